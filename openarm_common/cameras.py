@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras of the suite: mounts, frames and pinhole intrinsics.
+
+Frames of a camera `name` (REP-103, REP-105): `<name>_link` has x forward, y left, z up; `<name>_color_optical_frame`
+has z forward, x right, y down. Depth is aligned with colour, so images, CameraInfo and points share the optical
+frame. Pixel coordinates put the centre of the top-left pixel at (0, 0).
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, field_validator
+
+from openarm_common import se3
+from openarm_common.config import Config, load_yaml, validate
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import config_dir
+
+Array = NDArray[np.float64]
+Vector3 = tuple[float, float, float]
+
+#: Columns: the optical axes (right, down, forward) in link axes (forward, left, up).
+T_LINK_OPTICAL: Array = se3.make(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole camera without distortion; lengths in pixels."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @classmethod
+    def from_fovy(cls, width: int, height: int, fovy_deg: float) -> Intrinsics:
+        """Square pixels, principal point in the image centre, vertical field of view in degrees."""
+        f = height / 2.0 / math.tan(math.radians(fovy_deg) / 2.0)
+        return cls(width, height, f, f, (width - 1) / 2.0, (height - 1) / 2.0)
+
+    @property
+    def matrix(self) -> Array:
+        """K, (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points_optical: ArrayLike) -> Array:
+        """Pixels (..., 2) of points (..., 3) in the optical frame; NaN behind the camera."""
+        p = np.asarray(points_optical, dtype=np.float64)
+        z = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
+        return np.stack([p[..., 0] / z * self.fx + self.cx, p[..., 1] / z * self.fy + self.cy], axis=-1)
+
+    def deproject(self, pixels: ArrayLike, depth: ArrayLike) -> Array:
+        """Points (..., 3) in the optical frame of pixels (..., 2) at planar depth (...), m."""
+        uv = np.asarray(pixels, dtype=np.float64)
+        z = np.asarray(depth, dtype=np.float64)
+        return np.stack([(uv[..., 0] - self.cx) / self.fx * z, (uv[..., 1] - self.cy) / self.fy * z, z], axis=-1)
+
+
+class CameraConfig(Config):
+    """One camera: where it is mounted and what it sees."""
+
+    name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="prefix of topics and frames")
+    parent: str = Field(description="link that carries the camera")
+    position: Vector3 = Field(description="origin of the camera in the parent frame, m")
+    forward: Vector3 = Field(description="viewing direction in the parent frame")
+    image_right: Vector3 = Field(description="direction of growing u in the parent frame")
+    width: int = Field(640, ge=16, le=4096, description="pixels")
+    height: int = Field(480, ge=16, le=4096, description="pixels")
+    fovy_deg: float = Field(60.0, gt=1.0, lt=170.0, description="vertical field of view, degrees")
+    rate: float = Field(30.0, gt=0.0, le=100.0, description="images a second, Hz of simulated time")
+    near: float = Field(0.05, gt=0.0, description="nearest depth that is reported, m")
+    far: float = Field(3.0, gt=0.0, description="farthest depth that is reported, m")
+    depth: bool = Field(True, description="whether the camera has depth")
+    mount_error: bool = Field(True, description="whether the mount seed moves the simulated mount")
+    housing: Vector3 | None = Field(None, description="edges of the camera body along forward, left, up, m")
+
+    @field_validator("forward", "image_right")
+    @classmethod
+    def _direction(cls, value: Vector3) -> Vector3:
+        if math.hypot(*value) < 1e-9:
+            raise ValueError("expected a direction, got the zero vector")
+        return value
+
+    @property
+    def link_frame(self) -> str:
+        """Frame with x forward, y left, z up."""
+        return f"{self.name}_link"
+
+    @property
+    def optical_frame(self) -> str:
+        """Frame with z forward, x right, y down."""
+        return f"{self.name}_color_optical_frame"
+
+    @property
+    def T_parent_link(self) -> Array:
+        """Nominal mount, (4, 4)."""
+        optical = se3.rotation_from_z_y(self.forward, np.cross(self.forward, self.image_right))
+        return se3.make(optical, self.position) @ se3.inverse(T_LINK_OPTICAL)
+
+    @property
+    def T_parent_optical(self) -> Array:
+        """Nominal pose of the optical frame in the parent, (4, 4)."""
+        return self.T_parent_link @ T_LINK_OPTICAL
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Pinhole intrinsics."""
+        return Intrinsics.from_fovy(self.width, self.height, self.fovy_deg)
+
+
+class _CamerasFile(Config):
+    cameras: tuple[CameraConfig, ...]
+
+
+def load_cameras(path: Path | None = None) -> dict[str, CameraConfig]:
+    """Read the cameras, by name.
+
+    Args:
+        path: YAML with a list `cameras`; None is the suite's `config/params/cameras.yaml`.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming file and key, or the camera that is there twice.
+    """
+    source = path or config_dir() / "params" / "cameras.yaml"
+    cameras = validate(_CamerasFile, load_yaml(source), str(source)).cameras
+    by_name = {camera.name: camera for camera in cameras}
+    if len(by_name) != len(cameras):
+        names = sorted(camera.name for camera in cameras)
+        raise OpenArmError(Code.CONFIG_INVALID, f"{source}:cameras: names must be unique, got {', '.join(names)}")
+    return by_name
+
+
+def true_mount(camera: CameraConfig, mount_seed: int | None) -> Array:
+    """Where a simulated camera really is: the nominal mount off by an error of the mount seed.
+
+    Args:
+        camera: The camera with its nominal mount.
+        mount_seed: Seed of the error (up to 15 mm and 2°, drawn apart for each camera); None is no error.
+
+    Returns:
+        T_parent_link, (4, 4).
+    """
+    if mount_seed is None or not camera.mount_error:
+        return camera.T_parent_link
+    rng = np.random.default_rng([mount_seed, zlib.crc32(camera.name.encode())])
+    direction, axis = rng.normal(size=(2, 3))
+    shift = direction / np.linalg.norm(direction) * rng.uniform(0.005, 0.015)
+    turn = axis / np.linalg.norm(axis) * math.radians(rng.uniform(0.7, 2.0))
+    return camera.T_parent_link @ se3.make(se3.exp_so3(turn), shift)

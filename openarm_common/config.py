@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Configuration as frozen models, read from YAML with errors that name the file and the key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from openarm_common.errors import Code, OpenArmError
+
+
+class Config(BaseModel):
+    """Base of every configuration model: frozen, unknown keys refused, defaults checked too."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+ConfigT = TypeVar("ConfigT", bound=BaseModel)
+
+
+def load_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML mapping.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when the file is missing, is not YAML, or is not a mapping.
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"{path} does not exist") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"{path} is not valid YAML: {error}") from error
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise OpenArmError(Code.CONFIG_INVALID, f"{path} holds a {type(data).__name__}, expected a mapping of keys")
+    return data  # pyright: ignore[reportUnknownVariableType]
+
+
+def validate(model: type[ConfigT], data: dict[str, Any], where: str) -> ConfigT:
+    """Validate a mapping; every wrong key is named at once.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, with `where`:key for each fault.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise OpenArmError(Code.CONFIG_INVALID, describe_faults(error, where, model)) from error
+
+
+def describe_faults(error: ValidationError, where: str, model: type[BaseModel]) -> str:
+    """Turn a pydantic error into `where:key: fault` sentences, with the valid keys for an unknown one."""
+    faults: list[str] = []
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"]) or "(top level)"
+        text = item["msg"]
+        if item["type"] == "extra_forbidden":
+            text = "unknown key" + (f"; valid keys: {', '.join(model.model_fields)}" if len(item["loc"]) == 1 else "")
+        elif item["type"] != "missing":
+            text += f", got {item['input']!r}"
+        faults.append(f"{where}:{key}: {text}")
+    return "; ".join(faults)
+
+
+def load_config(path: Path, model: type[ConfigT]) -> ConfigT:
+    """Read and validate a YAML file.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming file and key.
+    """
+    return validate(model, load_yaml(path), str(path))

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One error tree, one list of codes.
+
+The codes travel as strings in services, actions, reports and the exit messages of the command line, so that a caller
+can branch on them; the message is for people: what, which value, what was expected, what to do.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Code(StrEnum):
+    """Why something did not happen; ``OK`` when it did."""
+
+    OK = "OK"
+    INVALID_ARGUMENT = "INVALID_ARGUMENT"
+    CONFIG_INVALID = "CONFIG_INVALID"
+    SCENE_INVALID = "SCENE_INVALID"
+    ENVIRONMENT = "ENVIRONMENT"
+    NOT_READY = "NOT_READY"
+    BUSY = "BUSY"
+    CANCELLED = "CANCELLED"
+    TIMEOUT = "TIMEOUT"
+    UNKNOWN_OBJECT = "UNKNOWN_OBJECT"
+    NOTHING_DETECTED = "NOTHING_DETECTED"
+    BAD_IMAGE = "BAD_IMAGE"
+    STALE_DATA = "STALE_DATA"
+    NO_TRANSFORM = "NO_TRANSFORM"
+    UNREACHABLE = "UNREACHABLE"
+    IN_COLLISION = "IN_COLLISION"
+    LIMITS = "LIMITS"
+    NO_PLAN = "NO_PLAN"
+    TOO_WIDE = "TOO_WIDE"
+    GRASP_MISSED = "GRASP_MISSED"
+    GRASP_LOST = "GRASP_LOST"
+    HAND_COLLISION = "HAND_COLLISION"
+    PLACE_FAILED = "PLACE_FAILED"
+    EXECUTION_FAILED = "EXECUTION_FAILED"
+    ROBOT_LOST = "ROBOT_LOST"
+    INTERNAL = "INTERNAL"
+
+
+class OpenArmError(Exception):
+    """Anything that the suite refuses or could not do.
+
+    Args:
+        code: What kind of failure it is; callers branch on this.
+        message: One sentence or two for people: what, which value, what was expected, what to do.
+    """
+
+    def __init__(self, code: Code, message: str) -> None:
+        super().__init__(f"{code}: {message}")
+        self.code = code
+        self.message = message
+
+    def __reduce__(self) -> tuple[type[OpenArmError], tuple[Code, str]]:
+        """Let the error cross process borders (worker pools pickle it)."""
+        return (type(self), (self.code, self.message))

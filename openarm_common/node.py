@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every node of the suite starts from: parameters, QoS, diagnostics, worker threads, orderly shutdown."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Generic, ParamSpec, TypeVar, get_args
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import get_logger
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+from openarm_common.config import Config, validate
+from openarm_common.description import RobotDescription
+from openarm_common.errors import OpenArmError
+
+ConfigT = TypeVar("ConfigT", bound=Config)
+P = ParamSpec("P")
+R = TypeVar("R")
+
+#: Where poses of the suite are expressed.
+BASE_FRAME = "openarm_body_link0"
+
+
+def _profile(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProfile:
+    return QoSProfile(
+        depth=depth,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def reliable(depth: int) -> QoSProfile:
+    """Reliable, volatile, keep last `depth`."""
+    return _profile(depth)
+
+
+#: Camera images, info, clouds as published (REP-2003).
+QOS_SENSOR = _profile(5, reliable=False)
+#: A subscriber that only ever wants the newest frame.
+QOS_NEWEST = _profile(1, reliable=False)
+QOS_COMMAND = _profile(10)
+QOS_CLOCK = _profile(1, reliable=False)
+QOS_TF = _profile(100)
+QOS_LATCHED = _profile(1, latched=True)
+#: As tf2: publishers keep one message each, the listener takes those of many publishers.
+QOS_STATIC_TF = _profile(100, latched=True)
+
+
+class BaseNode(Node, Generic[ConfigT]):
+    """A node with validated parameters, /diagnostics and a worker pool.
+
+    Args:
+        name: Node name.
+        model: Configuration model; every field becomes a read-only ROS parameter (nested models joined by dots).
+        kwargs: Passed to `rclpy.node.Node`.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming each wrong parameter.
+    """
+
+    def __init__(self, name: str, model: type[ConfigT], **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        data = _declare(self, model, "")
+        self.config: ConfigT = validate(model, data, f"parameters of {self.get_fully_qualified_name()}")
+        self._pool = ThreadPoolExecutor(max_workers=4, thread_name_prefix=name)
+        self._description: RobotDescription | None = None
+        self._status = DiagnosticStatus(level=DiagnosticStatus.STALE, name=f"{name}: status", hardware_id="openarm")
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+        self.wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self._publish_diagnostics, clock=self.wall_clock)
+
+    @property
+    def description(self) -> RobotDescription:
+        """The robot, loaded at first use."""
+        if self._description is None:
+            self._description = RobotDescription.load()
+        return self._description
+
+    def diagnose(self, ok: bool, message: str, **values: object) -> None:
+        """Set what /diagnostics says of this node once a second."""
+        status = DiagnosticStatus(name=self._status.name, hardware_id=self._status.hardware_id, message=message)
+        status.level = DiagnosticStatus.OK if ok else DiagnosticStatus.ERROR
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        self._status = status
+
+    def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Future:
+        """Run `fn` in a worker thread; await the returned future in a coroutine callback.
+
+        A future completed from another thread does not wake a waiting executor, so this does.
+        """
+        future = Future(executor=self.executor)
+
+        def work() -> None:
+            try:
+                result = fn(*args, **kwargs)
+            except BaseException as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+            if self.executor is not None:
+                self.executor.wake()
+
+        self._pool.submit(work)
+        return future
+
+    def close(self) -> None:
+        """Stop what the node runs beside the executor; subclasses with threads extend this."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _publish_diagnostics(self) -> None:
+        message = DiagnosticArray(status=[self._status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+
+def _declare(node: Node, model: type[BaseModel], prefix: str) -> dict[str, Any]:
+    data: dict[str, Any] = {}
+    for key, field in model.model_fields.items():
+        name = prefix + key
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            data[key] = _declare(node, field.annotation, name + ".")
+            continue
+        descriptor = ParameterDescriptor(
+            description=field.description or "", additional_constraints=_constraints(field), read_only=True
+        )
+        # Types are checked by the model, which says more (and takes 1 for 1.0) than rcl does.
+        descriptor.dynamic_typing = True
+        default: Any = field.get_default(call_default_factory=True)
+        value = node.declare_parameter(name, _to_ros(default), descriptor).value
+        if value is not None:
+            data[key] = list(value) if hasattr(value, "tolist") else value
+    return data
+
+
+def _to_ros(value: Any) -> Any:
+    if isinstance(value, tuple | list):
+        items: list[Any] = list(value)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+        return items
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def _constraints(field: FieldInfo) -> str:
+    limits = [
+        f"{symbol} {getattr(limit, key)}"
+        for limit in field.metadata
+        for key, symbol in _SYMBOLS.items()
+        if getattr(limit, key, None) is not None
+    ]
+    choices = [repr(choice) for choice in get_args(field.annotation) if isinstance(choice, str)]
+    return ", ".join(limits + (["one of " + ", ".join(choices)] if choices else []))
+
+
+_SYMBOLS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+
+
+def run(factory: Callable[[], BaseNode[Any]]) -> None:
+    """Main function of a node: create, spin until SIGINT or SIGTERM, shut down in order, exit.
+
+    The process exits with 0 after a signal and with 1 when the node could not be created.
+    """
+    # rclpy's handlers shut the context down and then call these; a KeyboardInterrupt could cut the shutdown short.
+    signal.signal(signal.SIGINT, lambda *_: None)
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.ALL)
+    try:
+        node = factory()
+    except OpenArmError as error:
+        get_logger("openarm").fatal(str(error))
+        rclpy.try_shutdown()
+        sys.exit(1)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        node.get_logger().debug("asked to stop")
+    finally:
+        executor.shutdown(timeout_sec=2.0)
+        node.close()
+        node.destroy_node()
+        rclpy.try_shutdown()

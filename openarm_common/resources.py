@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where `models/` and `config/` are: in a checkout, in an installed wheel, or in a colcon install."""
+
+from __future__ import annotations
+
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+from openarm_common.errors import Code, OpenArmError
+
+_MARKER = Path("models") / "openarm" / "openarm.urdf.xacro"
+
+
+@lru_cache(maxsize=1)
+def resource_root() -> Path:
+    """Return the folder that holds `models/` and `config/`.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, when none of the known places has them.
+    """
+    package = Path(__file__).resolve().parent
+    prefixes = [Path(sys.prefix), *package.parents]
+    candidates = [package.parent, *(p / "share" / "openarm" for p in prefixes)]
+    for candidate in candidates:
+        if (candidate / _MARKER).is_file():
+            return candidate
+    places = ", ".join(str(c) for c in candidates[:3])
+    raise OpenArmError(Code.ENVIRONMENT, f"{_MARKER} was not found in {places}, …; is the installation complete?")
+
+
+def models_dir() -> Path:
+    """Return the folder of robot models and scenes."""
+    return resource_root() / "models"
+
+
+def config_dir() -> Path:
+    """Return the folder of graphs and parameters."""
+    return resource_root() / "config"

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames for nodes: /joint_states and /tf_static into a `RobotStateBuffer`.
+
+Link poses come from own forward kinematics on /joint_states; a subscription to /tf would cost twice the time and say
+the same.
+"""
+
+from __future__ import annotations
+
+import time
+
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import JointState
+from tf2_msgs.msg import TFMessage
+
+from openarm_common.convert import stamp_to_ns, transform_to_matrix
+from openarm_common.description import RobotDescription
+from openarm_common.node import QOS_COMMAND, QOS_STATIC_TF
+from openarm_common.robot_state import RobotStateBuffer
+
+
+class RobotStateListener:
+    """Keeps a `RobotStateBuffer` filled.
+
+    Args:
+        node: The node that subscribes.
+        description: The robot.
+        joints: Whether to listen to /joint_states from the start; a 100 Hz subscription costs 5 to 10 % of a core, so a
+            node that needs it only now and then passes False and calls `enable`.
+    """
+
+    def __init__(self, node: Node, description: RobotDescription, *, joints: bool = True) -> None:
+        self.buffer = RobotStateBuffer(description)
+        self.efforts: dict[str, float] = {}
+        self.velocities: dict[str, float] = {}
+        self._node = node
+        self._received_at: float | None = None
+        self._joints: Subscription | None = None
+        node.create_subscription(TFMessage, "/tf_static", self._on_static, QOS_STATIC_TF)
+        if joints:
+            self.enable(True)
+
+    def enable(self, on: bool) -> None:
+        """Listen to /joint_states, or stop; what is old when listening starts again is forgotten."""
+        if on and self._joints is None:
+            self.buffer.clear()
+            self._received_at = None
+            self._joints = self._node.create_subscription(JointState, "/joint_states", self._on_joints, QOS_COMMAND)
+        elif not on and self._joints is not None:
+            self._node.destroy_subscription(self._joints)
+            self._joints = None
+
+    def age_s(self) -> float:
+        """Seconds of wall clock since the newest joint state arrived; infinite before the first."""
+        return float("inf") if self._received_at is None else time.monotonic() - self._received_at
+
+    def _on_joints(self, message: JointState) -> None:
+        self._received_at = time.monotonic()
+        self.buffer.add_joint_state(stamp_to_ns(message.header.stamp), message.name, message.position)
+        self.efforts = dict(zip(message.name, message.effort, strict=False))
+        self.velocities = dict(zip(message.name, message.velocity, strict=False))
+
+    def _on_static(self, message: TFMessage) -> None:
+        for edge in message.transforms:
+            self.buffer.set_static(edge.header.frame_id, edge.child_frame_id, transform_to_matrix(edge.transform))
