@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+# What every package of interfaces/ does, for colcon and for scikit-build-core (pip, uv) alike.
+#
+#   interface_package([UPSTREAM] DEPENDENCIES <package>...)
+#
+# generates all of msg/*.msg, srv/*.srv and action/*.action. UPSTREAM marks a copy of a package that a native ROS 2 may
+# provide: where that is so, nothing is built, and the installed package serves.
+
+# The wheels' targets named *__rosidl_generator_py export the include folder of the Python that built them. Where that
+# folder does not exist (everywhere else), CMake would stop there. Called from the package's own directory, because
+# imported targets are visible only there.
+function(drop_missing_include_folders)
+  get_property(targets DIRECTORY PROPERTY IMPORTED_TARGETS)
+  foreach(target IN LISTS targets)
+    get_target_property(folders ${target} INTERFACE_INCLUDE_DIRECTORIES)
+    foreach(folder IN LISTS folders)
+      if(IS_ABSOLUTE "${folder}" AND NOT EXISTS "${folder}")
+        set_property(TARGET ${target} PROPERTY INTERFACE_INCLUDE_DIRECTORIES "")
+        break()
+      endif()
+    endforeach()
+  endforeach()
+endfunction()
+
+macro(interface_package)
+  cmake_parse_arguments(PACKAGE "UPSTREAM" "" "DEPENDENCIES" ${ARGN})
+
+  if(SKBUILD)
+    # The ROS packages are wheels in the environment of the Python that builds.
+    find_package(Python3 REQUIRED COMPONENTS Interpreter)
+    execute_process(
+      COMMAND "${Python3_EXECUTABLE}" -c "import sys; print(sys.prefix)"
+      OUTPUT_VARIABLE PACKAGE_PREFIX OUTPUT_STRIP_TRAILING_WHITESPACE COMMAND_ERROR_IS_FATAL ANY)
+    list(PREPEND CMAKE_PREFIX_PATH "${PACKAGE_PREFIX}")
+    set(ENV{AMENT_PREFIX_PATH} "${PACKAGE_PREFIX}")
+  elseif(PACKAGE_UPSTREAM)
+    find_package(${PROJECT_NAME} QUIET)
+    string(FIND "${${PROJECT_NAME}_DIR}/" "${CMAKE_INSTALL_PREFIX}/" PACKAGE_AT)
+    if(${PROJECT_NAME}_FOUND AND NOT PACKAGE_AT EQUAL 0)
+      message(STATUS "${PROJECT_NAME} is installed (${${PROJECT_NAME}_DIR}): nothing to build")
+      return()
+    endif()
+  endif()
+
+  find_package(ament_cmake REQUIRED)
+  find_package(rosidl_default_generators REQUIRED)
+  foreach(dependency ${PACKAGE_DEPENDENCIES})
+    find_package(${dependency} REQUIRED)
+  endforeach()
+
+  if(SKBUILD)
+    # Python over rmw_fastrtps needs the C side only: leave out what only C++ nodes use (half of the build time).
+    list(FILTER AMENT_EXTENSIONS_rosidl_generate_idl_interfaces EXCLUDE REGEX "_cpp:")
+  endif()
+
+  file(GLOB PACKAGE_FILES RELATIVE "${CMAKE_CURRENT_SOURCE_DIR}" CONFIGURE_DEPENDS msg/*.msg srv/*.srv action/*.action)
+  rosidl_generate_interfaces(${PROJECT_NAME} ${PACKAGE_FILES} DEPENDENCIES ${PACKAGE_DEPENDENCIES})
+  drop_missing_include_folders()
+
+  ament_export_dependencies(rosidl_default_runtime)
+  ament_package()
+endmacro()
