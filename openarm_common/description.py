@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The robot: one description for every part of the suite.
 
-`RobotDescription.load()` expands `models/openarm`; the same URDF text goes to MuJoCo, pinocchio and `/robot_description`.
-Forward kinematics here needs nothing but numpy. Poses are ``T_root_link``, (4, 4), in the frame of the root link (`world`,
-identical to `openarm_body_link0`); joint positions are rad, or m for a finger.
+`RobotDescription.load()` expands `models/openarm`; the same URDF text goes to MuJoCo, pinocchio and
+`/robot_description`. Forward kinematics here needs nothing but numpy. Poses are ``T_root_link``, (4, 4), in the frame
+of the root link (`world`, identical to `openarm_body_link0`); joint positions are rad, or m for a finger.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
-from openarm_common.urdf import Joint, Link, Primitive, Semantics, parse_srdf, parse_urdf
+from openarm_common.srdf import Semantics, parse_srdf
+from openarm_common.urdf import Joint, Link, Primitive, parse_urdf
+from openarm_common.xml_text import fault
 
 __all__ = ["BASE_LINK", "SIDES", "Joint", "Link", "Primitive", "RobotDescription", "Side", "mirror"]
 
@@ -74,18 +76,19 @@ class RobotDescription:
         """Read any robot whose joints form one tree.
 
         Raises:
-            OpenArmError: CONFIG_INVALID, naming what is wrong: duplicate names, unknown links, no or several roots, a loop, an
-                SRDF that speaks of links or joints which the URDF does not have.
+            OpenArmError: CONFIG_INVALID, naming what is wrong: duplicate names, unknown links, no or several roots, a
+                loop, an SRDF that speaks of links or joints which the URDF does not have.
         """
         name, links, joints = parse_urdf(urdf)
         parent_joint: dict[str, Joint] = {}
         for joint in joints.values():
             if joint.child in parent_joint:
-                raise _fault(f"link {joint.child!r} is the child of {parent_joint[joint.child].name!r} and {joint.name!r}")
+                other = parent_joint[joint.child].name
+                raise fault(f"link {joint.child!r} is the child of two joints: {other!r} and {joint.name!r}")
             parent_joint[joint.child] = joint
         roots = [link for link in links if link not in parent_joint]
         if len(roots) != 1:
-            raise _fault(f"expected one root link, found {len(roots)}: {', '.join(roots) or 'the joints form a loop'}")
+            raise fault(f"expected one root link, found {len(roots)}: {', '.join(roots) or 'the joints form a loop'}")
         chains = {link: _chain_of(link, parent_joint) for link in links}
         semantics = parse_srdf(srdf)
         _check_semantics(semantics, links, joints)
@@ -215,15 +218,12 @@ class RobotDescription:
             return joint.T_parent_joint
         leader = joint.mimic or joint.name
         if leader not in q:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"no position of joint {leader!r}; got {', '.join(q) or 'no joints'}")
+            there = ", ".join(q) or "no joints"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no position of joint {leader!r}; got {there}")
         position = float(q[leader])
         if joint.mimic is not None:
             position = joint.multiplier * position + joint.offset
         return joint.T_parent_joint @ joint.motion(position)
-
-
-def _fault(message: str) -> OpenArmError:
-    return OpenArmError(Code.CONFIG_INVALID, f"robot description: {message}")
 
 
 def _chain_of(link: str, parent_joint: Mapping[str, Joint]) -> tuple[Joint, ...]:
@@ -234,7 +234,7 @@ def _chain_of(link: str, parent_joint: Mapping[str, Joint]) -> tuple[Joint, ...]
         chain.append(joint)
         link = joint.parent
         if link in seen:
-            raise _fault(f"the joints form a loop through link {link!r}")
+            raise fault(f"the joints form a loop through link {link!r}")
         seen.add(link)
     return tuple(reversed(chain))
 
@@ -250,19 +250,19 @@ def _known(chain: tuple[Joint, ...], poses: Mapping[str, Array]) -> int:
 def _check_semantics(semantics: Semantics, links: Mapping[str, Link], joints: Mapping[str, Joint]) -> None:
     for pair in semantics.allowed_collisions:
         for link in pair - links.keys():
-            raise _fault(f"SRDF disables collisions of link {link!r}, which the URDF does not have")
+            raise fault(f"SRDF disables collisions of link {link!r}, which the URDF does not have")
     named = {joint for group in semantics.groups.values() for joint in group.joints} | semantics.passive_joints
     named |= {joint for state in semantics.states.values() for joint in state}
     for joint in sorted(named - joints.keys()):
-        raise _fault(f"SRDF speaks of joint {joint!r}, which the URDF does not have")
+        raise fault(f"SRDF speaks of joint {joint!r}, which the URDF does not have")
     for group in semantics.groups.values():
         for link in (link for chain in group.chains for link in chain if link not in links):
-            raise _fault(f"SRDF group {group.name!r} speaks of link {link!r}, which the URDF does not have")
+            raise fault(f"SRDF group {group.name!r} speaks of link {link!r}, which the URDF does not have")
         for other in (other for other in group.groups if other not in semantics.groups):
-            raise _fault(f"SRDF group {group.name!r} speaks of group {other!r}, which does not exist")
+            raise fault(f"SRDF group {group.name!r} speaks of group {other!r}, which does not exist")
     for group_name, state in semantics.states:
         if group_name not in semantics.groups:
-            raise _fault(f"SRDF state {state!r} belongs to group {group_name!r}, which does not exist")
+            raise fault(f"SRDF state {state!r} belongs to group {group_name!r}, which does not exist")
 
 
 @lru_cache(maxsize=1)

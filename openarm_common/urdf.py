@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read URDF and SRDF text into frozen data.
+"""Read URDF text into frozen data.
 
-Lengths are metres, angles radians, masses kilograms. ``T_parent_joint`` is the pose of a joint frame in its parent link,
-``T_link_primitive`` the pose of a shape in its link; a cylinder's axis is its local z.
+Lengths are metres, angles radians, masses kilograms. ``T_parent_joint`` is the pose of a joint frame in its parent
+link, ``T_link_primitive`` the pose of a shape in its link; a cylinder's axis is its local z.
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.xml_text import attribute, fault, floats, parse_root, unique
 
 Array = NDArray[np.float64]
 Rgba = tuple[float, float, float, float]
@@ -89,26 +88,6 @@ class Joint:
         return se3.make(se3.exp_so3(self.axis * position))
 
 
-@dataclass(frozen=True)
-class Group:
-    """A planning group of the SRDF: joints by name, chains (base, tip), and other groups."""
-
-    name: str
-    joints: tuple[str, ...]
-    chains: tuple[tuple[str, str], ...]
-    groups: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Semantics:
-    """What the SRDF adds to the URDF. `states` is (group, state) → joint → position."""
-
-    groups: Mapping[str, Group]
-    states: Mapping[tuple[str, str], Mapping[str, float]]
-    allowed_collisions: frozenset[frozenset[str]]
-    passive_joints: frozenset[str]
-
-
 def parse_urdf(text: str) -> tuple[str, dict[str, Link], dict[str, Joint]]:
     """Read URDF text.
 
@@ -116,140 +95,73 @@ def parse_urdf(text: str) -> tuple[str, dict[str, Link], dict[str, Joint]]:
         Robot name, links by name, joints by name.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, naming the element: not XML, a duplicate name, a missing attribute, a joint type that is
-            not supported, a joint between links that do not exist.
+        OpenArmError: CONFIG_INVALID, naming the element: not XML, a duplicate name, a missing attribute, a joint type
+            that is not supported, a joint between links that do not exist.
     """
-    root = _root(text, "URDF")
+    root = parse_root(text, "URDF")
     colors = {m.get("name", ""): _rgba(m) for m in root.findall("material")}
     links: dict[str, Link] = {}
     joints: dict[str, Joint] = {}
     shape_names: set[str] = set()
     for element in root.findall("link"):
         link = _link(element, colors)
-        _unique("link", link.name, links)
+        unique("link", link.name, links)
         links[link.name] = link
         for tag in ("visual", "collision"):
             for shape in element.findall(tag):
                 name = shape.get("name")
                 if name is not None:
-                    _unique("visual or collision", name, shape_names)
+                    unique("visual or collision", name, shape_names)
                     shape_names.add(name)
     for element in root.findall("joint"):
         joint = _joint(element)
-        _unique("joint", joint.name, joints)
+        unique("joint", joint.name, joints)
         joints[joint.name] = joint
         for role, name in (("parent", joint.parent), ("child", joint.child)):
             if name not in links:
-                raise _fault(f"joint {joint.name!r} has the {role} link {name!r}, which does not exist")
+                raise fault(f"joint {joint.name!r} has the {role} link {name!r}, which does not exist")
     for joint in joints.values():
         leader = joints.get(joint.mimic) if joint.mimic is not None else None
         if joint.mimic is not None and (leader is None or leader.mimic is not None or leader.type == "fixed"):
-            fault = "does not exist" if leader is None else "is fixed or mimics a joint itself"
-            raise _fault(f"joint {joint.name!r} mimics {joint.mimic!r}, which {fault}")
+            why = "does not exist" if leader is None else "is fixed or mimics a joint itself"
+            raise fault(f"joint {joint.name!r} mimics {joint.mimic!r}, which {why}")
     return root.get("name", ""), links, joints
-
-
-def parse_srdf(text: str) -> Semantics:
-    """Read SRDF text; "" gives empty semantics.
-
-    Raises:
-        OpenArmError: CONFIG_INVALID, when it is not XML or an attribute is missing.
-    """
-    root = _root(text, "SRDF") if text else ET.Element("robot")
-    groups: dict[str, Group] = {}
-    for element in root.findall("group"):
-        name = _attribute(element, "name")
-        _unique("group", name, groups)
-        groups[name] = Group(
-            name=name,
-            joints=tuple(_attribute(e, "name") for e in element.findall("joint")),
-            chains=tuple((_attribute(e, "base_link"), _attribute(e, "tip_link")) for e in element.findall("chain")),
-            groups=tuple(_attribute(e, "name") for e in element.findall("group")),
-        )
-    states: dict[tuple[str, str], Mapping[str, float]] = {}
-    for element in root.findall("group_state"):
-        key = (_attribute(element, "group"), _attribute(element, "name"))
-        _unique("group_state", " ".join(key), {" ".join(k) for k in states})
-        states[key] = MappingProxyType(
-            {_attribute(e, "name"): _floats(_attribute(e, "value"), 1, e)[0] for e in element.findall("joint")}
-        )
-    pairs = frozenset(
-        frozenset((_attribute(e, "link1"), _attribute(e, "link2"))) for e in root.findall("disable_collisions")
-    )
-    passive = frozenset(_attribute(e, "name") for e in root.findall("passive_joint"))
-    return Semantics(MappingProxyType(groups), MappingProxyType(states), pairs, passive)
-
-
-def _fault(message: str) -> OpenArmError:
-    return OpenArmError(Code.CONFIG_INVALID, f"robot description: {message}")
-
-
-def _root(text: str, what: str) -> ET.Element:
-    try:
-        root = ET.fromstring(text)
-    except ET.ParseError as error:
-        raise _fault(f"{what} is not XML: {error}") from error
-    if root.tag != "robot":
-        raise _fault(f"{what} starts with <{root.tag}>, expected <robot>")
-    return root
-
-
-def _unique(kind: str, name: str, taken: Mapping[str, object] | set[str]) -> None:
-    if name in taken:
-        raise _fault(f"{kind} name {name!r} is used twice; names must be unique")
-
-
-def _attribute(element: ET.Element, key: str) -> str:
-    value = element.get(key)
-    if value is None:
-        raise _fault(f"<{element.tag} {element.attrib}> has no attribute {key!r}")
-    return value
-
-
-def _floats(text: str, count: int, element: ET.Element) -> tuple[float, ...]:
-    try:
-        values = tuple(float(part) for part in text.split())
-    except ValueError as error:
-        raise _fault(f"<{element.tag} {element.attrib}>: {text!r} is not a list of numbers") from error
-    if len(values) != count or not all(math.isfinite(v) for v in values):
-        raise _fault(f"<{element.tag} {element.attrib}>: expected {count} finite numbers, got {text!r}")
-    return values
 
 
 def _origin(element: ET.Element) -> Array:
     origin = element.find("origin")
     if origin is None:
         return np.eye(4)
-    roll, pitch, yaw = _floats(origin.get("rpy", "0 0 0"), 3, origin)
-    return se3.make(se3.matrix_from_rpy(roll, pitch, yaw), _floats(origin.get("xyz", "0 0 0"), 3, origin))
+    roll, pitch, yaw = floats(origin.get("rpy", "0 0 0"), 3, origin)
+    return se3.make(se3.matrix_from_rpy(roll, pitch, yaw), floats(origin.get("xyz", "0 0 0"), 3, origin))
 
 
 def _rgba(material: ET.Element) -> Rgba | None:
     color = material.find("color")
     if color is None:
         return None
-    r, g, b, a = _floats(_attribute(color, "rgba"), 4, color)
+    r, g, b, a = floats(attribute(color, "rgba"), 4, color)
     return (r, g, b, a)
 
 
 def _primitive(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Primitive | None:
     geometry = element.find("geometry")
     if geometry is None or len(geometry) != 1:
-        raise _fault(f"<{element.tag} {element.attrib}>: expected one <geometry> with one shape")
+        raise fault(f"<{element.tag} {element.attrib}>: expected one <geometry> with one shape")
     shape = geometry[0]
     size: tuple[float, ...]
     kind: ShapeKind
     if shape.tag == "box":
-        kind, size = "box", _floats(_attribute(shape, "size"), 3, shape)
+        kind, size = "box", floats(attribute(shape, "size"), 3, shape)
     elif shape.tag == "cylinder":
         kind = "cylinder"
-        size = tuple(_floats(_attribute(shape, key), 1, shape)[0] for key in ("radius", "length"))
+        size = tuple(floats(attribute(shape, key), 1, shape)[0] for key in ("radius", "length"))
     elif shape.tag == "sphere":
-        kind, size = "sphere", _floats(_attribute(shape, "radius"), 1, shape)
+        kind, size = "sphere", floats(attribute(shape, "radius"), 1, shape)
     elif shape.tag == "mesh":
         return None
     else:
-        raise _fault(f"<{element.tag} {element.attrib}>: unknown shape <{shape.tag}>; expected box, cylinder, sphere or mesh")
+        raise fault(f"<{element.tag} {element.attrib}>: <{shape.tag}> is none of box, cylinder, sphere, mesh")
     material = element.find("material")
     name = material.get("name", "") if material is not None else ""
     rgba = _rgba(material) if material is not None else None
@@ -262,10 +174,10 @@ def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
     if inertial is not None:
         mass_element, tensor = inertial.find("mass"), inertial.find("inertia")
         if mass_element is None or tensor is None:
-            raise _fault(f"link {element.get('name')!r}: <inertial> needs <mass> and <inertia>")
-        mass = _floats(_attribute(mass_element, "value"), 1, mass_element)[0]
+            raise fault(f"link {element.get('name')!r}: <inertial> needs <mass> and <inertia>")
+        mass = floats(attribute(mass_element, "value"), 1, mass_element)[0]
         xx, xy, xz, yy, yz, zz = (
-            _floats(tensor.get(key, "0"), 1, tensor)[0] for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+            floats(tensor.get(key, "0"), 1, tensor)[0] for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
         )
         T = _origin(inertial)
         com = T[:3, 3]
@@ -280,7 +192,7 @@ def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
             else:
                 found.append(primitive)
     return Link(
-        name=_attribute(element, "name"),
+        name=attribute(element, "name"),
         mass=mass,
         com=com,
         inertia=inertia,
@@ -293,35 +205,35 @@ def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
 def _child(element: ET.Element, tag: str, key: str) -> str:
     found = element.find(tag)
     if found is None:
-        raise _fault(f"joint {element.get('name')!r} has no <{tag}>")
-    return _attribute(found, key)
+        raise fault(f"joint {element.get('name')!r} has no <{tag}>")
+    return attribute(found, key)
 
 
 def _joint(element: ET.Element) -> Joint:
-    name = _attribute(element, "name")
-    kind = _attribute(element, "type")
+    name = attribute(element, "name")
+    kind = attribute(element, "type")
     if kind not in get_args(JointType):
-        raise _fault(f"joint {name!r} has type {kind!r}; supported: {', '.join(get_args(JointType))}")
+        raise fault(f"joint {name!r} has type {kind!r}; supported: {', '.join(get_args(JointType))}")
     axis_element, limit, mimic = element.find("axis"), element.find("limit"), element.find("mimic")
     dynamics = element.find("dynamics")
     axis = np.array(
-        _floats(axis_element.get("xyz", "1 0 0"), 3, axis_element) if axis_element is not None else (1.0, 0.0, 0.0)
+        floats(axis_element.get("xyz", "1 0 0"), 3, axis_element) if axis_element is not None else (1.0, 0.0, 0.0)
     )
     norm = float(np.linalg.norm(axis))
     if norm < 1e-9:
-        raise _fault(f"joint {name!r} has the axis (0, 0, 0)")
+        raise fault(f"joint {name!r} has the axis (0, 0, 0)")
     if kind in ("revolute", "prismatic") and limit is None:
-        raise _fault(f"joint {name!r} is {kind} and has no <limit>")
+        raise fault(f"joint {name!r} is {kind} and has no <limit>")
 
     def number(parent: ET.Element | None, key: str, default: float) -> float:
         text = parent.get(key) if parent is not None else None
-        return default if parent is None or text is None else _floats(text, 1, parent)[0]
+        return default if parent is None or text is None else floats(text, 1, parent)[0]
 
     bounded = kind in ("revolute", "prismatic")
     lower = number(limit, "lower", 0.0) if bounded else -math.inf
     upper = number(limit, "upper", 0.0) if bounded else math.inf
     if lower > upper:
-        raise _fault(f"joint {name!r} has the lower limit {lower} above the upper limit {upper}")
+        raise fault(f"joint {name!r} has the lower limit {lower} above the upper limit {upper}")
     return Joint(
         name=name,
         type=kind,  # pyright: ignore[reportArgumentType]

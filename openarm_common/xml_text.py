@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the readers of URDF and SRDF share: attributes and numbers of XML elements; errors name the element."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Container
+
+from openarm_common.errors import Code, OpenArmError
+
+
+def fault(message: str) -> OpenArmError:
+    """Build the error for a faulty robot description."""
+    return OpenArmError(Code.CONFIG_INVALID, f"robot description: {message}")
+
+
+def parse_root(text: str, what: str) -> ET.Element:
+    """Parse the <robot> document; `what` is its kind, for the error."""
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise fault(f"{what} is not XML: {error}") from error
+    if root.tag != "robot":
+        raise fault(f"{what} starts with <{root.tag}>, expected <robot>")
+    return root
+
+
+def unique(kind: str, name: str, taken: Container[str]) -> None:
+    """Refuse a name that is taken."""
+    if name in taken:
+        raise fault(f"{kind} name {name!r} is used twice; names must be unique")
+
+
+def attribute(element: ET.Element, key: str) -> str:
+    """Return an attribute that has to be there."""
+    value = element.get(key)
+    if value is None:
+        raise fault(f"<{element.tag} {element.attrib}> has no attribute {key!r}")
+    return value
+
+
+def floats(text: str, count: int, element: ET.Element) -> tuple[float, ...]:
+    """Read `count` finite numbers; `element` is named in the error."""
+    try:
+        values = tuple(float(part) for part in text.split())
+    except ValueError as error:
+        raise fault(f"<{element.tag} {element.attrib}>: {text!r} is not a list of numbers") from error
+    if len(values) != count or not all(math.isfinite(v) for v in values):
+        raise fault(f"<{element.tag} {element.attrib}>: expected {count} finite numbers, got {text!r}")
+    return values
