@@ -14,8 +14,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -82,6 +84,13 @@ class BaseNode(Node, Generic[ConfigT]):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
         self.wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._publish_diagnostics, clock=self.wall_clock)
+
+    @property
+    def default_callback_group(self) -> CallbackGroup:
+        """Callbacks of a node may overlap at their awaits: a coroutine that waits must not keep the others from running."""
+        if not hasattr(self, "_reentrant_group"):
+            self._reentrant_group = ReentrantCallbackGroup()
+        return self._reentrant_group
 
     @property
     def description(self) -> RobotDescription:
@@ -176,20 +185,26 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
     signal.signal(signal.SIGINT, lambda *_: None)
     signal.signal(signal.SIGTERM, lambda *_: None)
     rclpy.init(signal_handler_options=SignalHandlerOptions.ALL)
+    executor = SingleThreadedExecutor()
+    node: BaseNode[Any] | None = None
+    code = 0
     try:
         node = factory()
+        executor.add_node(node)
+        executor.spin()
     except OpenArmError as error:
         get_logger("openarm").fatal(str(error))
-        rclpy.try_shutdown()
-        sys.exit(1)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    try:
-        executor.spin()
+        code = 1
     except ExternalShutdownException:
-        node.get_logger().debug("asked to stop")
+        pass  # the normal end
+    except rclpy_implementation.RCLError:
+        if rclpy.ok():
+            raise
+        # The signal came while something of rcl was being made.
     finally:
         executor.shutdown(timeout_sec=2.0)
-        node.close()
-        node.destroy_node()
+        if node is not None:
+            node.close()
+            node.destroy_node()
         rclpy.try_shutdown()
+    sys.exit(code)

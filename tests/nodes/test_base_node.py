@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node base: parameters from the model, diagnostics, worker threads, orderly end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from pydantic import Field
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from openarm_common.config import Config
+from openarm_common.errors import OpenArmError
+from openarm_common.node import QOS_COMMAND, BaseNode
+
+
+class _Limits(Config):
+    force: float = Field(30.0, gt=0.0, description="N")
+
+
+class _Example(Config):
+    rate: float = Field(100.0, gt=0.0, le=1000.0, description="Hz")
+    names: tuple[str, ...] = ("a", "b")
+    seed: int | None = None
+    limits: _Limits = _Limits()
+
+
+def test_b62_parameters_come_from_the_model_and_take_overrides(ros) -> None:
+    node = ros.add(
+        BaseNode("example", _Example, parameter_overrides=[Parameter("rate", value=50), Parameter("limits.force", value=5.0)])
+    )
+    assert node.config == _Example(rate=50.0, limits=_Limits(force=5.0))
+    descriptor = node.describe_parameter("rate")
+    assert descriptor.description == "Hz"
+    assert "<= 1000" in descriptor.additional_constraints
+    assert descriptor.read_only
+
+
+def test_a_wrong_parameter_is_named_with_its_value(ros) -> None:
+    with pytest.raises(OpenArmError, match=r"/example:rate: .*greater than 0.*got -1"):
+        BaseNode("example", _Example, parameter_overrides=[Parameter("rate", value=-1.0)])
+
+
+def test_diagnostics_are_published_each_second(ros) -> None:
+    got: list[DiagnosticArray] = []
+    ros.node.create_subscription(DiagnosticArray, "/diagnostics", got.append, QOS_COMMAND)
+    node = ros.add(BaseNode("example", _Example))
+    node.diagnose(True, "all is well", frames=3)
+    ros.spin_until(lambda: any(s.message == "all is well" for m in got for s in m.status), 5.0, "a status")
+    status = got[-1].status[0]
+    assert status.name == "example: status"
+    assert status.level == b"\x00"
+    assert {v.key: v.value for v in status.values} == {"frames": "3"}
+
+
+def test_work_in_a_thread_leaves_the_node_answering_and_wakes_it(ros) -> None:
+    node = ros.add(BaseNode("example", _Example))
+    gate = threading.Event()
+
+    async def slow(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = await node.in_thread(gate.wait, 20.0)
+        return response
+
+    def fast(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = True
+        return response
+
+    node.create_service(Trigger, "slow", slow)
+    node.create_service(Trigger, "fast", fast)
+    slow_client, fast_client = (ros.node.create_client(Trigger, name) for name in ("slow", "fast"))
+    ros.spin_until(slow_client.service_is_ready)
+    pending = slow_client.call_async(Trigger.Request())
+    assert ros.call(fast_client, Trigger.Request(), 2.0).success
+    assert not pending.done()
+    gate.set()
+    assert ros.result(pending, 2.0).success
+
+
+def test_an_error_in_a_thread_reaches_who_awaits_it(ros) -> None:
+    node = ros.add(BaseNode("example", _Example))
+
+    def fail() -> None:
+        raise ValueError("wrong")
+
+    future = node.in_thread(fail)
+    ros.spin_until(future.done)
+    with pytest.raises(ValueError, match="wrong"):
+        future.result()
+
+
+_SCRIPT = textwrap.dedent(
+    """
+    from openarm_common.config import Config
+    from openarm_common.node import BaseNode, run
+    class Settings(Config):
+        rate: float = 1.0
+    class Example(BaseNode[Settings]):
+        def __init__(self):
+            super().__init__("example", Settings)
+            print("ready", flush=True)
+        def close(self):
+            super().close()
+            print("closed", flush=True)
+    run(Example)
+    """
+)
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_p34_a_signal_ends_the_process_in_order_with_exit_code_0(stop: signal.Signals) -> None:
+    with subprocess.Popen([sys.executable, "-c", _SCRIPT], stdout=subprocess.PIPE, text=True, env=os.environ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(stop)
+        out, _ = process.communicate(timeout=10.0)
+        assert (process.returncode, out) == (0, "closed\n")
+
+
+def test_a_wrong_parameter_ends_the_process_with_a_sentence_and_exit_code_1() -> None:
+    command = [sys.executable, "-c", _SCRIPT, "--ros-args", "-p", "rate:=fast"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=False)
+    assert done.returncode == 1
+    assert "rate" in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
