@@ -3,10 +3,10 @@
 
     python models/openarm/generate_srdf.py [--samples 60000] [--out FILE]
 
-Pairs of links are put in one of four classes. *Adjacent*: joined by a joint. *Default*: the primitives touch where the
-parts do not, or by design (the fingers when closed). *Never*: not nearer than `MARGIN` in any of the random postures, and
-neither is the mirror image of the pair. Everything else stays checked, and so does `always_checked`, whatever the samples
-say. Deterministic: same description, same file.
+A pair of links is not checked for one of three reasons. *Adjacent*: joined by a joint. *Default*: the primitives touch
+where the parts do not, or by design (the fingers when closed). *Never*: not nearer than `MARGIN` in any of the random
+postures, and neither is the mirror image of the pair. `always_checked` stays checked, whatever the samples say.
+Deterministic: same description, same file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,14 @@ OUTER = ("link4", "link5", "link6", "link7", "hand", "left_finger", "right_finge
 FINGERS = ("left_finger", "right_finger")
 #: Of one arm; "body" is the pedestal.
 DEFAULT = (
-    [("body", "link1"), ("body", "link2"), ("link0", "link2"), ("link1", "link3"), ("link3", "link5"), ("link5", "link7")]
+    [
+        ("body", "link1"),
+        ("body", "link2"),
+        ("link0", "link2"),
+        ("link1", "link3"),
+        ("link3", "link5"),
+        ("link5", "link7"),
+    ]
     + [("link7", finger) for finger in FINGERS]
     + [FINGERS]
 )
@@ -152,7 +159,12 @@ def group_lines() -> list[str]:
     for side in SIDES:
         joints = [f'    <joint name="openarm_{side}_finger_joint{i}"/>' for i in (1, 2)]
         lines += [f'  <group name="{side}_gripper">', *joints, "  </group>"]
-    lines += ['  <group name="both_arms">', '    <group name="left_arm"/>', '    <group name="right_arm"/>', "  </group>"]
+    lines += [
+        '  <group name="both_arms">',
+        '    <group name="left_arm"/>',
+        '    <group name="right_arm"/>',
+        "  </group>",
+    ]
     for side, label in zip(SIDES, ("left_ee", "right_ee"), strict=True):
         lines.append(
             f'  <end_effector name="{label}" parent_link="openarm_{side}_hand" group="{side}_gripper"'

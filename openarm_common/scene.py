@@ -1,0 +1,347 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes: a table in front of the robot and the objects on it.
+
+Positions are in the base frame (`world`, `openarm_body_link0`: x forward, y left, z up), metres; yaw is about z, rad.
+A scene is a YAML file in `models/scenes`, or drawn from a seed. One that does not fit is refused with all its faults.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from openarm_common import se3
+from openarm_common.config import Config, describe_faults, load_yaml
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import models_dir
+
+Array = NDArray[np.float64]
+Rgba = tuple[float, float, float, float]
+
+#: Colours of objects; each lies inside one hue range of `config/params/detector.yaml`.
+PALETTE: Mapping[str, Rgba] = MappingProxyType(
+    {
+        "red": (0.80, 0.08, 0.08, 1.0),
+        "orange": (0.95, 0.45, 0.04, 1.0),
+        "yellow": (0.93, 0.82, 0.05, 1.0),
+        "green": (0.08, 0.58, 0.18, 1.0),
+        "blue": (0.06, 0.25, 0.80, 1.0),
+        "purple": (0.46, 0.10, 0.66, 1.0),
+    }
+)
+SHAPES = ("box", "cylinder")
+DENSITY = 700.0  # kg/m3, of an object without a mass: hard wood
+MAX_EDGE = 0.30  # m
+MIN_EDGE = 0.01  # m
+#: Where an arm can grasp a cube of any yaw from above with a tilt up to 30°: x, and y to its own side.
+REGION_X = (0.16, 0.36)
+REGION_ABS_Y = (0.06, 0.42)
+#: Centre to centre in a random scene: the open fingers reach 65 mm to either side, an object up to 50 mm.
+SPACING = 0.12
+_TOUCH = 1e-4  # m; closer than this is touching, not overlapping
+#: The front of the pedestal's column; a table that reaches further back would stand in it.
+_COLUMN_FRONT = 0.035
+
+
+class Table(Config):
+    """A table with four legs; its top is a box."""
+
+    top_z: float = Field(0.40, ge=0.05, le=1.2, description="height of the top, m")
+    x: tuple[float, float] = Field((0.11, 0.81), description="front and back edge, m")
+    y: tuple[float, float] = Field((-0.60, 0.60), description="right and left edge, m")
+    thickness: float = Field(0.04, gt=0.0, le=0.2, description="of the top, m")
+
+    @field_validator("x", "y")
+    @classmethod
+    def _ascending(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not value[0] < value[1]:
+            raise ValueError("expected [low, high] with low < high")
+        return value
+
+    @field_validator("x")
+    @classmethod
+    def _clear_of_pedestal(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] < _COLUMN_FRONT:
+            raise ValueError(f"the front edge would stand in the pedestal; expected at least {_COLUMN_FRONT}")
+        return value
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Middle of the top, m."""
+        return (self.x[0] + self.x[1]) / 2.0, (self.y[0] + self.y[1]) / 2.0
+
+    @property
+    def extents(self) -> tuple[float, float, float]:
+        """Edges of the top, m."""
+        return self.x[1] - self.x[0], self.y[1] - self.y[0], self.thickness
+
+
+class SceneObject(Config):
+    """A free body in one plain colour.
+
+    `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height. `position`
+    is x, y, or x, y, z of the centre; without z the object stands on the table.
+    """
+
+    name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")
+    label: str = Field(min_length=1, description="what the detector calls it; the colour where it is not given")
+    shape: str = Field(description="box or cylinder")
+    size: tuple[float, float, float] = Field(description="extents, m")
+    color: str = Field(description="a colour of the palette")
+    mass: float = Field(0.0, ge=0.0, le=10.0, description="kg; 0 is the volume times the density of hard wood")
+    position: tuple[float, float] | tuple[float, float, float] = Field(description="of the centre, m")
+    yaw: float = Field(0.0, description="rad")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _label_is_color(cls, data: Any) -> Any:
+        return {"label": data.get("color", "")} | data if isinstance(data, dict) else data
+
+    @field_validator("shape")
+    @classmethod
+    def _known_shape(cls, value: str) -> str:
+        if value not in SHAPES:
+            raise ValueError(f"unknown shape; shapes: {', '.join(SHAPES)}")
+        return value
+
+    @field_validator("color")
+    @classmethod
+    def _known_color(cls, value: str) -> str:
+        if value not in PALETTE:
+            raise ValueError(f"unknown colour; colours: {', '.join(PALETTE)}")
+        return value
+
+    @field_validator("size")
+    @classmethod
+    def _possible_size(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not all(MIN_EDGE <= edge <= MAX_EDGE for edge in value):
+            raise ValueError(f"too large or too small; expected every extent in {MIN_EDGE} .. {MAX_EDGE} m")
+        return value
+
+    @field_validator("position", "yaw")
+    @classmethod
+    def _finite(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        if not np.isfinite(value).all():
+            raise ValueError("expected finite numbers")
+        return value
+
+    @property
+    def rgba(self) -> Rgba:
+        """Colour."""
+        return PALETTE[self.color]
+
+    @property
+    def volume(self) -> float:
+        """Cubic metres."""
+        x, y, z = self.size
+        return x * y * z * (math.pi / 4.0 if self.shape == "cylinder" else 1.0)
+
+    @property
+    def mass_kg(self) -> float:
+        """Mass, kg: as given, or by volume."""
+        return self.mass or self.volume * DENSITY
+
+    def centre(self, table: Table) -> tuple[float, float, float]:
+        """Position of the centre, m; on the table where the scene gives no z."""
+        z = self.position[2] if len(self.position) == 3 else table.top_z + self.size[2] / 2.0
+        return self.position[0], self.position[1], z
+
+    def T_world_object(self, table: Table) -> Array:
+        """Pose, (4, 4)."""
+        return se3.make(se3.rot_z(self.yaw), self.centre(table))
+
+    def outline(self) -> Array:
+        """Convex outline (n, 2) of the footprint in the base frame, m."""
+        if self.shape == "cylinder":
+            angles = np.arange(32) * (math.tau / 32.0)
+            corners = np.stack([np.cos(angles), np.sin(angles)], axis=1) * (self.size[0] / 2.0)
+        else:
+            corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (np.array(self.size[:2]) / 2.0)
+        return corners @ se3.rot_z(self.yaw)[:2, :2].T + np.array(self.position[:2])
+
+
+class Scene(Config):
+    """A table and what is on it."""
+
+    name: str = Field("scene", min_length=1)
+    table: Table = Table()
+    objects: tuple[SceneObject, ...] = ()
+
+    def object(self, name: str) -> SceneObject:
+        """Return the object of that name.
+
+        Raises:
+            OpenArmError: UNKNOWN_OBJECT, listing the objects there are.
+        """
+        for item in self.objects:
+            if item.name == name:
+                return item
+        there = ", ".join(item.name for item in self.objects) or "none"
+        raise OpenArmError(Code.UNKNOWN_OBJECT, f"no object {name!r} in scene {self.name!r}; objects: {there}")
+
+
+ModelT = TypeVar("ModelT", Scene, SceneObject)
+
+
+def parse_scene(data: Mapping[str, Any], where: str) -> Scene:
+    """Validate a scene; `where` stands in front of every fault.
+
+    Raises:
+        OpenArmError: SCENE_INVALID, naming each wrong key, and each object that is not on the table, overlaps another,
+            or has a name or label that is used twice.
+    """
+    scene = _parse(Scene, data, where)
+    faults = [fault for item in scene.objects for fault in _off_table(item, scene.table)]
+    faults += _duplicates("name", (item.name for item in scene.objects))
+    faults += _duplicates("label", (item.label for item in scene.objects))
+    for a, b in itertools.combinations(scene.objects, 2):
+        depth = _overlap(a, b, scene.table)
+        if depth > _TOUCH:
+            faults.append(f"{_place(a)} and {_place(b)} overlap by {depth * 1e3:.0f} mm; move one of them")
+    if faults:
+        raise OpenArmError(Code.SCENE_INVALID, "; ".join(f"{where}: {fault}" for fault in faults))
+    return scene
+
+
+def parse_object(data: Mapping[str, Any], table: Table, where: str) -> SceneObject:
+    """Validate one object that is to be put on (or above) a table.
+
+    Raises:
+        OpenArmError: SCENE_INVALID, naming each wrong key, or that it is not on the table.
+    """
+    item = _parse(SceneObject, data, where)
+    faults = _off_table(item, table)
+    if faults:
+        raise OpenArmError(Code.SCENE_INVALID, "; ".join(f"{where}: {fault}" for fault in faults))
+    return item
+
+
+def load_scene(source: str | Path, seed: int = 0) -> Scene:
+    """Read a scene.
+
+    Args:
+        source: Name of a file in `models/scenes`, a path ending in .yaml, or "random".
+        seed: Of a random scene.
+
+    Raises:
+        OpenArmError: SCENE_INVALID, with the faults, or listing the scenes there are.
+    """
+    if source == "random":
+        return random_scene(seed)
+    folder = models_dir() / "scenes"
+    path = Path(source)
+    if path.suffix not in (".yaml", ".yml"):
+        path = folder / f"{source}.yaml"
+    if not path.is_file():
+        names = sorted(file.stem for file in folder.glob("*.yaml"))
+        raise OpenArmError(
+            Code.SCENE_INVALID,
+            f"no scene {str(source)!r}; scenes: {', '.join([*names, 'random'])}, or the path of a YAML",
+        )
+    try:
+        data = load_yaml(path)
+    except OpenArmError as error:
+        raise OpenArmError(Code.SCENE_INVALID, error.message) from error
+    return parse_scene({"name": path.stem} | data, str(path))
+
+
+def random_scene(seed: int, count: int | None = None) -> Scene:
+    """Draw a scene: one to four objects that either arm can grasp, each in its own colour.
+
+    Cubes, boxes, cylinders and cans; faces and diameters of 40 to 70 mm, heights of 40 to 115 mm, 60 to 350 g.
+
+    Args:
+        seed: Same seed, same scene.
+        count: How many objects; None draws it.
+    """
+    rng = np.random.default_rng(seed)
+    number = int(rng.integers(1, 5)) if count is None else count
+    colors = rng.permutation(list(PALETTE))[:number]
+    spots: list[Array] = []
+    while len(spots) < number:
+        side = rng.choice((-1.0, 1.0))
+        spot = np.array([rng.uniform(*REGION_X), side * rng.uniform(*REGION_ABS_Y)]).round(4)
+        if all(np.hypot(*(spot - other)) >= SPACING for other in spots):
+            spots.append(spot)
+    objects: list[SceneObject] = []
+    for color, spot in zip(colors, spots, strict=True):
+        kind = str(rng.choice(("cube", "box", "cylinder", "can")))
+        item = SceneObject(
+            name=f"{color}_{kind}",
+            shape="box" if kind in ("cube", "box") else "cylinder",
+            size=_draw_size(rng, kind),
+            color=str(color),
+            position=(float(spot[0]), float(spot[1])),
+            yaw=round(float(rng.uniform(-math.pi, math.pi)), 4),
+        )
+        objects.append(item.model_copy(update={"mass": round(min(max(item.mass_kg, 0.06), 0.35), 3)}))
+    return parse_scene({"name": f"random_{seed}", "objects": objects}, f"random scene {seed}")
+
+
+def _draw_size(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
+    if kind == "can":
+        return (0.066, 0.066, 0.115)
+    a, b = (round(float(edge), 3) for edge in rng.uniform(0.04, 0.07, size=2))
+    if kind == "cube":
+        return (a, a, a)
+    if kind == "cylinder":
+        b = a
+    # Not taller than twice the narrow side: a slimmer one tips over when a finger touches it first.
+    return (a, b, round(float(rng.uniform(0.04, min(0.115, 2.0 * min(a, b)))), 3))
+
+
+def _parse(model: type[ModelT], data: Mapping[str, Any], where: str) -> ModelT:
+    try:
+        return model.model_validate(dict(data))
+    except ValidationError as error:
+        raise OpenArmError(Code.SCENE_INVALID, describe_faults(error, where, model)) from error
+
+
+def _place(item: SceneObject) -> str:
+    return f"object {item.name!r} at ({', '.join(f'{v:.3f}' for v in item.position)})"
+
+
+def _off_table(item: SceneObject, table: Table) -> list[str]:
+    outline = item.outline()
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    faults: list[str] = []
+    for axis, (edge_low, edge_high) in enumerate((table.x, table.y)):
+        over = max(edge_low - low[axis], high[axis] - edge_high)
+        if over > _TOUCH:
+            faults.append(
+                f"{_place(item)} is outside the table: {'xy'[axis]} spans {low[axis]:.3f} .. {high[axis]:.3f} m,"
+                f" the table {edge_low:.3f} .. {edge_high:.3f} m"
+            )
+    bottom = item.centre(table)[2] - item.size[2] / 2.0
+    if bottom < table.top_z - _TOUCH:
+        faults.append(
+            f"{_place(item)} is in the table: its bottom is at z {bottom:.3f}, the top at {table.top_z:.3f} m"
+        )
+    return faults
+
+
+def _duplicates(what: str, values: Iterable[str]) -> list[str]:
+    seen: set[str] = set()
+    twice = [value for value in values if value in seen or seen.add(value)]
+    return [f"{what} {value!r} is used by two objects; {what}s must be unique in a scene" for value in twice]
+
+
+def _overlap(a: SceneObject, b: SceneObject, table: Table) -> float:
+    """How deep two objects are in each other, m; 0 when apart. Separating axes of the outlines, and z."""
+    outlines = (a.outline(), b.outline())
+    edges = np.concatenate([np.roll(outline, -1, axis=0) - outline for outline in outlines])
+    normals = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)
+    spans = [outline @ normals.T for outline in outlines]
+    depth = np.minimum(spans[0].max(axis=0), spans[1].max(axis=0)) - np.maximum(
+        spans[0].min(axis=0), spans[1].min(axis=0)
+    )
+    vertical = (a.size[2] + b.size[2]) / 2.0 - abs(a.centre(table)[2] - b.centre(table)[2])
+    return max(0.0, min(float(depth.min()), vertical))
