@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From colour and depth images to clouds and to objects in the base frame."""

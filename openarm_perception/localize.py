@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a detection in the image to an object in the base frame: position, yaw, size. Usable without ROS.
+
+The base frame has z up; the table is a horizontal plane at a known height. The object is taken for a prism that stands on it
+(a box, an upright cylinder or can): its top gives the height, the outline of the top gives centre, yaw and footprint.
+
+The outline is found where neighbouring pixels part: where the far pixel lies lower, the edge is the ray between the two, cut
+with the plane of the top; where the far pixel lies on a side of the object, that point is on the edge already. So edges are
+known to a fraction of a pixel and nothing is eroded. Where the far pixel is nearer to the camera, something hides the
+object; such places are left out of the fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from openarm_common import se3
+from openarm_common.cameras import Intrinsics
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+from openarm_perception import footprint
+from openarm_perception.depth import DepthImage, DepthLimits, check_size, unit_scale
+from openarm_perception.detector import Detection2D, Mask
+
+Array = NDArray[np.float64]
+
+#: Pixels around a detection that are looked at.
+_MARGIN = 4
+
+
+class LocalizerConfig(Config):
+    """What counts as the object in the depth image."""
+
+    depth: DepthLimits = Field(DepthLimits(near=0.07, far=2.0), description="depths that count")
+    min_points: int = Field(40, ge=12, description="fewest pixels with depth on the object")
+    table_margin: float = Field(0.008, gt=0.0, le=0.05, description="points lower above the table than this are table, m")
+    top_band: float = Field(0.003, gt=0.0, le=0.02, description="points within this of the top's height are top, m")
+    depth_gate: float = Field(0.15, gt=0.0, description="points farther from the median depth are strays, m")
+    hidden_step: float = Field(0.010, gt=0.0, description="a neighbour nearer to the camera by this hides the object, m")
+    side_step: float = Field(0.015, gt=0.0, description="a lower neighbour within this is a side of the object, m")
+    std_floor: float = Field(0.0005, gt=0.0, description="smallest standard deviation of the position, m")
+
+
+@dataclass(frozen=True)
+class Detection3D:
+    """An object in the base frame.
+
+    Attributes:
+        label: What it is.
+        score: How certain, 0 to 1; less for what is partly hidden.
+        T_base_object: (4, 4); origin in the middle of the object, x along the smaller horizontal extent, z up.
+        size: Smaller and larger horizontal extent, height, m.
+        covariance: (6, 6) of x, y, z, roll, pitch, yaw in the base frame, m and rad.
+        points: Pixels with depth that were used.
+        visible: Share of the outline of the top that was in view, 0 to 1.
+        method: `rectangle` or `circle` through the outline of the top.
+    """
+
+    label: str
+    score: float
+    T_base_object: Array
+    size: tuple[float, float, float]
+    covariance: Array
+    points: int
+    visible: float
+    method: Literal["rectangle", "circle"]
+
+    @property
+    def position(self) -> Array:
+        """(3,) middle of the object in the base frame, m."""
+        return self.T_base_object[:3, 3].copy()
+
+    @property
+    def yaw(self) -> float:
+        """Direction of the smaller horizontal extent, rad in (-pi/2, pi/2]."""
+        return float(np.arctan2(self.T_base_object[1, 0], self.T_base_object[0, 0]))
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """The surroundings of a detection: pixel rays and points, all (h, w, ...)."""
+
+    rays: Array  # directions in the base frame, of unit depth
+    z: Array  # planar depth, m, NaN where invalid
+    points: Array  # base frame, m
+    mask: Mask  # the object by colour
+
+
+class Localizer:
+    """Finds where detections are.
+
+    Args:
+        config: What counts as the object.
+        table_height: Height of the table in the base frame, m.
+    """
+
+    def __init__(self, config: LocalizerConfig, table_height: float) -> None:
+        self.config = config
+        self.table_height = table_height
+
+    def coarse(self, found: Detection2D, depth: DepthImage, intrinsics: Intrinsics, T_base_camera: Array) -> Array:
+        """Point on the visible surface: the median pixel of the mask at the median of its valid depths.
+
+        A single pixel carries the whole noise of the sensor; the median of hundreds carries next to none of it.
+
+        Returns:
+            (3,) in the base frame, m.
+
+        Raises:
+            OpenArmError: BAD_IMAGE, when there are too few valid depths, or image and intrinsics disagree.
+        """
+        patch = self._patch(found, depth, intrinsics, T_base_camera)
+        v, u = np.nonzero(self._on_object(found, patch))
+        ray = patch.rays[int(np.median(v)), int(np.median(u))]
+        return T_base_camera[:3, 3] + ray * float(np.median(patch.z[v, u]))
+
+    def locate(self, found: Detection2D, depth: DepthImage, intrinsics: Intrinsics, T_base_camera: Array) -> Detection3D:
+        """The object of a detection.
+
+        Args:
+            found: In the colour image that the depth is aligned with.
+            depth: (h, w) uint16 millimetres or float32 metres, planar.
+            intrinsics: Of the camera, from its CameraInfo.
+            T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image.
+
+        Raises:
+            OpenArmError: BAD_IMAGE, when the image border cuts the object, depths are missing, or image and intrinsics
+                disagree; NOTHING_DETECTED, when nothing stands above the table there, or too much of it is hidden.
+        """
+        if found.truncated:
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"{found.label} at pixel {_pixel(found)} is cut by the border of the image; its size is unknown",
+            )
+        patch = self._patch(found, depth, intrinsics, T_base_camera)
+        solid = self._on_object(found, patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
+        count = int(np.count_nonzero(solid))
+        if count < self.config.min_points:
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"{found.label} at pixel {_pixel(found)} has {count} points above the table at {self.table_height:.3f} m,"
+                f" expected at least {self.config.min_points}; is it flat, or is the table height wrong?",
+            )
+        top = self._top_height(patch.points[..., 2][solid])
+        face = self._top_face(patch, top)
+        pixel = float(np.median(patch.z[solid])) / intrinsics.fx
+        outline, visible = self._outline(patch, face, top, T_base_camera[:3, 3])
+        try:
+            shape = footprint.fit(outline, pixel)
+        except OpenArmError as error:
+            where = f"{found.label} at pixel {_pixel(found)}"
+            raise OpenArmError(error.code, f"{where}: {error.message}") from error
+        return self._detection(found, shape, top, count, visible)
+
+    def _patch(self, found: Detection2D, depth: DepthImage, intrinsics: Intrinsics, T_base_camera: Array) -> _Patch:
+        scale = unit_scale(depth)
+        check_size("depth image", depth.shape, intrinsics)
+        # some surroundings: edges are found between a pixel of the object and one that is not
+        (u, v), (w, h) = found.origin, found.size
+        u0, u1 = max(u - _MARGIN, 0), min(u + w + _MARGIN, intrinsics.width)
+        v0, v1 = max(v - _MARGIN, 0), min(v + h + _MARGIN, intrinsics.height)
+        z = depth[v0:v1, u0:u1] * scale
+        z = np.where((z >= self.config.depth.near) & (z <= self.config.depth.far), z, np.nan)
+        x = (np.arange(u0, u1) - intrinsics.cx) / intrinsics.fx
+        y = (np.arange(v0, v1) - intrinsics.cy) / intrinsics.fy
+        in_camera = np.stack([*np.meshgrid(x, y), np.ones(z.shape)], axis=-1)
+        rays = in_camera @ T_base_camera[:3, :3].T
+        mask = np.zeros(z.shape, np.bool_)
+        mask[v - v0 : v - v0 + h, u - u0 : u - u0 + w] = found.mask
+        return _Patch(rays, z, rays * z[..., None] + T_base_camera[:3, 3], mask)
+
+    def _on_object(self, found: Detection2D, patch: _Patch) -> Mask:
+        valid = patch.mask & np.isfinite(patch.z)
+        count = int(np.count_nonzero(valid))
+        if count < self.config.min_points:
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"{found.label} at pixel {_pixel(found)} has {count} of {found.area} pixels with a depth of"
+                f" {self.config.depth.near} to {self.config.depth.far} m, expected at least {self.config.min_points}",
+            )
+        gate = np.abs(patch.z - np.median(patch.z[valid])) <= self.config.depth_gate
+        return valid & gate
+
+    def _top_height(self, heights: Array) -> float:
+        # the quantile lies on the top as long as the top is a tenth of what is seen; the median then takes the noise off
+        near_top = np.quantile(heights, 0.95)
+        band = heights[np.abs(heights - near_top) <= self.config.top_band]
+        return float(np.median(band))
+
+    def _top_face(self, patch: _Patch, top: float) -> Mask:
+        """The largest patch at the height of the top; depth, not colour, says where it ends."""
+        grown = cv2.dilate(patch.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        level = grown & (np.abs(patch.points[..., 2] - top) <= self.config.top_band)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(level.astype(np.uint8), connectivity=4)
+        return labels == 1 + int(np.argmax(stats[1:count, cv2.CC_STAT_AREA]))
+
+    def _outline(self, patch: _Patch, face: Mask, top: float, camera: Array) -> tuple[Array, float]:
+        """Points (n, 2) on the edges of the top, base frame, m, and the share of its outline that is in view."""
+        h, w = face.shape
+        found: list[Array] = []
+        hidden = 0
+        for dv, du in ((0, -1), (0, 1), (-1, 0), (1, 0)):
+            v, u = np.nonzero(face)
+            inside = (0 <= v + dv) & (v + dv < h) & (0 <= u + du) & (u + du < w)
+            hidden += int(np.count_nonzero(~inside))
+            v, u = v[inside], u[inside]
+            parted = ~face[v + dv, u + du]
+            v, u = v[parted], u[parted]
+            near, far = (v, u), (v + dv, u + du)
+            step = patch.z[far] - patch.z[near]
+            hides = step < -self.config.hidden_step
+            distance = np.linalg.norm(patch.points[far] - patch.points[near], axis=1)
+            height = patch.points[far][:, 2]
+            close = (distance <= self.config.side_step) & (height > self.table_height + self.config.table_margin)
+            level = close & (np.abs(height - top) <= self.config.top_band)  # a hole or another colour: not an edge
+            side = close & ~level & ~hides
+            rest = ~(close | hides)
+            hidden += int(np.count_nonzero(hides))
+            ray = 0.5 * (patch.rays[near] + patch.rays[far])[rest]
+            found.append(camera[:2] + ray[:, :2] * ((top - camera[2]) / ray[:, 2])[:, None])
+            found.append(patch.points[far][side, :2])
+        outline = np.concatenate(found)
+        return outline, len(outline) / max(len(outline) + hidden, 1)
+
+    def _detection(
+        self, found: Detection2D, shape: footprint.Footprint, top: float, count: int, visible: float
+    ) -> Detection3D:
+        height = top - self.table_height
+        R = se3.rot_z(shape.yaw)
+        T = se3.make(R, (*shape.centre, self.table_height + height / 2.0))
+        std = np.maximum([*shape.centre_std, 0.5 * self.config.std_floor], self.config.std_floor)
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = R @ np.diag(std**2) @ R.T
+        covariance[5, 5] = shape.yaw_std**2
+        size = (*shape.size, height)
+        return Detection3D(found.label, found.score * visible, T, size, covariance, count, visible, shape.kind)
+
+
+def _pixel(found: Detection2D) -> str:
+    return f"({found.centre[0]:.0f}, {found.centre[1]:.0f})"
