@@ -92,7 +92,7 @@ class SceneObject(Config):
     """
 
     name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")
-    label: str = Field(min_length=1, description="what the detector calls it; the colour where it is not given")
+    label: str = Field("", description="what the detector calls it; the colour where it is not given")
     shape: str = Field(description="box or cylinder")
     size: tuple[float, float, float] = Field(description="extents, m")
     color: str = Field(description="a colour of the palette")

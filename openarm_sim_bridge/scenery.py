@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What stands around the robot in MuJoCo: floor, light, table, objects, cameras.
+
+World frame: x forward, y left, z up; metres. Everything but the objects is without a hue, so that the colour detector sees
+objects only, and no light throws a shadow: an arm's would wander over the object region, and shadows double the cost of an
+image.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from openarm_common import se3
+from openarm_common.cameras import T_LINK_OPTICAL, CameraConfig, true_mount
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene import Scene, SceneObject, Table
+
+_TABLE_RGBA = (0.80, 0.785, 0.76, 1.0)
+_LEG_RGBA = (0.30, 0.30, 0.31, 1.0)
+_HOUSING_RGBA = (0.13, 0.13, 0.14, 1.0)
+_LENS_RGBA = (0.02, 0.02, 0.02, 1.0)
+_LEG = 0.02  # half the edge of a table leg, m
+#: Clipping planes of every camera, m; the near one lies before anything that a camera reports.
+NEAR, FAR = 0.02, 20.0
+#: A MuJoCo camera looks along -z with y up, an optical frame along z with y down.
+_T_OPTICAL_MUJOCO = se3.make(se3.rot_x(math.pi))
+
+
+def add_surroundings(spec: mujoco.MjSpec, contact: Mapping[str, Any]) -> None:
+    """Floor, sky and light."""
+    visual = spec.visual
+    visual.headlight.ambient = (0.38, 0.38, 0.38)
+    visual.headlight.diffuse = (0.22, 0.22, 0.22)
+    visual.headlight.specular = (0.05, 0.05, 0.05)
+    visual.quality.offsamples = 0
+    # With an extent of one metre the map's near and far are metres too.
+    spec.stat.extent = 1.0
+    spec.stat.center = (0.25, 0.0, 0.5)
+    visual.map.znear = NEAR
+    visual.map.zfar = FAR
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.93, 0.93, 0.93),
+        rgb2=(0.55, 0.55, 0.56),
+        width=64,
+        height=384,
+    )
+    spec.add_texture(
+        name="floor",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=(0.46, 0.46, 0.47),
+        rgb2=(0.50, 0.50, 0.51),
+        width=256,
+        height=256,
+    )
+    floor = spec.add_material(name="floor", texrepeat=(4.0, 4.0), texuniform=True, specular=0.05, shininess=0.1)
+    textures = list(floor.textures)
+    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "floor"
+    floor.textures = textures
+    world = spec.worldbody
+    world.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(4.0, 4.0, 0.1), material="floor", group=0, **contact
+    )
+    for name, direction, strength in (("key", (-0.65, 0.35, -1.0), 0.5), ("fill", (-0.3, -0.8, -0.5), 0.22)):
+        world.add_light(
+            name=name,
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            pos=(1.5, 0.0, 2.5),
+            dir=direction,
+            diffuse=(strength,) * 3,
+            specular=(0.25 * strength,) * 3,
+            castshadow=False,
+        )
+
+
+def add_table(spec: mujoco.MjSpec, table: Table, contact: Mapping[str, Any]) -> None:
+    """The body `table`, its origin in the middle of the top's surface."""
+    x, y = table.centre
+    length, width, thickness = table.extents
+    spec.add_material(name="table", rgba=_TABLE_RGBA, specular=0.05, shininess=0.1)
+    body = spec.worldbody.add_body(name="table", pos=(x, y, table.top_z))
+    body.add_geom(
+        name="table_top",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=(0.0, 0.0, -thickness / 2.0),
+        size=(length / 2.0, width / 2.0, thickness / 2.0),
+        material="table",
+        group=0,
+        **contact,
+    )
+    height = table.top_z - thickness
+    if height <= 0.0:
+        return
+    for along, x_sign in (("front", -1.0), ("back", 1.0)):
+        for across, y_sign in (("right", -1.0), ("left", 1.0)):
+            body.add_geom(
+                name=f"table_leg_{along}_{across}",
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                pos=(
+                    x_sign * max(length / 2.0 - 2.0 * _LEG, 0.0),
+                    y_sign * max(width / 2.0 - 2.0 * _LEG, 0.0),
+                    -thickness - height / 2.0,
+                ),
+                size=(_LEG, _LEG, height / 2.0),
+                rgba=_LEG_RGBA,
+                group=0,
+            )
+
+
+def add_object(spec: mujoco.MjSpec, item: SceneObject, table: Table, contact: Mapping[str, Any], condim: int) -> None:
+    """A free body; body and joint carry the object's name."""
+    body = spec.worldbody.add_body(
+        name=item.name, pos=item.centre(table), quat=(math.cos(item.yaw / 2.0), 0.0, 0.0, math.sin(item.yaw / 2.0))
+    )
+    body.add_freejoint(name=item.name)
+    x, y, z = item.size
+    if item.shape == "cylinder":
+        kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, (x / 2.0, z / 2.0, 0.0)
+    else:
+        kind, size = mujoco.mjtGeom.mjGEOM_BOX, (x / 2.0, y / 2.0, z / 2.0)
+    body.add_geom(
+        name=item.name, type=kind, size=size, mass=item.mass_kg, rgba=item.rgba, condim=condim, group=1, **contact
+    )
+
+
+def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig], mount_seed: int | None) -> None:
+    """Cameras where they really are, with their housings right behind the lens.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when a parent is not a link of the robot.
+    """
+    offscreen = spec.visual.global_
+    for camera in cameras:
+        parent = spec.body(camera.parent) if camera.parent != "world" else spec.worldbody
+        if parent is None:
+            names = ", ".join(body.name for body in spec.bodies)
+            raise OpenArmError(
+                Code.CONFIG_INVALID, f"camera {camera.name!r}: no link {camera.parent!r} to mount it on; links: {names}"
+            )
+        T_parent_link = true_mount(camera, mount_seed)
+        T_parent_camera = T_parent_link @ T_LINK_OPTICAL @ _T_OPTICAL_MUJOCO
+        parent.add_camera(
+            name=camera.name,
+            pos=T_parent_camera[:3, 3],
+            quat=_quat_wxyz(T_parent_camera),
+            fovy=camera.fovy_deg,
+            resolution=(camera.width, camera.height),
+        )
+        offscreen.offwidth = max(offscreen.offwidth, camera.width)
+        offscreen.offheight = max(offscreen.offheight, camera.height)
+        if camera.housing is not None:
+            _add_housing(parent, camera, T_parent_link)
+
+
+def _add_housing(parent: Any, camera: CameraConfig, T_parent_link: se3.Array) -> None:
+    """A box with its front face just behind the lens; it collides like a part of the link that carries it."""
+    assert camera.housing is not None
+    depth, width, height = camera.housing
+    T_parent_housing = T_parent_link @ se3.make(None, (-depth / 2.0 - 0.002, 0.0, 0.0))
+    parent.add_geom(
+        name=f"{camera.name}_housing",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=T_parent_housing[:3, 3],
+        quat=_quat_wxyz(T_parent_housing),
+        size=(depth / 2.0, width / 2.0, height / 2.0),
+        rgba=_HOUSING_RGBA,
+        mass=0.0,
+        group=2,
+    )
+    T_parent_lens = T_parent_link @ se3.make(se3.rot_y(math.pi / 2.0), (-0.0015, 0.0, 0.0))
+    parent.add_geom(
+        name=f"{camera.name}_lens",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        pos=T_parent_lens[:3, 3],
+        quat=_quat_wxyz(T_parent_lens),
+        size=(min(width, height) * 0.35, 0.001, 0.0),
+        rgba=_LENS_RGBA,
+        mass=0.0,
+        contype=0,
+        conaffinity=0,
+        group=2,
+    )
+
+
+def _quat_wxyz(T: se3.Array) -> se3.Array:
+    return np.roll(se3.quat_xyzw_from_matrix(T[:3, :3]), 1)
