@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exact collision checks of one arm: against itself, the rest of the robot, boxes around it, and what it holds.
+
+The robot's shapes come from the URDF, the pairs that may touch from the SRDF; pinocchio and coal do the geometry behind
+a broad phase. Every pair has a distance that it must keep: the checks answer "nearer than that?" Boxes are in the base
+frame (the description's root), held boxes in the frame of the tool centre point. m, rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.collision_robot import CollisionRobot
+
+Array = NDArray[np.float64]
+
+#: Two shapes further apart than this in a report are not worth a number.
+_REPORT_RANGE = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """An oriented box: `T` (4, 4) of its centre, `size` (3,) full edges, m."""
+
+    id: str
+    T: Array
+    size: Array
+
+    def __post_init__(self) -> None:
+        """Refuse a box that is none.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, naming the box and its size.
+        """
+        if self.size.shape != (3,) or not np.all(np.isfinite(self.size)) or not np.all(self.size > 0.0):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"box {self.id!r} has size {self.size.tolist()}, expected three edges > 0 m"
+            )
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """Distances that pairs keep, m.
+
+    Attributes:
+        own: Between links of the arm, and between the arm and the robot's fixed body.
+        world: Between the arm and boxes or other arms, and between a held box and everything.
+        fingers: Between the gripper and boxes; smaller on the straight parts, where it works near a surface.
+        touch: Between the palm (and the rest of the arm) and a box that the fingers may touch.
+        rest: Between a held box and what it may stand on; negative allows an overlap, as boxes are estimates.
+    """
+
+    own: float = 0.003
+    world: float = 0.010
+    fingers: float = 0.010
+    touch: float = 0.002
+    rest: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What is around an arm in one query.
+
+    Attributes:
+        state: Positions of (at least) the robot's other movable joints; missing ones are taken as 0.
+        boxes: Obstacles, base frame.
+        held: Boxes held by this arm, pose in the tool frame.
+        touchable: Ids of boxes that the fingers may touch.
+        supports: Ids of boxes that a held box may stand on.
+        clearance: Distances to keep.
+    """
+
+    state: Mapping[str, float]
+    boxes: Sequence[Box] = ()
+    held: Sequence[Box] = ()
+    touchable: frozenset[str] = frozenset()
+    supports: frozenset[str] = frozenset()
+    clearance: Clearance = field(default_factory=Clearance)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Two things nearer to each other than allowed; `distance` < 0 is how deep they overlap, m."""
+
+    first: str
+    second: str
+    distance: float
+    required: float
+
+    def __str__(self) -> str:
+        """Sentence for a refusal."""
+        if self.distance <= 0.0:
+            return f"{self.first} would hit {self.second} ({-self.distance * 1e3:.0f} mm deep)"
+        return (
+            f"{self.first} would come within {self.distance * 1e3:.1f} mm of {self.second},"
+            f" expected {self.required * 1e3:.0f} mm"
+        )
+
+
+class CollisionScene:
+    """One arm in one set of surroundings. Not for two threads at once; build one for each query (4 ms).
+
+    Args:
+        robot: The robot seen by the arm.
+        around: What is around it.
+    """
+
+    def __init__(self, robot: CollisionRobot, around: Surroundings) -> None:
+        self._robot = robot
+        self._around = around
+        self._geometry = robot.geometry.copy()
+        self._names = [*robot.links]
+        self._q = robot.configuration(around.state)
+        self.levers = robot.levers
+        pairs, required = self._pairs()
+        for i, j in pairs:
+            self._geometry.addCollisionPair(pin.CollisionPair(i, j))
+        self._pair_index = pairs
+        self._required = np.array(required)
+        self._data = robot.model.createData()
+        self._geometry_data = pin.GeometryData(self._geometry)
+        self._set_margins()
+
+    def collides(self, q: ArrayLike) -> bool:
+        """Whether some pair is nearer than it may be at the arm's configuration (n,)."""
+        self._q[self._robot.columns] = q
+        return bool(pin.computeCollisions(self._robot.model, self._data, self._manager, self._q, True))
+
+    def contacts(self, q: ArrayLike) -> list[Contact]:
+        """All pairs that are nearer than they may be, the deepest first."""
+        found = [self._contact(k) for k in self._colliding(q)]
+        return sorted(found, key=lambda contact: contact.distance - contact.required)
+
+    def edge_free(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.04) -> bool:
+        """Whether the straight joint line between two configurations is free, the ends included.
+
+        Args:
+            a: (n,) rad.
+            b: (n,) rad.
+            step: No joint turns further than this between two checks, rad.
+            travel: No point of the arm moves further than this between two checks, m.
+        """
+        return self.first_hit(a, b, step, travel) is None
+
+    def first_hit(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.04) -> Array | None:
+        """Some colliding configuration on the line between two, or None; far-apart points are looked at first."""
+        difference = b - a
+        size = np.abs(difference)
+        n = int(np.ceil(max(float(size.max()) / step, float(size @ self.levers) / travel, 1.0)))
+        for u in _spread(n):
+            q = a + u * difference
+            if self.collides(q):
+                return q
+        return None
+
+    def relax(self, q: ArrayLike, allowance: float) -> Contact | None:
+        """Let pairs that are too near at `q` stay as near as they are: an arm must be able to leave where it is.
+
+        Args:
+            q: (n,) where a motion starts.
+            allowance: Overlap that is taken for an error of measurement, m.
+
+        Returns:
+            A pair that overlaps deeper than that (nothing is relaxed then), or None.
+        """
+        colliding = self._colliding(q)
+        contacts = [self._contact(k) for k in colliding]
+        for contact in contacts:
+            if contact.distance < -allowance:
+                return contact
+        for k, contact in zip(colliding, contacts, strict=True):
+            self._required[k] = contact.distance - 1e-3
+        if colliding:
+            self._set_margins()
+        return None
+
+    def place_held(self, held: Sequence[Box]) -> None:
+        """Move the held boxes to other poses in the tool frame (same number and sizes as the scene was built with)."""
+        first = len(self._robot.links)
+        for k, box in enumerate(held):
+            self._geometry.geometryObjects[first + k].placement = pin.SE3(self._robot.kinematics.tip @ box.T)
+
+    def _colliding(self, q: ArrayLike) -> list[int]:
+        self._q[self._robot.columns] = q
+        pin.computeCollisions(self._robot.model, self._data, self._geometry, self._geometry_data, self._q, False)
+        results = self._geometry_data.collisionResults
+        return [k for k in range(len(self._pair_index)) if results[k].isCollision()]
+
+    def _contact(self, k: int) -> Contact:
+        result = pin.computeDistance(self._geometry, self._geometry_data, k)
+        i, j = self._pair_index[k]
+        distance = min(float(result.min_distance), _REPORT_RANGE)
+        return Contact(self._names[i], self._names[j], distance, float(self._required[k]))
+
+    def _set_margins(self) -> None:
+        for request, margin in zip(self._geometry_data.collisionRequests, self._required.tolist(), strict=True):
+            request.security_margin = margin
+        self._manager = pin.BroadPhaseManager_NaiveCollisionManager(
+            self._robot.model, self._geometry, self._geometry_data
+        )
+
+    def _pairs(self) -> tuple[list[tuple[int, int]], list[float]]:
+        """Add the boxes to the geometry; all pairs to check and the distance that each must keep."""
+        robot, around, keep = self._robot, self._around, self._around.clearance
+        pairs = list(robot.pairs)
+        own = robot.arm.fixed | robot.arm.moving
+        required = [keep.own if robot.links[j] in own else keep.world for _, j in pairs]
+        tool = robot.joints[-1]
+        held = [self._add(f"held {box.id}", tool, robot.kinematics.tip @ box.T, box) for box in around.held]
+        for h in held:
+            self.levers = np.maximum(self.levers, robot.levers_of(self._geometry.geometryObjects[h]))
+            for i, link in enumerate(robot.links):
+                if link not in robot.arm.hand:
+                    pairs.append((h, i))
+                    required.append(keep.own if link in robot.arm.moving else keep.world)
+        for box in around.boxes:
+            b = self._add(box.id, 0, box.T, box)
+            touchable = box.id in around.touchable
+            for i in robot.moving:
+                finger = robot.links[i] in robot.arm.gripper
+                if touchable and finger:
+                    continue
+                pairs.append((i, b))
+                required.append(keep.touch if touchable else keep.fingers if finger else keep.world)
+            for h in held:
+                pairs.append((h, b))
+                required.append(keep.rest if box.id in around.supports else keep.fingers)
+        return pairs, required
+
+    def _add(self, name: str, joint: int, T: Array, box: Box) -> int:
+        shape = pin.GeometryObject(name, joint, pin.SE3(T), coal.Box(*box.size.tolist()))
+        self._names.append(name)
+        return self._geometry.addGeometryObject(shape)
+
+
+def box_from(id: str, p: ArrayLike, size: ArrayLike, R: Array | None = None) -> Box:
+    """Box of its centre (3,), full edges (3,) and rotation (3, 3)."""
+    T = np.eye(4)
+    T[:3, 3] = p
+    if R is not None:
+        T[:3, :3] = R
+    return Box(id, T, np.asarray(size, dtype=np.float64))
+
+
+@lru_cache(maxsize=512)
+def _spread(n: int) -> tuple[float, ...]:
+    """0, 1/n, ..., 1 with the ends and far-apart points first, so that a collision is found early."""
+    order: list[int] = [n, 0]
+    gap = n
+    seen = {0, n}
+    while len(seen) <= n:
+        gap = max(gap // 2, 1)
+        for k in range(gap, n, gap):
+            if k not in seen:
+                seen.add(k)
+                order.append(k)
+    return tuple(k / n for k in order)

@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba kernels of a serial chain: forward kinematics, Jacobian, damped least squares.
+
+A chain is given by `placements` (n, 4, 4): joint i in the frame of joint i-1 at zero (the first in the base frame),
+`axes` (n, 3): unit joint axes in their joint frames, `prismatic` (n,) bool, and `tip` (4, 4): the tool in the frame of
+the last joint. Angles rad, lengths m, everything expressed in the base frame. The kernels release the GIL.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Turns a rotation error (rad) into a length (m) so that both can be minimised together: about the size of a hand.
+ROTATION_LENGTH = 0.2
+#: No joint moves further than this in one iteration: beyond it the linearisation says nothing.
+_MAX_STEP = 0.6
+#: An attempt is given up after this many iterations that hardly improve.
+_STALL = 8
+
+
+@njit(cache=True, nogil=True)
+def forward(
+    q: Array,
+    placements: Array,
+    axes: Array,
+    prismatic: NDArray[np.bool_],
+    tip: Array,
+    origins: Array,
+    directions: Array,
+    out: Array,
+) -> None:
+    """Forward kinematics; fills `origins` (n, 3) and `directions` (n, 3) of the joint axes and `out` (4, 4)."""
+    r = np.eye(3)
+    t = np.zeros(3)
+    a = np.empty((3, 3))
+    turn = np.empty((3, 3))
+    for i in range(q.shape[0]):
+        for row in range(3):
+            t[row] += (
+                r[row, 0] * placements[i, 0, 3] + r[row, 1] * placements[i, 1, 3] + r[row, 2] * placements[i, 2, 3]
+            )
+        for row in range(3):
+            for col in range(3):
+                a[row, col] = (
+                    r[row, 0] * placements[i, 0, col]
+                    + r[row, 1] * placements[i, 1, col]
+                    + r[row, 2] * placements[i, 2, col]
+                )
+        x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
+        for row in range(3):
+            origins[i, row] = t[row]
+            directions[i, row] = a[row, 0] * x + a[row, 1] * y + a[row, 2] * z
+        if prismatic[i]:
+            for row in range(3):
+                t[row] += directions[i, row] * q[i]
+                for col in range(3):
+                    r[row, col] = a[row, col]
+            continue
+        c, s = math.cos(q[i]), math.sin(q[i])
+        v = 1.0 - c
+        turn[0, 0] = c + x * x * v
+        turn[0, 1] = x * y * v - z * s
+        turn[0, 2] = x * z * v + y * s
+        turn[1, 0] = y * x * v + z * s
+        turn[1, 1] = c + y * y * v
+        turn[1, 2] = y * z * v - x * s
+        turn[2, 0] = z * x * v - y * s
+        turn[2, 1] = z * y * v + x * s
+        turn[2, 2] = c + z * z * v
+        for row in range(3):
+            for col in range(3):
+                r[row, col] = a[row, 0] * turn[0, col] + a[row, 1] * turn[1, col] + a[row, 2] * turn[2, col]
+    for row in range(3):
+        out[row, 3] = t[row] + r[row, 0] * tip[0, 3] + r[row, 1] * tip[1, 3] + r[row, 2] * tip[2, 3]
+        for col in range(3):
+            out[row, col] = r[row, 0] * tip[0, col] + r[row, 1] * tip[1, col] + r[row, 2] * tip[2, col]
+        out[3, row] = 0.0
+    out[3, 3] = 1.0
+
+
+@njit(cache=True, nogil=True)
+def forward_many(
+    configurations: Array, placements: Array, axes: Array, prismatic: NDArray[np.bool_], tip: Array
+) -> Array:
+    """Tool poses (m, 4, 4) of configurations (m, n)."""
+    m, n = configurations.shape
+    poses = np.empty((m, 4, 4))
+    origins = np.empty((n, 3))
+    directions = np.empty((n, 3))
+    for k in range(m):
+        forward(configurations[k], placements, axes, prismatic, tip, origins, directions, poses[k])
+    return poses
+
+
+@njit(cache=True, nogil=True)
+def jacobian(origins: Array, directions: Array, prismatic: NDArray[np.bool_], p: Array, out: Array) -> None:
+    """Geometric Jacobian (6, n) at point `p`: linear rows first, base frame."""
+    for i in range(origins.shape[0]):
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        if prismatic[i]:
+            out[0, i], out[1, i], out[2, i] = x, y, z
+            out[3, i], out[4, i], out[5, i] = 0.0, 0.0, 0.0
+            continue
+        dx, dy, dz = p[0] - origins[i, 0], p[1] - origins[i, 1], p[2] - origins[i, 2]
+        out[0, i] = y * dz - z * dy
+        out[1, i] = z * dx - x * dz
+        out[2, i] = x * dy - y * dx
+        out[3, i], out[4, i], out[5, i] = x, y, z
+
+
+@njit(cache=True, nogil=True)
+def _pose_error(target: Array, pose: Array, out: Array) -> None:
+    """Position error and rotation vector (6,) that take `pose` to `target`, base frame."""
+    e = np.empty((3, 3))
+    for row in range(3):
+        out[row] = target[row, 3] - pose[row, 3]
+        for col in range(3):
+            e[row, col] = target[row, 0] * pose[col, 0] + target[row, 1] * pose[col, 1] + target[row, 2] * pose[col, 2]
+    x, y, z = e[2, 1] - e[1, 2], e[0, 2] - e[2, 0], e[1, 0] - e[0, 1]
+    sine = math.sqrt(x * x + y * y + z * z)
+    trace = e[0, 0] + e[1, 1] + e[2, 2]
+    if sine < 1e-9 and trace < 0.0:  # half a turn: any axis gets the iteration off the saddle
+        out[3], out[4], out[5] = math.pi, 0.0, 0.0
+        return
+    k = math.atan2(sine, trace - 1.0) / sine if sine > 1e-9 else 0.5
+    out[3], out[4], out[5] = k * x, k * y, k * z
+
+
+@njit(cache=True, nogil=True)
+def _solve_spd(h: Array, g: Array, x: Array) -> None:
+    """Solve ``h x = g`` in place for a small symmetric positive definite `h` (lower triangle), by Cholesky."""
+    n = g.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            s = h[i, j]
+            for k in range(j):
+                s -= h[i, k] * h[j, k]
+            h[i, j] = math.sqrt(s) if i == j else s / h[j, j]
+    for i in range(n):
+        s = g[i]
+        for k in range(i):
+            s -= h[i, k] * x[k]
+        x[i] = s / h[i, i]
+    for i in range(n - 1, -1, -1):
+        s = x[i]
+        for k in range(i + 1, n):
+            s -= h[k, i] * x[k]
+        x[i] = s / h[i, i]
+
+
+@njit(cache=True, nogil=True)
+def solve_ik(
+    target: Array,
+    start: Array,
+    posture: Array,
+    posture_weight: float,
+    position_only: bool,
+    tolerance: tuple[float, float],
+    iterations: int,
+    restarts: int,
+    seed: int,
+    lower: Array,
+    upper: Array,
+    placements: Array,
+    axes: Array,
+    prismatic: NDArray[np.bool_],
+    tip: Array,
+    best: Array,
+) -> tuple[bool, float, float, int]:
+    """Levenberg-Marquardt with damping by the squared error (Sugihara 2011), joints held at limits they push into.
+
+    Args:
+        target: (4, 4) tool pose.
+        start: (n,) first guess; further guesses are uniform within the limits, drawn from `seed`.
+        posture: (n,) configuration that redundant motion is pulled towards.
+        posture_weight: Strength of that pull; it vanishes with the error, so the solution stays exact.
+        position_only: Ignore the rotation.
+        tolerance: Position (m) and rotation (rad).
+        iterations: Per guess.
+        restarts: Further guesses after the first.
+        seed: Of the guesses.
+        lower: (n,) limits.
+        upper: (n,) limits.
+        placements: Chain, see the module's head.
+        axes: Chain.
+        prismatic: Chain.
+        tip: Chain.
+        best: (n,) output: the solution, or the configuration with the smallest error found.
+
+    Returns:
+        Solved, position error (m), rotation error (rad) of `best`, and the number of restarts used.
+    """
+    n = start.shape[0]
+    np.random.seed(seed)
+    x = np.empty(n)
+    pose = np.empty((4, 4))
+    origins = np.empty((n, 3))
+    directions = np.empty((n, 3))
+    jac = np.empty((6, n))
+    e = np.empty(6)
+    h = np.empty((n, n))
+    g = np.empty(n)
+    dx = np.empty(n)
+    held = np.zeros(n, np.bool_)
+    w = 0.0 if position_only else ROTATION_LENGTH
+    best_cost, best_p, best_r = np.inf, np.inf, np.inf
+    for i in range(n):
+        x[i] = min(upper[i], max(lower[i], start[i]))
+        best[i] = x[i]
+    for attempt in range(restarts + 1):
+        least, stall = np.inf, 0
+        for _ in range(iterations):
+            forward(x, placements, axes, prismatic, tip, origins, directions, pose)
+            _pose_error(target, pose, e)
+            error_p = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
+            error_r = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
+            cost = error_p * error_p + w * w * error_r * error_r
+            if cost < best_cost:
+                best_cost, best_p, best_r = cost, error_p, error_r
+                for i in range(n):
+                    best[i] = x[i]
+            if error_p < tolerance[0] and (position_only or error_r < tolerance[1]):
+                return True, error_p, error_r, attempt
+            if cost < 0.98 * least:
+                least, stall = cost, 0
+            else:
+                stall += 1
+                if stall > _STALL:
+                    break
+            jacobian(origins, directions, prismatic, pose[:3, 3], jac)
+            for row in range(3, 6):
+                e[row] *= w
+                for i in range(n):
+                    jac[row, i] *= w
+            damping = 0.5 * cost + 1e-7
+            pull = posture_weight * cost
+            for i in range(n):
+                s = pull * (posture[i] - x[i])
+                for row in range(6):
+                    s += jac[row, i] * e[row]
+                g[i] = s
+                held[i] = (x[i] <= lower[i] + 1e-9 and s < 0.0) or (x[i] >= upper[i] - 1e-9 and s > 0.0)
+            for i in range(n):
+                for j in range(i + 1):
+                    s = 0.0
+                    if not (held[i] or held[j]):
+                        for row in range(6):
+                            s += jac[row, i] * jac[row, j]
+                    h[i, j] = s
+                h[i, i] += damping + pull
+                if held[i]:
+                    h[i, i] = 1.0
+                    g[i] = 0.0
+            _solve_spd(h, g, dx)
+            largest = 0.0
+            for i in range(n):
+                largest = max(largest, abs(dx[i]))
+            scale = _MAX_STEP / largest if largest > _MAX_STEP else 1.0
+            for i in range(n):
+                x[i] = min(upper[i], max(lower[i], x[i] + scale * dx[i]))
+        for i in range(n):
+            x[i] = lower[i] + (upper[i] - lower[i]) * np.random.random()
+    return False, best_p, best_r, restarts
