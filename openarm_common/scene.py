@@ -87,8 +87,8 @@ class Table(Config):
 class SceneObject(Config):
     """A free body in one plain colour.
 
-    `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height. `position`
-    is x, y, or x, y, z of the centre; without z the object stands on the table.
+    `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height.
+    `position` is x, y, or x, y, z of the centre; without z the object stands on the table.
     """
 
     name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")

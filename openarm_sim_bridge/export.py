@@ -19,12 +19,12 @@ from openarm_common.scene import load_scene
 from openarm_sim_bridge.model import PhysicsConfig, build_spec, robot_spec
 
 Kind = Literal["urdf", "mjcf", "srdf"]
-#: Views of `render_png`: point looked at (m, world), distance (m), azimuth and elevation (degrees) as MuJoCo counts them.
+#: Views: point looked at (m, world), distance (m), azimuth and elevation (degrees) as MuJoCo counts them.
 VIEWS: Mapping[str, tuple[tuple[float, float, float], float, float, float]] = {
-    "front": ((0.15, 0.0, 0.56), 1.75, 180.0, -12.0),
-    "three_quarter": ((0.16, 0.0, 0.55), 1.75, 146.0, -20.0),
-    "side": ((0.20, 0.0, 0.56), 1.65, 90.0, -8.0),
-    "back": ((0.10, 0.0, 0.55), 1.75, -35.0, -18.0),
+    "front": ((0.10, 0.0, 0.60), 1.75, 180.0, -10.0),
+    "three_quarter": ((0.13, 0.0, 0.60), 1.55, 146.0, -18.0),
+    "side": ((0.22, 0.0, 0.58), 1.55, 90.0, -6.0),
+    "back": ((0.10, 0.0, 0.58), 1.6, -35.0, -16.0),
     "top": ((0.25, 0.0, 0.45), 1.6, 180.0, -75.0),
 }
 
@@ -91,11 +91,7 @@ def render(
         )
     q = description.group_state("both_arms", posture) | {description.finger_joint(side): opening for side in SIDES}
     spec = build_spec(description, load_scene(scene, seed), cameras)
-    # A picture may cost what a camera may not: shadows and smooth edges.
-    spec.light("key").castshadow = True
-    spec.visual.quality.shadowsize = 4096
-    spec.visual.quality.offsamples = 8
-    spec.visual.map.shadowclip = 1.2
+    _light_for_people(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = max(width, 640), max(height, 480)
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -111,6 +107,17 @@ def render(
     with mujoco.Renderer(model, height, width) as renderer:
         renderer.update_scene(data, camera)
         return renderer.render().copy()
+
+
+def _light_for_people(spec: mujoco.MjSpec) -> None:
+    """Give a picture what would cost a camera too much: a spot that throws shadows, and smooth edges."""
+    key = spec.light("key")
+    key.type = mujoco.mjtLightType.mjLIGHT_SPOT
+    key.pos, key.dir = (1.3, -0.7, 2.7), (-1.1, 0.7, -2.2)
+    key.cutoff, key.exponent, key.attenuation = 38.0, 0.0, (1.0, 0.0, 0.0)
+    key.castshadow = True
+    spec.visual.quality.shadowsize = 8192
+    spec.visual.quality.offsamples = 8
 
 
 def render_png(

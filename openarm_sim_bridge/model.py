@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the robot description and a scene to a MuJoCo model.
 
-The URDF goes through MuJoCo's own importer, links and names kept; what a URDF cannot say is added: actuators, armature,
-finger coupling, gravity compensation, pad friction, pairs without contact, sites, cameras, table, objects, lights. World
-frame: x forward, y left, z up; SI units. Geom groups: 0 surroundings, 1 objects, 2 looks of the robot, 3 its collision
-shapes (not drawn).
+The URDF goes through MuJoCo's own importer, links and names kept; what a URDF cannot say is added: actuators,
+armature, finger coupling, gravity compensation, pad friction, pairs without contact, sites; and what is not the robot:
+cameras, table, objects, lights. World frame: x forward, y left, z up; SI units. Geom groups: 0 surroundings, 1 objects,
+2 looks of the robot, 3 its collision shapes (not drawn).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pydantic import Field
 
 from openarm_common.cameras import CameraConfig
 from openarm_common.config import Config
-from openarm_common.description import BASE_LINK, SIDES, RobotDescription, Side
+from openarm_common.description import SIDES, RobotDescription, Side
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Scene
 from openarm_sim_bridge import scenery
@@ -49,8 +49,9 @@ _SHAPES_GROUP, _LOOKS_GROUP = 3, 2
 class PhysicsConfig(Config):
     """Solver, contact and actuator settings with which grasps hold by friction alone.
 
-    Joint damping and dry friction come from the URDF, force limits of the arm from its efforts. `impratio` and a few no-slip
-    iterations keep a held object from creeping; the finger force is `finger_kp` times the remaining travel, capped.
+    Joint damping and dry friction come from the URDF, force limits of the arm from its efforts. `impratio` and a few
+    no-slip iterations keep a held object from creeping. The finger force is `finger_kp` times the remaining travel, up
+    to `finger_force`.
     """
 
     timestep: float = Field(0.002, gt=0.0, le=0.01, description="s; the control tick of 10 ms is a multiple of it")
@@ -259,6 +260,3 @@ def _add_servo(
     actuator.ctrlrange = (joint.lower, joint.upper)
     if math.isfinite(force):
         actuator.forcerange = (-force, force)
-
-
-__all__ = ["BASE_LINK", "PhysicsConfig", "build_spec", "compile_model", "contact_of", "robot_spec"]

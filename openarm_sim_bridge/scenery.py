@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stands around the robot in MuJoCo: floor, light, table, objects, cameras.
 
-World frame: x forward, y left, z up; metres. Everything but the objects is without a hue, so that the colour detector sees
-objects only, and no light throws a shadow: an arm's would wander over the object region, and shadows double the cost of an
-image.
+World frame: x forward, y left, z up; metres. Everything but the objects is without a hue, so that the colour detector
+sees objects only, and no light throws a shadow: an arm's would wander over the object region, and shadows double the
+cost of an image.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.cameras import T_LINK_OPTICAL, CameraConfig, true_mount
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import Scene, SceneObject, Table
+from openarm_common.scene import SceneObject, Table
 
 _TABLE_RGBA = (0.80, 0.785, 0.76, 1.0)
 _LEG_RGBA = (0.30, 0.30, 0.31, 1.0)
@@ -157,16 +157,15 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig], mount_seed
         offscreen.offwidth = max(offscreen.offwidth, camera.width)
         offscreen.offheight = max(offscreen.offheight, camera.height)
         if camera.housing is not None:
-            _add_housing(parent, camera, T_parent_link)
+            _add_housing(parent, camera.name, camera.housing, T_parent_link)
 
 
-def _add_housing(parent: Any, camera: CameraConfig, T_parent_link: se3.Array) -> None:
+def _add_housing(parent: Any, name: str, housing: tuple[float, float, float], T_parent_link: se3.Array) -> None:
     """A box with its front face just behind the lens; it collides like a part of the link that carries it."""
-    assert camera.housing is not None
-    depth, width, height = camera.housing
+    depth, width, height = housing
     T_parent_housing = T_parent_link @ se3.make(None, (-depth / 2.0 - 0.002, 0.0, 0.0))
     parent.add_geom(
-        name=f"{camera.name}_housing",
+        name=f"{name}_housing",
         type=mujoco.mjtGeom.mjGEOM_BOX,
         pos=T_parent_housing[:3, 3],
         quat=_quat_wxyz(T_parent_housing),
@@ -177,7 +176,7 @@ def _add_housing(parent: Any, camera: CameraConfig, T_parent_link: se3.Array) ->
     )
     T_parent_lens = T_parent_link @ se3.make(se3.rot_y(math.pi / 2.0), (-0.0015, 0.0, 0.0))
     parent.add_geom(
-        name=f"{camera.name}_lens",
+        name=f"{name}_lens",
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
         pos=T_parent_lens[:3, 3],
         quat=_quat_wxyz(T_parent_lens),
