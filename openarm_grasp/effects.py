@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the state machine asks for, and what it is told: frozen data, no ROS.
+
+A state answers with a recipe, a tuple of effects that are carried out in order; the first that fails ends the recipe.
+What came of it returns to the machine as one `Outcome`. Trajectories are opaque here: the planner's, handed back to be
+executed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code
+from openarm_grasp.candidates import Box, GraspCandidate
+from openarm_grasp.evidence import Evidence
+from openarm_grasp.observation import Frame
+from openarm_grasp.place import PlaceTarget
+
+Array = NDArray[np.float64]
+Trajectory: TypeAlias = object
+
+
+# --- what is asked for
+@dataclass(frozen=True)
+class GraspRequest:
+    """A user's wish.
+
+    Attributes:
+        label: What to pick; "" takes the detection with the highest score.
+        arm: "auto", "left" or "right".
+        place: (2,) or (3,) footprint centre, base frame, m; None lets a free spot be chosen.
+        dry_run: Plan and report, do not move.
+    """
+
+    label: str
+    arm: str = "auto"
+    place: tuple[float, ...] | None = None
+    dry_run: bool = False
+
+
+@dataclass(frozen=True)
+class GoHome:
+    """Move the arms that are not there to their home posture, one after the other.
+
+    Attributes:
+        arms: Which.
+        obstacles: Boxes to keep clear of, base frame.
+        back_off_below: A hand lower than this (z, base frame, m) may be among the objects and first backs off along its
+            own approach axis.
+    """
+
+    arms: tuple[str, ...]
+    obstacles: tuple[Box, ...] = ()
+    back_off_below: float = float("-inf")
+
+
+@dataclass(frozen=True)
+class Observe:
+    """Collect `frames` frames of detections that are taken from now on; result `Frames`."""
+
+    frames: int
+
+
+@dataclass(frozen=True)
+class ToBase:
+    """Express frames of detections in the base frame at their stamps; result `Frames`."""
+
+    frames: tuple[Frame, ...]
+    frame_id: str
+
+
+@dataclass(frozen=True)
+class PlanGrasp:
+    """Choose and plan one of the candidates with one arm; result `Planned`."""
+
+    arm: str
+    candidates: tuple[GraspCandidate, ...]
+    obstacles: tuple[Box, ...]
+    target: Box
+
+
+@dataclass(frozen=True)
+class PlanPlace:
+    """Choose and plan one of the place targets; result `Planned`.
+
+    Attributes:
+        held: What the hand carries, TCP frame.
+        after: Trajectory whose end is the start; None starts at the present joints.
+    """
+
+    arm: str
+    targets: tuple[PlaceTarget, ...]
+    obstacles: tuple[Box, ...]
+    held: Box
+    after: Trajectory | None = None
+
+
+@dataclass(frozen=True)
+class ProbeReach:
+    """Ask how near each arm's TCP comes to a pose; result `Reach`."""
+
+    arms: tuple[str, ...]
+    T_base_tcp: Array
+
+
+@dataclass(frozen=True)
+class Execute:
+    """Follow a planned trajectory; with `carrying`, a hand that closes on nothing stops it (GRASP_LOST)."""
+
+    arm: str
+    trajectory: Trajectory
+    what: str
+    carrying: bool = False
+
+
+@dataclass(frozen=True)
+class MoveLinear:
+    """Move the TCP to a pose on a straight line."""
+
+    arm: str
+    T_base_tcp: Array
+    what: str
+
+
+@dataclass(frozen=True)
+class MoveGripper:
+    """Move the fingers to `position` (m a finger) until they are there or push against something."""
+
+    arm: str
+    position: float
+    what: str
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Read the gripper at rest; result `Evidence`.
+
+    Attributes:
+        expected: Width between the fingers, m.
+        T_base_tcp: (4, 4) planned pose that the TCP error is measured against; None leaves the error 0.
+        settle: Longest wait for the fingers to rest, s.
+    """
+
+    arm: str
+    expected: float
+    T_base_tcp: Array | None = None
+    settle: float = 0.0
+
+
+@dataclass(frozen=True)
+class Wait:
+    """Let robot time pass, s."""
+
+    duration: float
+
+
+@dataclass(frozen=True)
+class Together:
+    """Effects that are carried out at the same time."""
+
+    effects: tuple[Effect, ...]
+
+
+Effect: TypeAlias = (
+    GoHome
+    | Observe
+    | ToBase
+    | PlanGrasp
+    | PlanPlace
+    | ProbeReach
+    | Execute
+    | MoveLinear
+    | MoveGripper
+    | Measure
+    | Wait
+    | Together
+)
+Effects: TypeAlias = tuple[Effect, ...]
+
+
+# --- what is told
+@dataclass(frozen=True)
+class Frames:
+    """Frames of detections, oldest first, and the frame they are expressed in."""
+
+    frames: tuple[Frame, ...]
+    frame_id: str
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan: which of the offered ways was chosen, and its three trajectories."""
+
+    chosen: int
+    transfer: Trajectory
+    approach: Trajectory
+    retreat: Trajectory
+    planning_time: float = 0.0
+
+
+@dataclass(frozen=True)
+class Reach:
+    """Smallest distance of each arm's TCP from the pose that was asked about, m."""
+
+    distances: Mapping[str, float]
+
+
+Result: TypeAlias = Frames | Planned | Reach | Evidence
+ResultT = TypeVar("ResultT", Frames, Planned, Reach, Evidence)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a recipe.
+
+    Attributes:
+        code: OK, or why the first failing effect failed.
+        message: The failure in a sentence.
+        results: Of the effects that have one, in order, up to the failing one.
+        done: How many effects of the recipe were carried out.
+    """
+
+    code: Code = Code.OK
+    message: str = ""
+    results: tuple[Result, ...] = ()
+    done: int = 0
+
+    @property
+    def ok(self) -> bool:
+        """Whether the whole recipe was carried out."""
+        return self.code is Code.OK
+
+    def last(self, kind: type[ResultT]) -> ResultT:
+        """The newest result of a kind.
+
+        Raises:
+            LookupError: When the recipe had none; a fault of the caller.
+        """
+        for result in reversed(self.results):
+            if isinstance(result, kind):
+                return result
+        raise LookupError(f"no {kind.__name__} among the results {[type(r).__name__ for r in self.results]}")
+
+
+@dataclass(frozen=True)
+class GraspOutcome:
+    """The answer to a request.
+
+    Attributes:
+        code: OK, or what went wrong.
+        message: What happened, in a sentence or two.
+        label: What was picked (or asked for).
+        arm: The arm that was used, or "".
+        attempts: Physical attempts.
+        place_position: (3,) target that was used, base frame, m; zeros when none.
+        duration: s of robot time.
+    """
+
+    code: Code
+    message: str
+    label: str
+    arm: str = ""
+    attempts: int = 0
+    place_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    duration: float = 0.0
+
+    @property
+    def success(self) -> bool:
+        """Whether what was asked for happened."""
+        return self.code is Code.OK

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether an object is held, has risen, and stands where it should: from the gripper's joint and the camera.
+
+A command that was sent proves nothing. Two independent kinds of evidence are needed for a lift: the gripper (gap,
+effort, rest) and the camera (the object has left its place, or is seen higher).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code
+from openarm_grasp.config import HeldConfig
+from openarm_grasp.observation import Detection, Frame
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the gripper's joint says at rest.
+
+    Attributes:
+        gap: Distance between the fingers, m (twice the position of one finger).
+        expected: Width of the object between them, m.
+        effort: Force of the finger actuator, N, any sign.
+        speed: Of the gap, m/s, any sign.
+        tcp_error: Distance of the TCP from the planned grasp, m.
+    """
+
+    gap: float
+    expected: float
+    effort: float
+    speed: float
+    tcp_error: float = 0.0
+
+
+class Grip(Enum):
+    """What the hand holds."""
+
+    HELD = "held"
+    EMPTY = "empty"
+    HAND_COLLISION = "hand_collision"
+    MOVING = "moving"
+    LOST = "lost"
+
+    @property
+    def code(self) -> Code:
+        """The code that a grasp failing on this ends with."""
+        return _GRIP_CODES[self]
+
+
+_GRIP_CODES = {
+    Grip.HELD: Code.OK,
+    Grip.EMPTY: Code.GRASP_MISSED,
+    Grip.HAND_COLLISION: Code.HAND_COLLISION,
+    Grip.MOVING: Code.GRASP_MISSED,
+    Grip.LOST: Code.GRASP_LOST,
+}
+
+
+class Sight(Enum):
+    """What the camera says of an object after its lift."""
+
+    RISEN = "risen"
+    GONE = "gone from its place"
+    STILL_THERE = "still there"
+    BLIND = "no frame"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A judgement with its reason in a sentence."""
+
+    code: Code
+    reason: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether what was hoped for is so."""
+        return self.code is Code.OK
+
+
+def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> tuple[Grip, str]:
+    """Held, empty, moving, or the hand on top of the object.
+
+    Args:
+        e: What the gripper says.
+        config: Thresholds.
+        was_held: The object was held before: an empty hand has lost it.
+
+    Returns:
+        The judgement and its reason with values and limits.
+    """
+    empty = Grip.LOST if was_held else Grip.EMPTY
+    gap, width = f"gap {e.gap * 1e3:.1f} mm", f"the object's {e.expected * 1e3:.1f} mm"
+    if e.tcp_error > config.max_tcp_error:
+        off, limit = e.tcp_error * 1e3, config.max_tcp_error * 1e3
+        return Grip.HAND_COLLISION, f"the hand is {off:.1f} mm from the grasp, expected at most {limit:.0f} mm"
+    if e.gap <= config.closed_below:
+        return empty, f"{gap}: the fingers are closed on nothing"
+    if e.gap > e.expected + config.width_tolerance:
+        return Grip.HAND_COLLISION, f"{gap} is wider than {width}: the fingers are not around it"
+    if e.gap < e.expected - config.width_tolerance:
+        return empty, f"{gap} is narrower than {width}: something else is between the fingers"
+    if abs(e.speed) >= config.max_speed:
+        return Grip.MOVING, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest"
+    if config.use_effort and abs(e.effort) <= config.min_effort:
+        return empty, f"{gap}, but the fingers press with {abs(e.effort):.1f} N, expected over {config.min_effort:g} N"
+    force = f", {abs(e.effort):.0f} N" if config.use_effort else ""
+    return Grip.HELD, f"{gap} for {e.expected * 1e3:.1f} mm{force}: held"
+
+
+def judge_sight(
+    before: Detection, frames: Sequence[Frame], config: HeldConfig, *, match_radius: float
+) -> tuple[Sight, str]:
+    """Whether the camera still sees the object at its old place, sees it higher, or not there any more.
+
+    Args:
+        before: The object as it was before the grasp.
+        frames: Taken after the lift; the newest that says anything counts.
+        config: Thresholds.
+        match_radius: Horizontal distance that counts as the old place, m.
+    """
+    if not frames:
+        return Sight.BLIND, "no camera frame after the lift"
+    same = [d for d in frames[-1].detections if d.label == before.label]
+    if not same:
+        return Sight.GONE, f"{before.label!r} has gone from its place"
+    # The top counts: a detector may take the visible part of a lifted object for a box that reaches down to the table.
+    risen = max(d.top - before.top for d in same)
+    if risen >= config.rise:
+        return Sight.RISEN, f"{before.label!r} is seen {risen * 1e3:.0f} mm higher"
+    distance = min(float(np.linalg.norm((d.p_base - before.p_base)[:2])) for d in same)
+    if distance <= match_radius:
+        return Sight.STILL_THERE, f"{before.label!r} still stands at its place ({distance * 1e3:.0f} mm from it)"
+    return Sight.GONE, f"{before.label!r} has left its place ({distance * 1e3:.0f} mm)"
+
+
+def judge_lift(grip: tuple[Grip, str], sight: tuple[Sight, str]) -> Verdict:
+    """A lift counts only when hand and camera agree."""
+    if grip[0] is not Grip.HELD:
+        return Verdict(grip[0].code, grip[1])
+    if sight[0] in (Sight.RISEN, Sight.GONE):
+        return Verdict(Code.OK, f"{grip[1]}; {sight[1]}")
+    code = Code.STALE_DATA if sight[0] is Sight.BLIND else Code.GRASP_MISSED
+    return Verdict(code, f"{grip[1]}, but {sight[1]}")
+
+
+def judge_place(label: str, p_target: Array, frames: Sequence[Frame], tolerance: float) -> Verdict:
+    """Whether the camera sees the object at the place target after the arm has left.
+
+    Args:
+        label: Of the object.
+        p_target: (3,) where its footprint centre shall stand, base frame, m; z is not judged.
+        frames: Taken after the arm has left.
+        tolerance: Largest horizontal distance, m.
+    """
+    if not frames:
+        return Verdict(Code.STALE_DATA, "no camera frame after the place")
+    same = [d for d in frames[-1].detections if d.label == label]
+    if not same:
+        return Verdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
+    distance = min(float(np.linalg.norm((d.p_base - p_target)[:2])) for d in same)
+    text = f"{label!r} stands {distance * 1e3:.0f} mm from its target"
+    if distance > tolerance:
+        return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
+    return Verdict(Code.OK, text)

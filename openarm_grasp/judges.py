@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the outcome of each state's recipe means: an event for the transition table, and the reason in a sentence.
+
+A judge also writes down what was learned. `OpenArmError` raised by a judge ends the request with its code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp import recipes
+from openarm_grasp.candidates import propose
+from openarm_grasp.effects import Frames, Outcome, Planned, Reach
+from openarm_grasp.evidence import Evidence, Grip, Verdict, judge_grip, judge_lift, judge_place, judge_sight
+from openarm_grasp.memory import Memory, Surroundings
+from openarm_grasp.observation import Sighting, find, labels_in_view, on_table
+from openarm_grasp.place import check_position, free_spots, place_targets
+from openarm_grasp.routing import arm_order, out_of_reach
+from openarm_grasp.states import Event, State
+
+Judgement = tuple[Event, str]
+
+
+def fail(m: Memory, code: Code, reason: str, *, final: bool = False) -> Judgement:
+    """Write a failure down; `final` allows no further try."""
+    m.failure = Verdict(code, reason)
+    return (Event.END if final else Event.AGAIN), reason
+
+
+# --- looking
+def idle(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """The next frame has come, or not: DETECT looks in either case, and counts."""
+    return Event.DONE, "the next frame has come" if outcome.ok else outcome.message
+
+
+def detect(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """Frames without the object make the machine wait for the next; no frame at all ends the request."""
+    if not outcome.ok:
+        return fail(m, outcome.code, outcome.message, final=True)
+    m.seen = outcome.last(Frames)
+    seen = labels_in_view(m.seen.frames)
+    if seen and (not m.request.label or m.request.label in seen):
+        return Event.DONE, f"in view: {', '.join(seen)}"
+    if not seen:
+        text = f"nothing is in view of the camera (asked for {m.request.label or 'any object'!r})"
+        return _missed_round(m, Code.NOTHING_DETECTED, text, around)
+    return _missed_round(m, Code.UNKNOWN_OBJECT, f"no {m.request.label!r} in view; in view: {', '.join(seen)}", around)
+
+
+def transform(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """One trusted object in the base frame, not older than allowed, and the ways to grasp it."""
+    if not outcome.ok:
+        if outcome.code is Code.STALE_DATA:
+            return _missed_round(m, outcome.code, outcome.message, around)
+        return fail(m, outcome.code, outcome.message, final=True)
+    m.seen = outcome.last(Frames)
+    limits, table = around.config.detect, around.table
+    try:
+        sighting = find(
+            m.seen.frames, m.request.label, match_radius=limits.match_radius, agree_within=limits.agree_within
+        )
+        target = on_table(sighting.target, table.top_z)
+    except OpenArmError as error:
+        return _missed_round(m, error.code, error.message, around)
+    age = (t_ns - sighting.t_ns) * 1e-9
+    if age > limits.max_age:
+        text = f"the newest detection is {age:.2f} s old, expected at most {limits.max_age:g} s"
+        return _missed_round(m, Code.STALE_DATA, text, around)
+    # What is flat on the table is in nobody's way.
+    others = tuple(on_table(d, table.top_z) for d in sighting.others if d.top > table.top_z + 0.005)
+    m.sighting = Sighting(target, others, sighting.t_ns, sighting.spread)
+    if m.request.place is not None:
+        check_position(m.request.place, target, others, table.x, table.y)
+    m.arms = arm_order(m.request.arm, float(target.p_base[1]), around.config.approach.overlap_half_width)
+    _offer_grasps(m, around)
+    x, y, z = target.p_base
+    return Event.DONE, f"{target.label!r} stands at ({x:.3f}, {y:.3f}, {z:.3f}) m; {len(m.offered)} ways to grasp it"
+
+
+def _missed_round(m: Memory, code: Code, reason: str, around: Surroundings) -> Judgement:
+    """One more round of frames without a trusted object: wait for the next, or give up."""
+    m.detect_rounds += 1
+    final = m.detect_rounds >= around.config.detect.attempts
+    if m.attempt > 1 and m.failure is not None:
+        # What went wrong with the arm says more than the object that is missing since.
+        before = m.failure
+        return fail(m, before.code, f"{before.reason}; then {reason}" if final else before.reason, final=final)
+    return fail(m, code, reason, final=final)
+
+
+# --- planning
+def plan(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """A plan of the grasp (and of the place, where one is asked for or nothing shall move); else the next arm."""
+    if m.probed:
+        return _no_plan(m, outcome, around)
+    if not outcome.ok:
+        return _next_arm(m, outcome, around)
+    done = outcome.last(Planned)
+    if m.grasp_plan is None:
+        m.grasp_plan, m.candidate = done, m.offered[done.chosen]
+        chosen = f"grasp {m.candidate.id} with the {m.arm} arm"
+        # Also without a wish for the place: no free spot is a reason not to lift.
+        _offer_places(m, around)
+        if m.request.dry_run or m.request.place is not None:
+            return Event.MORE, f"{chosen}; planning the place"
+        return Event.DONE, chosen
+    # This plan starts at the end of the lift and shows that the place can be reached; PLACE plans from where the arm
+    # then is.
+    m.place_target = m.place_offered[done.chosen]
+    chosen = f"grasp {m.need_candidate().id} with the {m.arm} arm, place {m.place_target.id}"
+    if m.request.dry_run:
+        m.failure = None
+        return Event.END, f"can be done: {chosen}"
+    return Event.DONE, chosen
+
+
+def _next_arm(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
+    reason = outcome.message
+    if m.grasp_plan is not None:
+        m.place_refused = True
+        reason = f"it could grasp, but not place: {reason}"
+    m.refusals[m.arm] = Verdict(outcome.code, reason)
+    m.candidate = m.grasp_plan = m.place_target = None
+    m.arms = m.arms[1:]
+    if m.arms:
+        _offer_grasps(m, around)
+        return Event.MORE, f"{reason}; trying the {m.arm} arm"
+    m.arm = ""
+    if not m.place_refused and all(v.code is Code.UNREACHABLE for v in m.refusals.values()):
+        m.probed = True
+        return Event.MORE, "out of reach; asking how near the arms come"
+    return _no_plan(m, outcome, around)
+
+
+def _no_plan(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
+    m.plans_failed += 1
+    final = m.plans_failed >= around.config.limits.plan_attempts
+    codes = {v.code for v in m.refusals.values()}
+    reason = "; ".join(f"{arm} arm: {v.reason}" for arm, v in m.refusals.items())
+    if m.probed:
+        distances = outcome.last(Reach).distances if outcome.ok else {}
+        x, y, z = m.need_sighting().target.p_base
+        reason = f"{out_of_reach(f'{m.label!r} at ({x:.3f}, {y:.3f}, {z:.3f}) m', distances)} ({reason})"
+    return fail(m, codes.pop() if len(codes) == 1 else Code.NO_PLAN, reason, final=final)
+
+
+def _offer_grasps(m: Memory, around: Surroundings) -> None:
+    m.arm = m.arms[0]
+    target = m.need_sighting().target
+    m.offered = propose(target, around.config, shoulder_xy=around.shoulders.get(m.arm, (0.0, 0.0)), used=m.used)
+
+
+def _offer_places(m: Memory, around: Surroundings, *, origin: bool = False) -> None:
+    s = m.need_sighting()
+    if origin:
+        spots = (s.target.p_base[:2],)
+    elif m.request.place is not None:
+        spots = (check_position(m.request.place, s.target, s.others, around.table.x, around.table.y),)
+    else:
+        spots = free_spots(m.arm, s.target, s.others, around.config)
+    m.place_offered = place_targets(s.target, m.need_candidate(), spots, around.config)
+
+
+# --- grasping
+def move_to_pregrasp(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """The arm came to the pre-grasp with an open hand, or not."""
+    if not outcome.ok:
+        return fail(m, outcome.code, outcome.message)
+    return Event.DONE, "the open hand is before the object"
+
+
+def move_to_grasp(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """A hand that stops short has met the object."""
+    m.hand.at_object = True
+    if not outcome.ok:
+        return fail(m, outcome.code, outcome.message)
+    error, limit = outcome.last(Evidence).tcp_error, around.config.held.max_tcp_error
+    if error > limit:
+        text = f"the hand stopped {error * 1e3:.1f} mm from the grasp, expected at most {limit * 1e3:.0f} mm"
+        return fail(m, Code.HAND_COLLISION, text)
+    return Event.DONE, f"the hand is at the grasp, off by {error * 1e3:.1f} mm"
+
+
+def close_gripper(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """Gap, effort and rest say whether something of the right width is between the fingers."""
+    if not outcome.ok:
+        return fail(m, outcome.code, outcome.message)
+    grip, reason = judge_grip(outcome.last(Evidence), around.config.held)
+    if grip is not Grip.HELD:
+        return fail(m, grip.code, reason)
+    m.hand.holding = True
+    return Event.DONE, reason
+
+
+def lift(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """Held by the hand and gone from its place for the camera: two kinds of evidence."""
+    if not outcome.ok:
+        m.hand.holding = m.hand.holding and outcome.code is not Code.GRASP_LOST
+        return fail(m, outcome.code, outcome.message)
+    held = around.config.held
+    grip = judge_grip(outcome.last(Evidence), held, was_held=True)
+    frames = outcome.last(Frames).frames
+    sight = judge_sight(m.need_sighting().target, frames, held, match_radius=around.config.detect.match_radius)
+    verdict = judge_lift(grip, sight)
+    if not verdict.ok:
+        m.hand.holding = grip[0] is Grip.HELD
+        return fail(m, verdict.code, verdict.reason)
+    m.hand.at_object = False
+    return Event.DONE, verdict.reason
+
+
+# --- placing
+def place(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """Planned, then carried, then let go."""
+    hand = m.hand
+    if outcome.code is Code.GRASP_LOST:
+        hand.holding = False
+        return fail(m, outcome.code, outcome.message)
+    if not outcome.ok and hand.carried and outcome.done >= recipes.RELEASED_AFTER:
+        # It was let go; only the way back failed.
+        hand.holding, hand.released, hand.at_object = False, True, True
+        return Event.DONE, outcome.message
+    if not outcome.ok:
+        return _put_back(m, outcome, around)
+    if m.place_plan is None:
+        m.place_plan = outcome.last(Planned)
+        m.place_target = m.place_offered[m.place_plan.chosen]
+        return Event.MORE, f"carrying to {m.place_target.id}"
+    if not hand.carried:
+        grip, reason = judge_grip(outcome.last(Evidence), around.config.held, was_held=True)
+        if grip is not Grip.HELD:
+            hand.holding = False
+            return fail(m, Code.GRASP_LOST, f"lost on the way: {reason}")
+        hand.carried = True
+        return Event.MORE, reason
+    hand.holding, hand.released = False, True
+    return Event.DONE, "put back where it stood" if hand.putting_back else "put down and let go"
+
+
+def _put_back(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
+    """The place cannot be reached: put the object back, or keep it when that cannot be done either."""
+    if m.hand.putting_back:
+        text = f"{outcome.message}; the {m.arm} hand still holds {m.label!r}: open it over a safe place"
+        return fail(m, Code.PLACE_FAILED, text, final=True)
+    fail(m, Code.PLACE_FAILED, f"{m.label!r} could not be placed ({outcome.code}): {outcome.message}")
+    m.hand.putting_back, m.hand.carried, m.place_plan = True, False, None
+    _offer_places(m, around, origin=True)
+    return Event.MORE, f"{outcome.message}; putting it back"
+
+
+# --- going home
+def reset(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """Home, the place checked by the camera; then done, another attempt, or the end."""
+    hand = m.hand
+    if not hand.homed:
+        if not outcome.ok:
+            return _no_way_home(m, outcome)
+        hand.homed, hand.holding = True, False
+        if hand.released and not hand.putting_back:
+            return Event.MORE, "home; looking at the place"
+    elif not outcome.ok:
+        return fail(m, Code.PLACE_FAILED, f"put down, but not seen since: {outcome.message}", final=True)
+    else:
+        frames, tolerance = outcome.last(Frames).frames, around.config.place.tolerance
+        verdict = judge_place(m.label, m.need_place_target().position, frames, tolerance)
+        if verdict.ok:
+            m.failure = None
+            return Event.DONE, f"{verdict.reason}, placed by the {m.arm} arm"
+        m.failure = verdict
+    failure = m.failure or Verdict(Code.INTERNAL, "RESET without a failure")
+    last = m.attempt >= around.config.limits.max_attempts or hand.putting_back
+    return (Event.END if last else Event.AGAIN), failure.reason
+
+
+def _no_way_home(m: Memory, outcome: Outcome) -> Judgement:
+    hand = m.hand
+    hand.retreats += 1
+    stuck = hand.holding and outcome.done == 0
+    if hand.retreats < 2 and not stuck:
+        hand.holding = hand.at_object = False
+        return Event.MORE, f"{outcome.message}; trying another way home"
+    before = m.failure or Verdict(outcome.code, "")
+    keeps = f"; the {m.arm} hand still holds {m.label!r}: open it over a safe place" if stuck else ""
+    return fail(m, before.code, f"{before.reason}; the arm could not go home: {outcome.message}{keeps}", final=True)
+
+
+def start_over(m: Memory, came_from: State) -> None:
+    """Look again; after a physical attempt with the next number, the failed grasp marked, the object's name kept."""
+    if came_from is State.RESET:
+        m.request = replace(m.request, label=m.label)
+        m.used = m.used | {m.candidate.id} if m.candidate else m.used
+        m.attempt += 1
+        m.detect_rounds = m.plans_failed = 0
+    m.forget_sight()
+
+
+Judge = Callable[[Memory, Outcome, int, Surroundings], Judgement]
+#: The judge of each state.
+JUDGES: Mapping[State, Judge] = MappingProxyType(
+    {
+        State.IDLE: idle,
+        State.DETECT: detect,
+        State.TRANSFORM: transform,
+        State.PLAN: plan,
+        State.MOVE_TO_PREGRASP: move_to_pregrasp,
+        State.MOVE_TO_GRASP: move_to_grasp,
+        State.CLOSE_GRIPPER: close_gripper,
+        State.LIFT: lift,
+        State.PLACE: place,
+        State.RESET: reset,
+    }
+)

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the state machine knows: of its surroundings always, of a request while it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene import Table
+from openarm_grasp.candidates import GraspCandidate
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.effects import Frames, GraspRequest, Planned
+from openarm_grasp.evidence import Verdict
+from openarm_grasp.observation import Sighting
+from openarm_grasp.place import PlaceTarget
+
+ValueT = TypeVar("ValueT")
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What does not change from request to request.
+
+    Attributes:
+        config: Parameters.
+        table: Where objects stand.
+        shoulders: (x, y) of each arm's shoulder, base frame, m.
+    """
+
+    config: GraspConfig
+    table: Table
+    shoulders: Mapping[str, Sequence[float]]
+
+
+@dataclass
+class Hand:
+    """Where the hand stands in the course of one attempt.
+
+    Attributes:
+        holding: It holds the object, as far as known.
+        at_object: It is around the object or straight above its grasp, so it leaves on a straight line.
+        carried: The object is above its place.
+        released: The object was put down and let go.
+        putting_back: The place is where the object came from, because no other could be reached.
+        homed: The arm is home again.
+        retreats: Ways home that failed.
+    """
+
+    holding: bool = False
+    at_object: bool = False
+    carried: bool = False
+    released: bool = False
+    putting_back: bool = False
+    homed: bool = False
+    retreats: int = 0
+
+
+@dataclass
+class Memory:
+    """The request and all that was learned since it came.
+
+    Attributes:
+        request: What is asked for.
+        started_ns: When it came, robot time.
+        attempt: 1-based number of the running attempt.
+        tried: Attempts in which the arm moved.
+        detect_rounds: Rounds of frames without a trusted object, this attempt.
+        plans_failed: Detections planned for in vain, this attempt.
+        used: Ids of the grasps that have failed.
+        failure: The newest failure; None while nothing has failed.
+        seen: Frames of the running attempt.
+        sighting: The object and its neighbours, base frame.
+        arms: Arms that remain to be planned for; the first is being planned.
+        refusals: Why each arm could not be planned for.
+        place_refused: One of them could grasp, but not place.
+        probed: The arms were asked how near they come.
+        offered: Candidates that the planner chooses from.
+        arm: The arm that is used, "" while none is chosen.
+        candidate: The chosen grasp.
+        grasp_plan: Its trajectories.
+        place_offered: Place targets that the planner chooses from.
+        place_target: The chosen one.
+        place_plan: Its trajectories.
+        hand: Where the hand stands.
+    """
+
+    request: GraspRequest
+    started_ns: int
+    attempt: int = 1
+    tried: int = 0
+    detect_rounds: int = 0
+    plans_failed: int = 0
+    used: frozenset[str] = frozenset()
+    failure: Verdict | None = None
+    seen: Frames | None = None
+    sighting: Sighting | None = None
+    arms: tuple[str, ...] = ()
+    refusals: dict[str, Verdict] = field(default_factory=dict[str, Verdict])
+    place_refused: bool = False
+    probed: bool = False
+    offered: tuple[GraspCandidate, ...] = ()
+    arm: str = ""
+    candidate: GraspCandidate | None = None
+    grasp_plan: Planned | None = None
+    place_offered: tuple[PlaceTarget, ...] = ()
+    place_target: PlaceTarget | None = None
+    place_plan: Planned | None = None
+    hand: Hand = field(default_factory=Hand)
+
+    @property
+    def label(self) -> str:
+        """What is picked, once it is known; before that, what is asked for."""
+        return self.sighting.target.label if self.sighting else self.request.label
+
+    def need_frames(self) -> Frames:
+        """The frames; states after DETECT have them."""
+        return _need(self.seen, "frames")
+
+    def need_sighting(self) -> Sighting:
+        """The sighting; states after TRANSFORM have one."""
+        return _need(self.sighting, "sighting")
+
+    def need_candidate(self) -> GraspCandidate:
+        """The chosen grasp; states after PLAN have one."""
+        return _need(self.candidate, "candidate")
+
+    def need_grasp_plan(self) -> Planned:
+        """The plan of the grasp; states after PLAN have one."""
+        return _need(self.grasp_plan, "grasp plan")
+
+    def need_place_target(self) -> PlaceTarget:
+        """The place, once PLACE has chosen it."""
+        return _need(self.place_target, "place target")
+
+    def forget_sight(self) -> None:
+        """Start over from the camera."""
+        self.seen = self.sighting = self.candidate = self.grasp_plan = self.place_target = self.place_plan = None
+        self.arms, self.refusals, self.offered, self.place_offered, self.arm = (), {}, (), (), ""
+        self.place_refused = self.probed = False
+        self.hand = Hand()
+
+
+def _need(value: ValueT | None, what: str) -> ValueT:
+    if value is None:
+        raise OpenArmError(Code.INTERNAL, f"the grasp machine has no {what} in a state that needs one")
+    return value

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From frames of detections to one trusted object.
+
+All poses are in the base frame. A detection is an upright box: its z axis is up, ``size[0]`` and ``size[1]`` are the
+footprint edges along its x and y, ``size[2]`` its height. A box has no front: turned by 90° with its edges swapped it is
+the same box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One upright box in one frame.
+
+    Attributes:
+        label: Class, for example "red".
+        score: Confidence, 0 to 1.
+        T_base_object: (4, 4) pose of the box centre, yaw only.
+        size: (3,) full edges, m.
+    """
+
+    label: str
+    score: float
+    T_base_object: Array
+    size: Array
+
+    @property
+    def p_base(self) -> Array:
+        """Centre, base frame, m."""
+        return self.T_base_object[:3, 3]
+
+    @property
+    def top(self) -> float:
+        """Height of the upper face, base frame, m."""
+        return float(self.T_base_object[2, 3] + self.size[2] / 2.0)
+
+    @property
+    def bottom(self) -> float:
+        """Height of the lower face, base frame, m."""
+        return float(self.T_base_object[2, 3] - self.size[2] / 2.0)
+
+    @property
+    def yaw(self) -> float:
+        """Angle of the object's x axis about the base z, rad."""
+        return float(np.arctan2(self.T_base_object[1, 0], self.T_base_object[0, 0]))
+
+
+@dataclass(frozen=True)
+class Frame:
+    """All detections of one image; `t_ns` is the image stamp."""
+
+    t_ns: int
+    detections: tuple[Detection, ...]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """An object averaged over frames, and what else was in view.
+
+    Attributes:
+        target: The averaged detection.
+        others: Every other object, newest sight of each.
+        t_ns: Stamp of the newest frame.
+        spread: Largest distance of a frame's position from the average, m.
+    """
+
+    target: Detection
+    others: tuple[Detection, ...]
+    t_ns: int
+    spread: float
+
+
+def labels_in_view(frames: Sequence[Frame]) -> list[str]:
+    """Labels seen in any of the frames, sorted."""
+    return sorted({d.label for frame in frames for d in frame.detections})
+
+
+def find(frames: Sequence[Frame], label: str, *, match_radius: float, agree_within: float) -> Sighting:
+    """Follow one object through all frames and average it.
+
+    Args:
+        frames: At least one, oldest first.
+        label: What to look for; "" takes the detection with the highest score.
+        match_radius: Detections nearer than this are one object, m.
+        agree_within: Largest distance between the positions of one object in consecutive frames, m.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED, when no frame holds anything; UNKNOWN_OBJECT, naming what is in view;
+            STALE_DATA, when the object was not in every frame or moved between them.
+    """
+    seen = labels_in_view(frames)
+    wanted = [d for d in frames[-1].detections if not label or d.label == label]
+    if not seen:
+        raise OpenArmError(Code.NOTHING_DETECTED, f"nothing is in view (asked for {label or 'any object'!r})")
+    if label and label not in seen:
+        raise OpenArmError(Code.UNKNOWN_OBJECT, f"no {label!r} in view; in view: {', '.join(seen)}")
+    if not wanted:
+        raise OpenArmError(Code.STALE_DATA, f"{label or 'the object'!r} was in view, but not in the newest frame")
+    anchor = max(wanted, key=lambda d: d.score)
+    track: list[Detection] = []
+    for frame in frames:
+        near = [d for d in frame.detections if d.label == anchor.label and _distance(d, anchor) <= match_radius]
+        if not near:
+            raise OpenArmError(
+                Code.STALE_DATA,
+                f"{anchor.label!r} is not in the same place in all of {len(frames)} frames: expected one within"
+                f" {match_radius * 1e3:.0f} mm of {_text(anchor.p_base)}",
+            )
+        track.append(min(near, key=lambda d: _distance(d, anchor)))
+    steps = [_distance(a, b) for a, b in pairwise(track)]
+    if steps and max(steps) > agree_within:
+        raise OpenArmError(
+            Code.STALE_DATA,
+            f"{anchor.label!r} moved {max(steps) * 1e3:.1f} mm between two frames, expected at most"
+            f" {agree_within * 1e3:.1f} mm; is it at rest?",
+        )
+    target = average(track)
+    spread = max(_distance(d, target) for d in track)
+    return Sighting(target, _others(frames, target, match_radius), frames[-1].t_ns, spread)
+
+
+def average(track: Sequence[Detection]) -> Detection:
+    """Mean of sights of one box, whichever of its four equal descriptions each frame chose."""
+    reference = track[-1]
+    yaws: list[float] = []
+    sizes: list[Array] = []
+    for d in track:
+        quarter_turns = round((d.yaw - reference.yaw) / (np.pi / 2.0))
+        yaws.append(d.yaw - quarter_turns * np.pi / 2.0 - reference.yaw)
+        sizes.append(d.size[[1, 0, 2]] if quarter_turns % 2 else d.size)
+    # Round things have no yaw of their own: their frames disagree by up to 45°, and any value is right.
+    yaw = reference.yaw + float(np.mean(yaws))
+    p = np.mean([d.p_base for d in track], axis=0)
+    score = float(np.mean([d.score for d in track]))
+    return Detection(reference.label, score, se3.make(se3.rot_z(yaw), p), np.mean(sizes, axis=0))
+
+
+def on_table(d: Detection, table_z: float, *, reach: float = 0.03) -> Detection:
+    """Let a box that stands on the table end there: its top is measured, its bottom is usually hidden.
+
+    Args:
+        d: The box.
+        table_z: Height of the table top, base frame, m.
+        reach: A bottom further than this from the table is believed (the object stands on something else), m.
+
+    Raises:
+        OpenArmError: STALE_DATA, when the box is flatter than 5 mm: there is nothing to grasp.
+    """
+    if abs(d.bottom - table_z) > reach:
+        return d
+    height = d.top - table_z
+    if height < 0.005:
+        raise OpenArmError(
+            Code.STALE_DATA,
+            f"{d.label!r} is measured {height * 1e3:.0f} mm above the table at {table_z:.3f} m, expected at least 5 mm;"
+            " is the camera calibrated?",
+        )
+    T = d.T_base_object.copy()
+    T[2, 3] = table_z + height / 2.0
+    return Detection(d.label, d.score, T, np.array([d.size[0], d.size[1], height]))
+
+
+def _others(frames: Sequence[Frame], target: Detection, match_radius: float) -> tuple[Detection, ...]:
+    found: list[Detection] = []
+    for frame in reversed(frames):
+        for d in frame.detections:
+            if all(_distance_xy(d, known) > match_radius for known in (target, *found)):
+                found.append(d)
+    return tuple(found)
+
+
+def _distance(a: Detection, b: Detection) -> float:
+    return float(np.linalg.norm(a.p_base - b.p_base))
+
+
+def _distance_xy(a: Detection, b: Detection) -> float:
+    return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
+
+
+def _text(p: Array) -> str:
+    return "(" + ", ".join(f"{v:.3f}" for v in p) + ") m"
