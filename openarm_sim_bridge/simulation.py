@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The thread that steps the world: commands, physics, and telling those who publish, at a steady rate.
+
+Everything that touches the world or the controller happens in this thread. Others hand it functions (`call`), which it
+runs between two ticks; they never wait for physics, and physics never waits for them.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_sim_bridge.controller import RobotController
+from openarm_sim_bridge.pacing import Pacer, PeriodMeter, RealTimeFactor
+from openarm_sim_bridge.world import JointReadout, World
+
+T = TypeVar("T")
+
+
+class Observer(Protocol):
+    """Who is told of every tick, in the thread of the simulation."""
+
+    def __call__(self, state: JointReadout) -> None:
+        """Take the state at the end of a tick."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Call:
+    fn: Callable[[], Any]
+    future: Future[Any]
+
+    def run(self) -> None:
+        if not self.future.set_running_or_notify_cancel():
+            return
+        try:
+            result = self.fn()
+        except BaseException as error:  # handed to whoever asked, never dropped
+            self.future.set_exception(error)
+        else:
+            self.future.set_result(result)
+
+
+class Simulation:
+    """Steps a world in real time.
+
+    Args:
+        world: The world; not to be touched by anyone else while the thread runs, but through `call`.
+        controller: Makes the targets.
+        observe: Called at the end of every tick that is told of.
+        speed: Simulated seconds a wall second; 0 is as fast as it can. Faster than real time, `observe` is still called
+            about once a period of wall time.
+        clock: Monotonic wall clock, ns.
+    """
+
+    #: How often a paused world tells its (unchanged) state, so that a pause is not taken for a death.
+    PAUSED_PERIOD_S = 0.1
+
+    def __init__(
+        self,
+        world: World,
+        controller: RobotController,
+        observe: Observer,
+        *,
+        speed: float = 1.0,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.world = world
+        self.controller = controller
+        self.real_time_factor = RealTimeFactor()
+        self.periods = PeriodMeter()
+        self.fault = ""
+        self._observe = observe
+        self._clock = clock
+        self._pacer = Pacer(world.period_ns, speed)
+        self._throttled = speed == 0.0 or speed > 1.0
+        self._told_ns = 0
+        self._paused = False
+        self._steps_left = 0
+        self._stepped: Future[int] | None = None
+        self._calls: deque[_Call] = deque()
+        self._wake = threading.Event()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="physics", daemon=True)
+
+    @property
+    def paused(self) -> bool:
+        """Whether simulated time stands still."""
+        return self._paused
+
+    @property
+    def skipped_s(self) -> float:
+        """Wall time that was given up because the machine was too slow, s."""
+        return self._pacer.skipped_ns * 1e-9
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the thread and wait for it; calls that still wait are cancelled."""
+        self._stopping = True
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        while self._calls:
+            self._calls.popleft().future.cancel()
+
+    def call(self, fn: Callable[[], T]) -> Future[T]:
+        """Run a (short) function between two ticks; the future has its result within a tick or so."""
+        future: Future[T] = Future()
+        self._calls.append(_Call(fn, future))
+        if self._paused:
+            self._wake.set()
+        return future
+
+    def set_paused(self, paused: bool) -> None:
+        """Let simulated time stand still or go on. For `call`."""
+        self._paused = paused
+        self._end_stepping("the simulation was resumed" if not paused else "the simulation was paused anew")
+
+    def advance(self, steps: int) -> Future[int]:
+        """Advance a paused world by physics steps, as fast as it can. For `call`.
+
+        Returns:
+            A future with the simulated time, ns, when all steps are done.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT for no steps; NOT_READY when the world runs; BUSY when it steps already.
+        """
+        if steps < 1:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"steps is {steps}, expected 1 or more")
+        if not self._paused:
+            raise OpenArmError(Code.NOT_READY, "the simulation is running; pause it first with /sim/set_pause")
+        if self._stepped is not None:
+            raise OpenArmError(Code.BUSY, f"still stepping, {self._steps_left} steps to go; wait for the answer")
+        self._steps_left, self._stepped = steps, Future()
+        return self._stepped
+
+    def restart(self) -> None:
+        """Go on after the world was reset or exchanged: forget goals and faults. For `call`."""
+        self.fault = ""
+        self._end_stepping("the world was reset")
+        self.controller.reset(self.world.read_joints())
+        self.world.set_effort_limits(self.controller.effort_limits())
+
+    # --- the thread
+    def _run(self) -> None:
+        while not self._stopping:
+            while self._calls:
+                self._calls.popleft().run()
+            if self.fault or (self._paused and not self._steps_left):
+                self._stand()
+                continue
+            wait_ns = 0 if self._paused else self._pacer.wait_ns(self._clock())
+            if wait_ns > 0:
+                self._wait(wait_ns * 1e-9)
+                continue
+            self._tick(self._clock())
+
+    def _wait(self, seconds: float) -> None:
+        if self._wake.wait(seconds):
+            self._wake.clear()
+
+    def _stand(self) -> None:
+        """Pass a moment without time going on."""
+        self._pacer.restart()
+        self.periods.restart()
+        self._observe(self.world.read_joints())
+        if not self._calls:
+            self._wait(self.PAUSED_PERIOD_S)
+
+    def _tick(self, now_ns: int) -> None:
+        world, controller = self.world, self.controller
+        steps = min(world.steps_per_tick, self._steps_left) if self._paused else world.steps_per_tick
+        self._pacer.ticked(now_ns)
+        world.set_targets(controller.update(world.read_joints(), steps * world.timestep_ns))
+        world.set_effort_limits(controller.effort_limits())
+        try:
+            world.step(steps)
+        except OpenArmError as error:
+            self.fault = error.message
+            self._end_stepping(error.message)
+            return
+        self.real_time_factor.add(now_ns, world.t_ns)
+        last = self._paused and steps == self._steps_left
+        if last or not self._throttled or now_ns - self._told_ns >= 0.9 * world.period_ns:
+            self._told_ns = now_ns
+            self.periods.add(self._clock())
+            self._observe(world.read_joints())
+        if self._paused:
+            self._steps_left -= steps
+            if self._steps_left == 0 and self._stepped is not None:
+                stepped, self._stepped = self._stepped, None
+                stepped.set_result(world.t_ns)
+
+    def _end_stepping(self, why: str) -> None:
+        self._steps_left = 0
+        if self._stepped is not None:
+            stepped, self._stepped = self._stepped, None
+            stepped.set_exception(OpenArmError(Code.CANCELLED, f"stepping ended early: {why}"))

@@ -1,0 +1,380 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Followers against an ideal arm (it is where it was told to be), and against arms that lag, stick or are pushed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_sim_bridge.actuation import End, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
+from openarm_sim_bridge.gripper import GripperConfig, GripperFollower, GripperGoal, GripperOutcome
+from openarm_sim_bridge.tracker import Tracker
+from openarm_sim_bridge.trajectory import JointGroup, JointTolerance, Trajectory, TrajectoryError, TrajectoryResult
+
+MS = 1_000_000
+GROUP = JointGroup(("j1", "j2"), np.array([-2.0, -2.0]), np.array([2.0, 2.0]), np.array([4.0, 4.0]))
+CONFIG = TrajectoryConfig()
+FINGER = JointGroup(("finger",), np.array([0.0]), np.array([0.044]), np.array([10.0]))
+START = 1_000 * MS
+
+
+class Arm:
+    """A follower and the joints it moves; `plant` maps (position, target) to the position a tick later."""
+
+    def __init__(self, plant=lambda q, target: target, config: TrajectoryConfig = CONFIG, lead: float = 0.0) -> None:
+        self.follower = TrajectoryFollower(GROUP, config, np.full(2, lead), np.zeros(2))
+        self.plant = plant
+        self.q, self.v = np.zeros(2), np.zeros(2)
+        self.t_ns = START
+        self.outcomes: list[TrajectoryOutcome] = []
+        self.history: list[np.ndarray] = []
+
+    def start(self, **changes) -> None:
+        given = {"names": GROUP.names, "t": np.array([1.0]), "q": np.array([[0.5, -0.5]])} | changes
+        self.follower.start(self.follower.check(Trajectory(**given)), self.t_ns, self.q, self.outcomes.append)
+
+    def tick(self, n: int = 1) -> None:
+        for _ in range(n):
+            target = self.follower.update(self.t_ns, 10 * MS, self.q, self.v)
+            q = self.plant(self.q, target)
+            self.v, self.q = (q - self.q) / 0.01, q
+            self.t_ns += 10 * MS
+            self.history.append(target)
+
+    def run(self, limit: int = 1000) -> TrajectoryOutcome:
+        n = len(self.outcomes)
+        while len(self.outcomes) == n:
+            assert limit > 0, "the goal did not end"
+            self.tick()
+            limit -= 1
+        return self.outcomes[-1]
+
+
+CUBIC = {"t": np.array([0.0, 1.0]), "q": np.array([[0.0, 0.0], [0.5, -0.5]]), "v": np.zeros((2, 2))}
+
+
+def test_a_trajectory_is_followed_to_its_goal() -> None:
+    arm = Arm()
+    arm.start(**CUBIC)
+    assert arm.follower.busy
+    outcome = arm.run()
+    assert (outcome.end, outcome.result) == (End.SUCCEEDED, TrajectoryResult.SUCCESSFUL)
+    assert arm.t_ns - START == pytest.approx(1010 * MS, abs=20 * MS)
+    np.testing.assert_allclose(arm.q, [0.5, -0.5])
+    np.testing.assert_allclose(arm.history[49], [0.25, -0.25], atol=1e-9)  # at half time the cubic is half way
+    assert not arm.follower.busy
+
+
+def test_joint_order_of_the_goal_does_not_matter() -> None:
+    arm = Arm()
+    arm.start(names=("j2", "j1"))
+    arm.run()
+    np.testing.assert_allclose(arm.q, [-0.5, 0.5])
+
+
+def test_the_way_to_the_first_point_starts_at_the_present_command() -> None:
+    arm = Arm()
+    arm.start(t=np.array([0.5, 1.0]), q=np.array([[0.2, 0.2], [0.4, 0.4]]), v=np.array([[0.4, 0.4], [0.0, 0.0]]))
+    arm.run()
+    steps = np.abs(np.diff(np.vstack([np.zeros(2), *arm.history]), axis=0))
+    assert steps.max() < 0.01  # no jump
+    np.testing.assert_allclose(arm.history[49], [0.2, 0.2], atol=1e-9)
+
+
+def test_a_small_offset_at_the_start_fades_instead_of_jumping() -> None:
+    arm = Arm()
+    arm.start(**(CUBIC | {"q": np.array([[0.03, 0.0], [0.5, -0.5]])}))
+    arm.tick()
+    assert abs(arm.history[0][0]) < 0.002
+    assert arm.run().end is End.SUCCEEDED
+    np.testing.assert_allclose(arm.q, [0.5, -0.5])
+
+
+def test_a_start_far_from_the_arm_is_refused_with_joint_and_value() -> None:
+    arm = Arm()
+    with pytest.raises(TrajectoryError, match=r"starts with j2 at 0\.400 rad, but it is at 0\.000") as caught:
+        arm.start(**(CUBIC | {"q": np.array([[0.0, 0.4], [0.5, -0.5]])}))
+    assert caught.value.result is TrajectoryResult.PATH_TOLERANCE_VIOLATED
+    assert not arm.follower.busy
+
+
+def test_a_first_point_that_cannot_be_reached_in_time_is_refused() -> None:
+    with pytest.raises(TrajectoryError, match=r"j1 would have to move at 50\.00 rad/s to be at the first point"):
+        Arm().start(t=np.array([0.01]))
+
+
+def test_feed_forward_leads_by_lag_times_velocity() -> None:
+    for feed_forward in (True, False):
+        arm = Arm(config=TrajectoryConfig(feed_forward=feed_forward), lead=0.02)
+        arm.start(t=np.array([0.0, 1.0]), q=np.array([[0.0, 0.0], [0.5, -0.5]]))
+        arm.tick(50)
+        np.testing.assert_allclose(
+            arm.history[49], np.array([0.25, -0.25]) + (0.02 * np.array([0.5, -0.5])) * feed_forward
+        )
+
+
+def test_a_stamp_in_the_future_delays_the_start() -> None:
+    arm = Arm()
+    arm.start(start_ns=START + 300 * MS)
+    arm.tick(30)
+    np.testing.assert_array_equal(arm.q, 0.0)
+    assert arm.run().end is End.SUCCEEDED
+    assert arm.t_ns - START == pytest.approx(1310 * MS, abs=20 * MS)
+
+
+def test_a_stamp_in_the_past_joins_the_trajectory_where_it_should_be() -> None:
+    arm = Arm()
+    arm.start(**(CUBIC | {"start_ns": START - 20 * MS}))
+    assert arm.run().end is End.SUCCEEDED
+    assert arm.t_ns - START == pytest.approx(990 * MS, abs=20 * MS)
+    assert np.abs(np.diff(np.array(arm.history), axis=0)).max() < 0.02
+
+
+def test_a_trajectory_that_is_over_already_is_refused() -> None:
+    arm = Arm()
+    with pytest.raises(TrajectoryError, match=r"ended 0\.50 s ago") as caught:
+        arm.start(start_ns=START - 1500 * MS)
+    assert caught.value.result is TrajectoryResult.OLD_HEADER_TIMESTAMP
+
+
+def test_a_joint_that_is_held_back_ends_the_goal_and_the_arm_holds_there() -> None:
+    arm = Arm(plant=lambda q, target: np.minimum(target, 0.2))
+    arm.start(**(CUBIC | {"q": np.array([[0.0, 0.0], [0.5, 0.0]])}))
+    outcome = arm.run()
+    assert (outcome.end, outcome.result) == (End.ABORTED, TrajectoryResult.PATH_TOLERANCE_VIOLATED)
+    assert outcome.text.startswith("j1 is 0.05")
+    arm.tick(5)
+    np.testing.assert_allclose(arm.history[-1], [0.2, 0.0])
+
+
+@pytest.mark.parametrize("tolerance", [JointTolerance("j1", -1.0), JointTolerance("j1", 0.5)])
+def test_path_tolerance_of_the_goal_replaces_the_default(tolerance: JointTolerance) -> None:
+    arm = Arm(plant=lambda q, target: np.minimum(target, 0.2))
+    arm.start(**(CUBIC | {"q": np.array([[0.0, 0.0], [0.5, 0.0]]), "path_tolerance": (tolerance,)}))
+    outcome = arm.run()
+    assert outcome.result is TrajectoryResult.GOAL_TOLERANCE_VIOLATED
+    assert arm.t_ns - START == pytest.approx(2010 * MS, abs=30 * MS)  # one second of grace
+    assert "j1 is 0.300 rad off its goal" in outcome.text
+
+
+def test_goal_tolerance_and_goal_time_of_the_goal_replace_the_defaults() -> None:
+    arm = Arm(plant=lambda q, target: target - 0.03)
+    arm.q = np.full(2, -0.03)
+    arm.start(**(CUBIC | {"goal_time_s": 0.2}))
+    assert arm.run().result is TrajectoryResult.GOAL_TOLERANCE_VIOLATED
+    assert arm.t_ns - START == pytest.approx(1210 * MS, abs=30 * MS)
+    loose = tuple(JointTolerance(name, 0.04) for name in GROUP.names)
+    arm.start(t=np.array([0.5]), q=np.array([[0.4, -0.4]]), goal_tolerance=loose)
+    assert arm.run().result is TrajectoryResult.SUCCESSFUL
+
+
+def test_p21_cancel_slows_down_along_the_path_and_holds() -> None:
+    arm = Arm()
+    arm.start(**CUBIC)
+    arm.tick(50)
+    arm.follower.cancel()
+    outcome = arm.run()
+    assert outcome.end is End.CANCELLED
+    np.testing.assert_allclose(arm.q[0], -arm.q[1])  # still on the path
+    assert 0.25 < arm.q[0] < 0.35
+    held = arm.q.copy()
+    arm.tick(50)
+    np.testing.assert_array_equal(arm.q, held)
+    assert np.abs(np.diff(np.array(arm.history), n=2, axis=0)).max() < 0.0015  # less than 15 rad/s2
+
+
+def test_cancel_before_the_start_holds_at_once() -> None:
+    arm = Arm()
+    arm.start(start_ns=START + 1000 * MS)
+    arm.follower.cancel()
+    assert arm.run(limit=20).end is End.CANCELLED
+    np.testing.assert_array_equal(arm.q, 0.0)
+
+
+def test_a_new_trajectory_takes_over_without_a_jump() -> None:
+    arm = Arm()
+    arm.start(**CUBIC)
+    arm.tick(50)
+    arm.start(t=np.array([1.0]), q=np.array([[0.0, 0.3]]), v=np.zeros((1, 2)))
+    assert [o.end for o in arm.outcomes] == [End.ABORTED]
+    assert "newer" in arm.outcomes[0].text
+    assert arm.run().end is End.SUCCEEDED
+    np.testing.assert_allclose(arm.q, [0.0, 0.3])
+    assert np.abs(np.diff(np.array(arm.history), n=2, axis=0)).max() < 0.0015
+
+
+def test_a_refused_trajectory_leaves_the_running_one_alone() -> None:
+    arm = Arm()
+    arm.start(**CUBIC)
+    arm.tick(10)
+    with pytest.raises(TrajectoryError):
+        arm.start(start_ns=1)
+    assert arm.run().end is End.SUCCEEDED
+
+
+def test_reset_aborts_and_holds_the_new_position() -> None:
+    arm = Arm()
+    arm.start(**CUBIC)
+    arm.tick(10)
+    arm.follower.reset(np.array([0.7, 0.7]))
+    assert arm.outcomes[0].end is End.ABORTED
+    arm.tick()
+    np.testing.assert_array_equal(arm.history[-1], [0.7, 0.7])
+
+
+def test_a_position_command_moves_at_bounded_speed_and_stops_there() -> None:
+    arm = Arm()
+    arm.follower.set_target(np.array([1.0, np.nan]))
+    arm.tick(200)
+    np.testing.assert_array_equal(arm.q, [1.0, 0.0])
+    steps = np.diff(np.vstack([np.zeros(2), *arm.history]), axis=0)
+    assert np.abs(steps).max() <= CONFIG.command_velocity * 0.01 + 1e-12
+    assert (
+        np.abs(np.diff(steps, axis=0)).max() <= CONFIG.command_acceleration * 1e-4 * 1.2
+    )  # the last step ends on the target
+
+
+def test_position_commands_are_ignored_while_a_trajectory_runs() -> None:
+    arm = Arm()
+    arm.start(**CUBIC)
+    arm.follower.set_target(np.array([-1.0, -1.0]))
+    arm.run()
+    arm.tick(100)
+    np.testing.assert_allclose(arm.q, [0.5, -0.5])
+
+
+@given(target=st.floats(-3.0, 3.0), v=st.floats(0.1, 5.0), a=st.floats(0.5, 50.0))
+def test_the_tracker_arrives_without_overshoot(target: float, v: float, a: float) -> None:
+    tracker, goal = Tracker([0.0], [v], [a]), np.array([target])
+    furthest = 0.0
+    for _ in range(int((abs(target) / v + v / a) * 100) + 20):
+        tracker.step(goal, 0.01)
+        furthest = max(furthest, abs(tracker.position[0]))
+    assert tracker.position[0] == target
+    assert furthest <= abs(target) + 1e-12
+
+
+class Finger:
+    """A gripper follower and a finger that an object may stop at `width`; pressing on it costs `effort`."""
+
+    def __init__(self, position: float = 0.044, stop: float = -1.0) -> None:
+        self.follower = GripperFollower(FINGER, GripperConfig(), position, 30.0)
+        self.x, self.v, self.stop, self.t_ns = position, 0.0, stop, START
+        self.targets: list[float] = []
+        self.outcomes: list[GripperOutcome] = []
+
+    def start(self, position: float, **kwargs) -> None:
+        goal = self.follower.check(GripperGoal(position, **kwargs))
+        self.follower.start(goal, self.x, self.effort, self.outcomes.append)
+
+    @property
+    def effort(self) -> float:
+        command = self.targets[-1] if self.targets else self.x
+        return float(np.clip(2000.0 * (command - self.x), -30.0, 30.0))
+
+    def run(self, limit: int = 400) -> GripperOutcome:
+        n = len(self.outcomes)
+        while len(self.outcomes) == n:
+            assert limit > 0, "the goal did not end"
+            self.tick()
+            limit -= 1
+        return self.outcomes[-1]
+
+    def tick(self, n: int = 1) -> None:
+        for _ in range(n):
+            self.targets.append(self.follower.update(self.t_ns, 10 * MS, self.x, self.v, self.effort))
+            x = max(self.targets[-1], self.stop)
+            self.v, self.x = (x - self.x) / 0.01, x
+            self.t_ns += 10 * MS
+
+
+@pytest.mark.parametrize("position", [0.005, 0.035, 0.025, 0.0, 0.044])
+def test_p22_the_finger_reaches_its_goal(position: float) -> None:
+    finger = Finger(position=0.02)
+    finger.start(position)
+    outcome = finger.run()
+    assert (outcome.end, outcome.reached_goal, outcome.stalled) == (End.SUCCEEDED, True, False)
+    assert outcome.position == pytest.approx(position, abs=0.001)
+
+
+def test_b53_closing_takes_six_tenths_of_a_second() -> None:
+    finger = Finger()
+    finger.start(0.0)
+    finger.run()
+    assert (finger.t_ns - START) / 1e9 == pytest.approx(0.66, abs=0.06)
+
+
+def test_an_object_stalls_the_finger_and_is_pressed_on() -> None:
+    finger = Finger(stop=0.025)
+    finger.start(0.0)
+    outcome = finger.run()
+    assert (outcome.end, outcome.reached_goal, outcome.stalled) == (End.SUCCEEDED, False, True)
+    assert outcome.position == 0.025
+    assert outcome.effort == -30.0
+    finger.tick(100)
+    assert finger.targets[-1] == 0.0
+
+
+def test_effort_is_limited_as_asked_and_by_the_gripper() -> None:
+    finger = Finger()
+    for asked, limit in ((10.0, 10.0), (100.0, 30.0), (0.0, 30.0), (-5.0, 30.0)):
+        finger.start(0.0, max_effort=asked)
+        assert finger.follower.effort_limit == limit
+
+
+def test_velocity_is_limited_as_asked() -> None:
+    finger = Finger()
+    finger.start(0.0, max_velocity=0.022)
+    finger.run()
+    assert (finger.t_ns - START) / 1e9 == pytest.approx(2.05, abs=0.1)
+
+
+def test_cancel_stops_the_ramp() -> None:
+    finger = Finger()
+    finger.start(0.0)
+    finger.tick(20)
+    finger.follower.cancel()
+    assert finger.run(limit=2).end is End.CANCELLED
+    held = finger.targets[-1]
+    finger.tick(50)
+    assert finger.targets[-1] == pytest.approx(held, abs=0.002)
+
+
+def test_a_new_gripper_goal_takes_over() -> None:
+    finger = Finger()
+    finger.start(0.0)
+    finger.tick(5)
+    finger.start(0.044)
+    assert finger.outcomes[0].end is End.ABORTED
+    assert finger.run().reached_goal
+
+
+def test_a_finger_that_never_rests_times_out() -> None:
+    finger = Finger()
+    finger.start(0.02)
+    for i in range(600):
+        finger.follower.update(finger.t_ns, 10 * MS, 0.03, 0.01 * (-1) ** i, 0.0)
+        finger.t_ns += 10 * MS
+    assert [o.end for o in finger.outcomes] == [End.ABORTED]
+    assert "still moves at" in finger.outcomes[0].text
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "code", "message"),
+    [
+        (
+            {"position": 0.1},
+            Code.LIMITS,
+            r"position of finger is 0\.1000 m, out of its limits 0\.000 \(closed\) to 0\.044",
+        ),
+        ({"position": float("nan")}, Code.INVALID_ARGUMENT, "position of finger is nan"),
+        ({"position": 0.01, "max_effort": float("inf")}, Code.INVALID_ARGUMENT, "effort of finger is inf"),
+    ],
+)
+def test_bad_gripper_goals_are_refused_with_joint_and_value(kwargs: dict, code: Code, message: str) -> None:
+    with pytest.raises(OpenArmError, match=message) as caught:
+        Finger().follower.check(GripperGoal(**kwargs))
+    assert caught.value.code is code

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pacing: due times, hiccups, real-time factor, percentiles. The clock is an argument, so nothing here waits."""
+
+from __future__ import annotations
+
+import pytest
+
+from openarm_sim_bridge.pacing import Pacer, PeriodMeter, RealTimeFactor
+
+MS = 1_000_000
+
+
+def drive(pacer: Pacer, ticks: int, now: int = 0) -> list[int]:
+    """Run ticks as early as the pacer allows; the times they begin at."""
+    begun = []
+    for _ in range(ticks):
+        now += max(0, pacer.wait_ns(now))
+        pacer.ticked(now)
+        begun.append(now)
+    return begun
+
+
+def test_a18_ticks_are_a_period_apart_and_do_not_drift() -> None:
+    assert drive(Pacer(10 * MS), 5) == [0, 10 * MS, 20 * MS, 30 * MS, 40 * MS]
+
+
+@pytest.mark.parametrize(("speed", "step"), [(0.5, 20 * MS), (2.0, 5 * MS), (5.0, 2 * MS)])
+def test_speed_scales_the_period(speed: float, step: int) -> None:
+    assert drive(Pacer(10 * MS, speed), 3) == [0, step, 2 * step]
+
+
+def test_speed_zero_never_waits() -> None:
+    assert drive(Pacer(10 * MS, 0.0), 3, now=7) == [7, 7, 7]
+
+
+def test_a_short_hiccup_is_made_up_at_once() -> None:
+    pacer = Pacer(10 * MS)
+    drive(pacer, 2)
+    late = 55 * MS
+    assert drive(pacer, 5, late) == [late, late, late, late, 60 * MS]
+    assert pacer.skipped_ns == 0
+
+
+def test_a_long_halt_is_forgiven() -> None:
+    pacer = Pacer(10 * MS, max_debt_ns=500 * MS)
+    drive(pacer, 2)
+    late = 20 * MS + 3000 * MS
+    assert drive(pacer, 3, late) == [late, late + 10 * MS, late + 20 * MS]
+    assert pacer.skipped_ns == 3000 * MS
+
+
+def test_nothing_is_made_up_after_a_pause() -> None:
+    pacer = Pacer(10 * MS)
+    drive(pacer, 2)
+    pacer.restart()
+    assert drive(pacer, 2, 300 * MS) == [300 * MS, 310 * MS]
+
+
+def test_a19_real_time_factor_is_simulated_over_wall_time_of_the_window() -> None:
+    factor = RealTimeFactor(1000 * MS)
+    assert factor.value == 0.0
+    for i in range(300):  # half speed for two seconds, then full speed
+        factor.add(i * 10 * MS, i * 5 * MS if i < 200 else 1000 * MS + (i - 200) * 10 * MS)
+    assert factor.value == pytest.approx(1.0, abs=0.01)
+
+
+def test_period_figures() -> None:
+    meter = PeriodMeter(capacity=100)
+    assert meter.figures().n == 0
+    now = 0
+    for i in range(101):
+        meter.add(now)
+        now += (30 if i == 50 else 10) * MS
+    figures = meter.figures()
+    assert (figures.p50_ms, figures.max_ms, figures.n) == (10.0, 30.0, 100)
+    meter.restart()
+    meter.add(now + 10**12)
+    assert meter.figures().max_ms == 30.0
