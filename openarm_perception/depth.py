@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth images to points in the optical frame (z forward, x right, y down), metres.
 
-Depth is planar: the distance along the optical axis, not along the ray. Encodings are those of the ROS images: ``uint16``
-millimetres (16UC1) and ``float32`` metres (32FC1); 0, NaN, infinite, and anything outside the limits of the camera is invalid.
+Depth is planar: the distance along the optical axis, not along the ray. Encodings are those of the ROS images:
+``uint16`` millimetres (16UC1) and ``float32`` metres (32FC1). Invalid are 0, NaN, infinity, and what lies outside the
+limits of the camera.
 """
 
 from __future__ import annotations

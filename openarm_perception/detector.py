@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Objects in colour images: what a detector is, one that goes by colour, and which detection to take.
 
-Pixel coordinates put the centre of the top-left pixel at (0, 0). A detection says where in the image something is; where it
-is in space is the business of `openarm_perception.localize`, which reads the mask and the depth, never the box.
+Pixel coordinates put the centre of the top-left pixel at (0, 0). A detection says where in the image a thing is; where
+it is in space is the business of `openarm_perception.localize`, which reads the mask and the depth, never the box.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ class ColorDetectorConfig(Config):
     classes: tuple[ColorClass, ...] = Field(min_length=1, description="colours that are looked for")
     min_area: int = Field(120, ge=9, description="smallest object, pixels")
     cleanup: int = Field(3, ge=1, le=31, description="edge of the morphological kernel, pixels; odd")
-    sure_saturation: float = Field(0.7, gt=0.0, le=1.0, description="saturation from which a pixel counts in full, 0..1")
-    truncated_factor: float = Field(0.5, ge=0.0, le=1.0, description="score of an object cut by the image border, times this")
+    sure_saturation: float = Field(0.7, gt=0.0, le=1.0, description="a pixel as saturated as this counts in full, 0..1")
+    truncated_factor: float = Field(0.5, ge=0.0, le=1.0, description="factor on the score of what the border cuts")
     min_score: float = Field(0.3, ge=0.0, le=1.0, description="detections below are dropped, 0..1")
 
     @field_validator("cleanup")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from openarm_common.errors import Code, OpenArmError
 
 Array = NDArray[np.float64]
+Kind = Literal["rectangle", "circle", "bound"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class Footprint:
     """What an object covers, seen from above.
 
     Attributes:
-        kind: `rectangle` or `circle`.
+        kind: `rectangle` or `circle`, fitted; `bound`: the smallest rectangle around what was seen.
         centre: (2,) m.
         yaw: Direction of the smaller extent, rad in (-pi/2, pi/2]; 0 for a circle.
         size: (smaller, larger) extent, m; the diameter twice for a circle.
@@ -33,7 +34,7 @@ class Footprint:
         yaw_std: rad; that of any direction for a circle.
     """
 
-    kind: Literal["rectangle", "circle"]
+    kind: Kind
     centre: Array
     yaw: float
     size: tuple[float, float]
@@ -66,6 +67,23 @@ def fit(outline: Array, spacing: float) -> Footprint:
     if isinstance(best, str):
         raise OpenArmError(Code.NOTHING_DETECTED, best)
     return best
+
+
+def bound(points: Array, spacing: float) -> Footprint:
+    """The smallest rectangle around points (n, 2), m: for what is neither rectangle nor circle."""
+    (cx, cy), (width, height), angle_deg = cv2.minAreaRect((points * 1e3).astype(np.float32))
+    yaw = math.radians(angle_deg) + (math.pi / 2.0 if width > height else 0.0)
+    # half a pixel is missing on every side that the camera does not look at
+    smaller, larger = (1e-3 * min(width, height) + spacing, 1e-3 * max(width, height) + spacing)
+    std = (0.1 * smaller, 0.1 * larger)
+    return Footprint(
+        "bound", np.array([cx, cy]) * 1e-3, _half_turn(yaw), (smaller, larger), 0.0, std, math.radians(10.0)
+    )
+
+
+def _half_turn(yaw: float) -> float:
+    """The direction in (-pi/2, pi/2]."""
+    return math.pi / 2.0 - (math.pi / 2.0 - yaw) % math.pi
 
 
 def _rms(residual: Array) -> float:
@@ -103,13 +121,15 @@ def _fit_rectangle(outline: Array, spacing: float) -> tuple[Footprint | str, flo
     yaw = math.radians(angle_deg)
     sides: list[Array] = []
     names = ("first", "second")
-    for _ in range(6):
+    for step in range(6):
         local = _to_local(outline, centre, yaw)
-        sides = _assign(local, half, spacing)
+        # one stray point stretches the first rectangle, so the first assignment is generous and the later ones are not
+        sides = _assign(local, half, spacing, 0.3 * float(half.min()) * 0.5**step)
         for axis, name in enumerate(names):
             for sign in (0, 1):
                 side = sides[2 * axis + sign]
-                if len(side) < 3 or np.ptp(side[:, 1 - axis]) < 0.6 * half[1 - axis]:
+                # the direction comes from all sides, so a short piece says where its side is
+                if len(side) < 6:
                     text = f"an edge across the {name} axis of the outline is in view at {len(side)} points only"
                     return text + "; something hides the object", _rectangle_rms(local, half)
         # one direction for all four sides in closed form: turn two of them by a right angle and add the scatter
@@ -134,9 +154,8 @@ def _fit_rectangle(outline: Array, spacing: float) -> tuple[Footprint | str, flo
     lever = sum(float(((s[:, 1 - i // 2] - s[:, 1 - i // 2].mean()) ** 2).sum()) for i, s in enumerate(sides))
     if half[0] > half[1]:
         half, stds, yaw = half[::-1], stds[::-1], yaw + math.pi / 2.0
-    yaw = math.pi / 2.0 - (math.pi / 2.0 - yaw) % math.pi
     size = (2.0 * float(half[0]), 2.0 * float(half[1]))
-    return Footprint("rectangle", centre, yaw, size, rms, (stds[0], stds[1]), sigma / math.sqrt(lever)), rms
+    return Footprint("rectangle", centre, _half_turn(yaw), size, rms, (stds[0], stds[1]), sigma / math.sqrt(lever)), rms
 
 
 def _rotation(yaw: float) -> Array:
@@ -148,16 +167,13 @@ def _to_local(outline: Array, centre: Array, yaw: float) -> Array:
     return (outline - centre) @ _rotation(yaw)
 
 
-def _assign(local: Array, half: Array, spacing: float) -> list[Array]:
+def _assign(local: Array, half: Array, spacing: float, slack: float) -> list[Array]:
     """Points of the sides -x, +x, -y, +y; without those near a corner, whose side is open, and without strays."""
-    distance = np.stack(
-        [np.abs(local[:, 0] + half[0]), np.abs(local[:, 0] - half[0])]
-        + [np.abs(local[:, 1] + half[1]), np.abs(local[:, 1] - half[1])],
-        axis=1,
-    )
+    x, y = local.T
+    distance = np.abs(np.stack([x + half[0], x - half[0], y + half[1], y - half[1]], axis=1))
     nearest = distance.argmin(axis=1)
     residual = distance.min(axis=1)
-    limit = max(2.0 * spacing, 3.0 * float(np.median(residual)))
+    limit = max(2.0 * spacing, 3.0 * float(np.median(residual)), slack)
     sides: list[Array] = []
     for index in range(4):
         axis = index // 2

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
 from openarm_common import se3
 from openarm_common.cameras import Intrinsics
 
@@ -25,9 +26,12 @@ RGBA = {
 
 _XML = """
 <mujoco>
-  <visual><global offwidth="640" offheight="480"/><quality offsamples="0" shadowsize="0"/><map znear="0.02" zfar="5"/></visual>
+  <visual>
+    <global offwidth="640" offheight="480"/><quality offsamples="0" shadowsize="0"/><map znear="0.02" zfar="5"/>
+  </visual>
   <worldbody>
-    <light pos="1.5 0 2.5" dir="-0.5 0 -0.8" directional="true" castshadow="false" diffuse="0.6 0.6 0.6" ambient="0.3 0.3 0.3"/>
+    <light pos="1.5 0 2.5" dir="-0.5 0 -0.8" directional="true" castshadow="false"
+           diffuse="0.6 0.6 0.6" ambient="0.3 0.3 0.3"/>
     <geom name="table" type="box" size="0.5 0.8 0.02" pos="0.4 0 0.38" rgba="0.72 0.70 0.67 1"/>
     <geom name="floor" type="plane" size="3 3 0.1" rgba="0.4 0.4 0.42 1"/>
     <body name="camera" mocap="true"><camera name="camera" fovy="60"/></body>
@@ -40,7 +44,7 @@ _BODY = '<body name="o{i}" mocap="true"><geom name="o{i}" type="{kind}" size="0.
 
 @dataclass(frozen=True)
 class Thing:
-    """An object on the table: a box (full edges x, y, z) or an upright cylinder (diameter, diameter, height), m and rad."""
+    """On the table: a box (edges x, y, z) or an upright cylinder (diameter, diameter, height), m and rad."""
 
     label: str
     kind: str
@@ -48,11 +52,12 @@ class Thing:
     x: float
     y: float
     yaw: float = 0.0
+    lying: bool = False  # a cylinder with its axis along the yaw
 
     @property
     def position(self) -> NDArray[np.float64]:
         """Middle of the object, base frame, m."""
-        return np.array([self.x, self.y, TABLE + self.size[2] / 2.0])
+        return np.array([self.x, self.y, TABLE + self.size[0 if self.lying else 2] / 2.0])
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,15 @@ OVERHEAD = look_at((0.55, 0.0, 1.10), (0.27, 0.0, 0.42), (0.0, 1.0, 0.0))
 
 
 class Tabletop:
-    """Renders up to four boxes and four cylinders on a table."""
+    """Renders up to four boxes and four cylinders on a table.
+
+    Tests reach the names of this module through it, because a conftest can't be imported.
+    """
+
+    Thing = Thing
+    look_at = staticmethod(look_at)
+    table_height = TABLE
+    labels = tuple(RGBA)
 
     def __init__(self) -> None:
         kinds = ["box"] * 4 + ["cylinder"] * 4
@@ -101,11 +114,11 @@ class Tabletop:
             model.geom_size[geom] = half if thing.kind == "box" else (half[0], half[2], 0.0)
             model.geom_rgba[geom] = (*RGBA[thing.label], 1.0)
             data.mocap_pos[slot] = thing.position
-            data.mocap_quat[slot] = (np.cos(thing.yaw / 2.0), 0.0, 0.0, np.sin(thing.yaw / 2.0))
+            R = se3.rot_z(thing.yaw) @ (se3.rot_y(np.pi / 2) if thing.lying else np.eye(3))
+            data.mocap_quat[slot] = np.roll(se3.quat_xyzw_from_matrix(R), 1)
         # MuJoCo's cameras look along -z with y up
         R = T_base_camera[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-        x, y, z, w = se3.quat_xyzw_from_matrix(R)
-        data.mocap_pos[0], data.mocap_quat[0] = T_base_camera[:3, 3], (w, x, y, z)
+        data.mocap_pos[0], data.mocap_quat[0] = T_base_camera[:3, 3], np.roll(se3.quat_xyzw_from_matrix(R), 1)
         mujoco.mj_forward(model, data)
         self._renderer.update_scene(data, "camera")
         rgb = self._renderer.render()
