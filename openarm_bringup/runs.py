@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run folders, and the list of graphs that run now.
+
+A run folder is `runs/<stamp>/` below the working directory (or $OPENARM_RUNS); `runs/latest` points at the newest.
+What runs now is one small JSON file a supervisor in $XDG_RUNTIME_DIR/openarm (or the temporary folder), so that
+`openarm ps`, `logs` and `pick` find it from any terminal.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import psutil
+from pydantic import ValidationError
+
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+
+
+class NodeRecord(Config):
+    """One node as the supervisor sees it."""
+
+    state: str
+    pid: int | None = None
+    restarts: int = 0
+    log: str = ""
+
+
+class RunRecord(Config):
+    """One running graph."""
+
+    graph: str
+    pid: int
+    pid_created: float
+    domain: int
+    discovery: str
+    run_dir: str
+    started: str
+    ready: bool = False
+    nodes: dict[str, NodeRecord]
+
+    @property
+    def alive(self) -> bool:
+        """Whether its supervisor still runs (and not another process with its number)."""
+        try:
+            return abs(psutil.Process(self.pid).create_time() - self.pid_created) < 1.0
+        except psutil.NoSuchProcess:
+            return False
+
+
+def runs_root(environ: Mapping[str, str] = os.environ) -> Path:
+    """Return the folder of all runs."""
+    return Path(environ.get("OPENARM_RUNS") or "runs").resolve()
+
+
+def new_run_dir(root: Path | None = None) -> Path:
+    """Make a run folder named by the time of day, with `logs/` and `params/`, and point `latest` at it."""
+    root = runs_root() if root is None else root
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    number, folder = 1, root / stamp
+    while True:
+        try:
+            folder.mkdir(parents=True)
+            break
+        except FileExistsError:
+            number, folder = number + 1, root / f"{stamp}-{number + 1}"
+    (folder / "logs").mkdir()
+    (folder / "params").mkdir()
+    link = root / f".latest-{os.getpid()}"
+    link.unlink(missing_ok=True)
+    link.symlink_to(folder.name)
+    link.replace(root / "latest")
+    return folder
+
+
+def state_dir(environ: Mapping[str, str] = os.environ) -> Path:
+    """Return the folder of records of running graphs."""
+    runtime = environ.get("XDG_RUNTIME_DIR")
+    if runtime and os.access(runtime, os.W_OK):
+        return Path(runtime) / "openarm"
+    return Path(tempfile.gettempdir()) / f"openarm-{os.getuid()}"
+
+
+def write_record(record: RunRecord) -> Path:
+    """Write the record of this supervisor, atomically."""
+    folder = state_dir()
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    path = folder / f"{record.pid}.json"
+    draft = path.with_suffix(".tmp")
+    draft.write_text(record.model_dump_json(indent=1), encoding="utf-8")
+    draft.replace(path)
+    return path
+
+
+def remove_record(pid: int) -> None:
+    """Remove the record of a supervisor that ends."""
+    (state_dir() / f"{pid}.json").unlink(missing_ok=True)
+
+
+def running() -> list[RunRecord]:
+    """Return the graphs that run now, oldest first; records of dead supervisors are removed."""
+    records: list[RunRecord] = []
+    for path in sorted(state_dir().glob("*.json")) if state_dir().is_dir() else []:
+        try:
+            record = RunRecord.model_validate_json(path.read_text(encoding="utf-8"))
+        except (ValidationError, FileNotFoundError):
+            continue  # of another version, or just ended
+        if record.alive:
+            records.append(record)
+        else:
+            path.unlink(missing_ok=True)
+    return sorted(records, key=lambda record: record.started)
+
+
+def the_running(domain: int | None = None) -> RunRecord:
+    """Return the graph that runs now.
+
+    Args:
+        domain: Tells several running graphs apart; None = ROS_DOMAIN_ID if it is set, else the only one.
+
+    Raises:
+        OpenArmError: NOT_READY, when none runs; INVALID_ARGUMENT, when several do.
+    """
+    if domain is None and os.environ.get("ROS_DOMAIN_ID", "").isdecimal():
+        domain = int(os.environ["ROS_DOMAIN_ID"])
+    records = running()
+    matching = [record for record in records if domain is None or record.domain == domain]
+    if len(matching) == 1:
+        return matching[0]
+    listed = "; ".join(f"{r.graph} in domain {r.domain} (pid {r.pid})" for r in records)
+    if not matching:
+        hint = f"; running: {listed}" if listed else ""
+        where = "" if domain is None else f" in domain {domain}"
+        raise OpenArmError(Code.NOT_READY, f"no graph is running{where}{hint}; start one with `openarm up`")
+    raise OpenArmError(Code.INVALID_ARGUMENT, f"several graphs are running: {listed}; choose one with --domain")
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write a JSON report."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(data, indent=2, default=str) + "\n", encoding="utf-8")

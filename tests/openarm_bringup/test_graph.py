@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Graph files: what is accepted, what is refused and with which words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from openarm_bringup.draw import mermaid, text
+from openarm_bringup.graph import load_graph
+from openarm_common.errors import Code, OpenArmError
+
+BASE = """
+name: toy
+scene: demo
+seed: 3
+nodes:
+  bridge:
+    module: toy.bridge
+    params: {scene: "${scene}", seed: "${seed}", label: "run ${seed}", nested: {deep: {x: 1}}}
+    ready: [{message: /joint_states}]
+    offers: [/joint_states]
+  arm:
+    module: toy.arm
+    needs: [bridge]
+    uses: [/joint_states]
+  hand: {module: toy.hand, needs: [bridge, arm]}
+"""
+
+
+def write(folder: Path, body: str, name: str = "toy.yaml") -> str:
+    path = folder / name
+    path.write_text(body)
+    return str(path)
+
+
+def refused(folder: Path, body: str, **kwargs: object) -> OpenArmError:
+    with pytest.raises(OpenArmError) as caught:
+        load_graph(write(folder, body), **kwargs)  # type: ignore[arg-type]
+    return caught.value
+
+
+def test_variables_keep_their_type_and_nested_parameters_are_joined_by_dots(tmp_path: Path) -> None:
+    graph = load_graph(write(tmp_path, BASE))
+    assert graph.node("bridge").params == {"scene": "demo", "seed": 3, "label": "run 3", "nested.deep.x": 1}
+
+
+def test_overrides_come_before_substitution_and_set_comes_last(tmp_path: Path) -> None:
+    graph = load_graph(
+        write(tmp_path, BASE), overrides={"scene": "random", "seed": 8, "domain": None}, sets=["bridge.label=[1, 2]"]
+    )
+    assert graph.node("bridge").params["scene"] == "random"
+    assert graph.node("bridge").params["seed"] == 8
+    assert graph.node("bridge").params["label"] == [1, 2]
+    assert graph.domain is None
+
+
+def test_levels_follow_the_needs(tmp_path: Path) -> None:
+    assert load_graph(write(tmp_path, BASE)).levels() == (("bridge",), ("arm",), ("hand",))
+
+
+def test_duplicate_node_is_refused_with_its_line(tmp_path: Path) -> None:
+    error = refused(tmp_path, BASE + "  arm: {module: other}\n")
+    assert error.code == Code.CONFIG_INVALID
+    assert "'arm' is given twice" in error.message
+    assert "line 16" in error.message
+
+
+def test_unknown_need_names_file_key_and_choices(tmp_path: Path) -> None:
+    error = refused(tmp_path, BASE.replace("needs: [bridge, arm]", "needs: [bridg]"))
+    assert "toy.yaml:nodes.hand.needs: unknown node 'bridg'; nodes are bridge, arm, hand" in error.message
+
+
+def test_circle_of_needs_is_spelled_out(tmp_path: Path) -> None:
+    error = refused(tmp_path, BASE.replace("    module: toy.bridge\n", "    module: toy.bridge\n    needs: [hand]\n"))
+    assert "bridge → hand → bridge is a circle" in error.message
+
+
+def test_need_of_itself_is_a_circle(tmp_path: Path) -> None:
+    assert "arm → arm is a circle" in refused(tmp_path, BASE.replace("needs: [bridge]", "needs: [arm]")).message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("{message: /joint_states}", "{message: /a, topic: /b}", "nodes.bridge.ready.0: Value error, give exactly one"),
+        ("{message: /joint_states}", "{message: joint_states}", "must be an absolute name, such as /joint_states"),
+        ("module: toy.arm", "modul: toy.arm", "nodes.arm.modul: unknown key"),
+        ("seed: 3", "seed: -3", "seed: Input should be greater than or equal to 0, got -3"),
+        ("scene: demo", "sene: demo", "sene: unknown key; valid keys: name, description, scene"),
+        ('"run ${seed}"', '"run ${sed}"', "params.label: unknown variable ${sed}; there are ${scene}, ${seed}"),
+        ("module: toy.hand", "params_file: no.yaml, module: toy.hand", "nodes.hand.params_file: no.yaml is neither in"),
+    ],
+)
+def test_faults_name_the_key_and_what_is_valid(tmp_path: Path, old: str, new: str, words: str) -> None:
+    error = refused(tmp_path, BASE.replace(old, new))
+    assert error.code == Code.CONFIG_INVALID
+    assert "toy.yaml" in error.message
+    assert words in error.message
+
+
+@pytest.mark.parametrize(
+    ("item", "words"),
+    [
+        ("arm", "expected node.param=value"),
+        ("arm=3", "expected node.param=value"),
+        ("leg.speed=3", "has no node 'leg'; its nodes are bridge, arm, hand"),
+        ("arm.x=[1", "is not a value in YAML"),
+    ],
+)
+def test_wrong_set_is_refused(tmp_path: Path, item: str, words: str) -> None:
+    error = refused(tmp_path, BASE, sets=[item])
+    assert error.code == Code.INVALID_ARGUMENT
+    assert words in error.message
+
+
+def test_unknown_graph_lists_those_of_the_suite() -> None:
+    with pytest.raises(OpenArmError, match=r"no graph 'simm'; give a file, or one of .*sim"):
+        load_graph("simm")
+
+
+def test_extends_keeps_some_nodes_and_changes_others(tmp_path: Path) -> None:
+    write(tmp_path, BASE)
+    small = "extends: toy\nonly: [bridge, arm]\nscene: empty\nnodes: {arm: {params: {speed: 2.0}}}\n"
+    graph = load_graph(write(tmp_path, small, "small.yaml"))
+    assert graph.name == "toy" or graph.name == "small"
+    assert list(graph.nodes) == ["bridge", "arm"]
+    assert graph.node("bridge").params["scene"] == "empty"
+    assert graph.node("arm").params == {"speed": 2.0}
+    assert graph.node("arm").needs == ("bridge",)
+
+
+def test_only_of_an_unknown_node_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, BASE)
+    with pytest.raises(OpenArmError, match=r"small.yaml:only: unknown node 'leg'"):
+        load_graph(write(tmp_path, "extends: toy\nonly: [leg]\n", "small.yaml"))
+
+
+def test_parameter_file_comes_before_inline_parameters(tmp_path: Path) -> None:
+    (tmp_path / "p.yaml").write_text(
+        "/**: {ros__parameters: {a: 1, b: {c: 2}}}\narm: {ros__parameters: {a: 5, d: 6}}\n"
+    )
+    both = "module: toy.arm\n    params_file: p.yaml\n    params: {d: 7}"
+    graph = load_graph(write(tmp_path, BASE.replace("module: toy.arm", both)))
+    assert graph.node("arm").params == {"a": 5, "b.c": 2, "d": 7}
+
+
+def test_drawings_show_who_gives_what_to_whom(tmp_path: Path) -> None:
+    graph = load_graph(write(tmp_path, BASE))
+    assert "bridge -- /joint_states --> arm" in mermaid(graph)
+    assert "needs bridge" in text(graph)

@@ -1,0 +1,343 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The supervisor with toy processes and a toy probe: order, restarts, and above all that nothing survives."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
+from pathlib import Path
+
+import psutil
+import pytest
+
+from openarm_bringup import runs
+from openarm_bringup.graph import Graph, NodeSpec, Ready, Restart
+from openarm_bringup.keeper import NodeState
+from openarm_bringup.process import Ladder
+from openarm_bringup.supervisor import Event, Supervisor
+from openarm_common.errors import Code, OpenArmError
+
+#: Touches the file named by the first argument, as a server that has come up.
+READY = "import os, pathlib, sys, time; pathlib.Path(sys.argv[1]).write_text(str(os.getpid()));"
+
+
+class FileProbe:
+    """A condition holds when the file of that name exists; its content is the identity of who wrote it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def _who(self, condition: Ready) -> str:
+        path = self.folder / condition.name.strip("/")
+        return path.read_text() if path.exists() else ""
+
+    def known(self, conditions: Sequence[Ready]) -> frozenset[str]:
+        return frozenset(self._who(condition) for condition in conditions) - {""}
+
+    def unmet(self, conditions: Sequence[Ready], old: frozenset[str]) -> tuple[str, ...]:
+        return tuple(str(condition) for condition in conditions if self._who(condition) in {*old, ""})
+
+    def parameters(self, node: str) -> frozenset[str]:
+        return frozenset({"speed"})
+
+    def close(self) -> None:
+        pass
+
+
+def toy(folder: Path, name: str, body: str = "time.sleep(60)", **fields: object) -> NodeSpec:
+    """Return a node that reports ready and then does `body`."""
+    return NodeSpec(
+        command=("python", "-S", "-c", READY + body, str(folder / name)),
+        ready=(Ready(service=f"/{name}"),),
+        **fields,  # type: ignore[arg-type]
+    )
+
+
+class Running:
+    """A supervisor under test and what it has told."""
+
+    def __init__(self, folder: Path, nodes: dict[str, NodeSpec], ladder: Ladder | None = None) -> None:
+        self.events: list[Event] = []
+        self.supervisor = Supervisor(
+            Graph(name="toy", nodes=nodes, domain=67),
+            folder / "run",
+            lambda: FileProbe(folder),
+            listener=self.events.append,
+            ladder=ladder,
+            poll=0.01,
+        )
+
+    async def until(self, condition: Callable[[], bool], seconds: float = 20.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, f"timed out; events: {self.events}"
+            await asyncio.sleep(0.01)
+
+    def seen(self, node: str) -> list[NodeState]:
+        return [event.state for event in self.events if event.node == node]
+
+
+@contextlib.asynccontextmanager
+async def running(folder: Path, nodes: dict[str, NodeSpec], ladder: Ladder | None = None) -> AsyncIterator[Running]:
+    run = Running(folder, nodes, ladder)
+    await run.supervisor.start()
+    try:
+        yield run
+    finally:
+        await run.supervisor.stop()
+
+
+@pytest.fixture(autouse=True)
+def own_state_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "xdg").mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "xdg"))
+
+
+def gone(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
+def wait_gone(pids: Sequence[int], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while not all(gone(pid) for pid in pids):
+        assert time.monotonic() < deadline, f"still alive: {[pid for pid in pids if not gone(pid)]}"
+        time.sleep(0.05)
+
+
+def test_b12_nodes_start_when_their_needs_are_ready_and_stop_in_reverse(tmp_path: Path) -> None:
+    nodes = {
+        "last": toy(tmp_path, "last", needs=("middle",)),
+        "middle": toy(tmp_path, "middle", needs=("first",)),
+        "first": toy(tmp_path, "first"),
+    }
+
+    async def body() -> list[Event]:
+        async with running(tmp_path, nodes) as run:
+            await run.supervisor.wait_ready()
+            assert all(state == NodeState.READY for state in run.supervisor.states().values())
+            (record,) = runs.running()
+            assert record.ready
+            assert record.domain == 67
+        assert runs.running() == []
+        return run.events
+
+    events = [(event.node, event.state) for event in asyncio.run(body())]
+    starts = [node for node, state in events if state == NodeState.STARTING]
+    stops = [node for node, state in events if state == NodeState.STOPPED]
+    assert starts == ["first", "middle", "last"]
+    assert stops == ["last", "middle", "first"]
+    for need, node in (("first", "middle"), ("middle", "last")):
+        assert events.index((need, NodeState.READY)) < events.index((node, NodeState.STARTING))
+
+
+def test_output_goes_to_a_log_per_node_with_the_time(tmp_path: Path) -> None:
+    body = (
+        "print('to out', flush=True); print('to err', file=sys.stderr, flush=True);"
+        "sys.stdout.write('no end'); sys.stdout.flush(); time.sleep(0.3)"
+    )
+
+    async def run_it() -> None:
+        async with running(tmp_path, {"talker": toy(tmp_path, "talker", body)}) as run:
+            await run.until(lambda: NodeState.EXITED in run.seen("talker"))
+
+    asyncio.run(run_it())
+    lines = (tmp_path / "run" / "logs" / "talker.log").read_text().splitlines()
+    assert [line.split(" ", 2)[2] for line in lines] == ["to out", "to err", "no end"]
+    assert all(line[:2] == "20" and line[10] == " " for line in lines)
+
+
+def test_failed_node_comes_back_and_old_endpoints_do_not_count_as_ready(tmp_path: Path) -> None:
+    nodes = {"arm": toy(tmp_path, "arm", restart=Restart(backoff=0.05))}
+
+    async def body() -> None:
+        async with running(tmp_path, nodes) as run:
+            await run.supervisor.wait_ready()
+            first = run.supervisor.pid("arm")
+            os.kill(first, signal.SIGKILL)
+            await run.until(lambda: run.seen("arm").count(NodeState.READY) == 2)
+            second = run.supervisor.pid("arm")
+            assert second != first
+            assert (tmp_path / "arm").read_text() == str(second)
+        assert run.seen("arm") == [
+            NodeState.STARTING,
+            NodeState.READY,
+            NodeState.BACKOFF,
+            NodeState.STARTING,
+            NodeState.READY,
+            NodeState.STOPPED,
+        ]
+
+    asyncio.run(body())
+
+
+def test_restarts_end_after_the_maximum_with_the_log_in_the_message(tmp_path: Path) -> None:
+    crash = "time.sleep(0.2); print('no camera found', flush=True); sys.exit(3)"
+    nodes = {"eye": toy(tmp_path, "eye", crash, restart=Restart(backoff=0.05, max=2))}
+
+    async def body() -> OpenArmError:
+        async with running(tmp_path, nodes) as run:
+            with pytest.raises(OpenArmError) as caught:
+                await run.supervisor.wait_stop_asked()
+            assert run.seen("eye").count(NodeState.BACKOFF) == 2
+            assert run.seen("eye")[-1] == NodeState.FAILED
+            return caught.value
+
+    error = asyncio.run(body())
+    assert error.code == Code.NOT_READY
+    assert "ended with code 3 after 2 restarts" in error.message
+    assert "no camera found" in error.message
+
+
+def test_node_that_never_gets_ready_is_named_with_what_is_missing(tmp_path: Path) -> None:
+    silent = NodeSpec(
+        command=("python", "-S", "-c", "import time; time.sleep(60)"), ready=(Ready(action="/pick"),), ready_timeout=0.5
+    )
+
+    async def body() -> OpenArmError:
+        async with running(tmp_path, {"silent": silent}) as run:
+            with pytest.raises(OpenArmError) as caught:
+                await run.supervisor.wait_ready()
+            return caught.value
+
+    assert "silent was not ready after 0.5 s; missing: action /pick" in asyncio.run(body()).message
+
+
+def test_node_that_fails_at_its_first_start_fails_the_graph_at_once(tmp_path: Path) -> None:
+    broken = NodeSpec(command=("python", "-c", "raise SystemExit('no such scene')"), ready=(Ready(service="/x"),))
+
+    async def body() -> OpenArmError:
+        async with running(tmp_path, {"broken": broken}) as run:
+            with pytest.raises(OpenArmError) as caught:
+                await run.supervisor.wait_ready()
+            return caught.value
+
+    assert "no such scene" in asyncio.run(body()).message
+
+
+def test_unknown_parameter_is_refused_because_ros_would_ignore_it(tmp_path: Path) -> None:
+    async def body() -> OpenArmError:
+        async with running(tmp_path, {"arm": toy(tmp_path, "arm", params={"sped": 1})}) as run:
+            with pytest.raises(OpenArmError) as caught:
+                await run.supervisor.wait_ready()
+            return caught.value
+
+    assert "arm has no parameter 'sped'; it has speed" in asyncio.run(body()).message
+
+
+def test_error_inside_the_probe_is_raised_and_not_waited_for_ever(tmp_path: Path) -> None:
+    async def body() -> None:
+        def no_rclpy() -> FileProbe:
+            raise ImportError("no rclpy here")
+
+        supervisor = Supervisor(Graph(name="toy", nodes={"arm": toy(tmp_path, "arm")}), tmp_path / "run", no_rclpy)
+        await supervisor.start()
+        try:
+            with pytest.raises(ImportError, match="no rclpy here"):
+                await supervisor.wait_ready()
+        finally:
+            await supervisor.stop()
+
+    asyncio.run(body())
+
+
+def test_p34_grandchildren_end_with_their_node(tmp_path: Path) -> None:
+    body = (
+        "import subprocess; c = subprocess.Popen([sys.executable, '-S', '-c', "
+        "'import signal, time; signal.signal(2, signal.SIG_IGN); signal.signal(15, signal.SIG_IGN); time.sleep(60)']);"
+        "pathlib.Path(sys.argv[1] + '.child').write_text(str(c.pid)); time.sleep(60)"
+    )
+
+    async def run_it() -> list[int]:
+        async with running(tmp_path, {"parent": toy(tmp_path, "parent", body)}) as run:
+            await run.supervisor.wait_ready()
+            await run.until(lambda: (tmp_path / "parent.child").exists())
+            return [run.supervisor.pid("parent"), int((tmp_path / "parent.child").read_text())]
+
+    wait_gone(asyncio.run(run_it()), 2.0)
+
+
+DEAF_TO_INT = "import signal; signal.signal(2, signal.SIG_IGN); print('deaf', flush=True); time.sleep(60)"
+STUBBORN = "import signal; signal.signal(15, signal.SIG_IGN);" + DEAF_TO_INT
+
+
+@pytest.mark.parametrize(
+    ("body", "detail"), [("time.sleep(60)", "code "), (DEAF_TO_INT, "code -15"), (STUBBORN, "killed (-9)")]
+)
+def test_stop_goes_up_the_ladder_int_term_kill(tmp_path: Path, body: str, detail: str) -> None:
+    async def run_it() -> tuple[str, float]:
+        async with running(tmp_path, {"toy": toy(tmp_path, "toy", body)}, Ladder(0.5, 0.5)) as run:
+            await run.supervisor.wait_ready()
+            if body != "time.sleep(60)":
+                log = tmp_path / "run" / "logs" / "toy.log"
+                await run.until(lambda: log.exists() and "deaf" in log.read_text())
+            began = time.monotonic()
+        return run.events[-1].detail, time.monotonic() - began
+
+    last, seconds = asyncio.run(run_it())
+    assert last.startswith(detail)
+    assert seconds < 5.0
+
+
+def test_second_ctrl_c_cuts_the_patience_short(tmp_path: Path) -> None:
+    async def run_it() -> float:
+        run = Running(tmp_path, {"deaf": toy(tmp_path, "deaf", STUBBORN)}, Ladder(30.0, 30.0))
+        await run.supervisor.start()
+        await run.supervisor.wait_ready()
+        log = tmp_path / "run" / "logs" / "deaf.log"
+        await run.until(lambda: log.exists() and "deaf" in log.read_text())
+        began = time.monotonic()
+        run.supervisor.ask_stop()
+        stopping = asyncio.create_task(run.supervisor.stop())
+        while not stopping.done():
+            await asyncio.sleep(0.3)
+            run.supervisor.ask_stop()
+        await stopping
+        return time.monotonic() - began
+
+    assert asyncio.run(run_it()) < 10.0
+
+
+def test_p34_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
+    """SIGKILL leaves the supervisor no time for anything: its guard ends the nodes, deaf ones and grandchildren too."""
+    script = tmp_path / "supervise.py"
+    script.write_text(
+        textwrap.dedent(
+            f"""
+            import asyncio, sys
+            from pathlib import Path
+            sys.path.insert(0, {str(Path(__file__).parent)!r})
+            import test_supervisor as t
+            folder = Path({str(tmp_path)!r})
+            async def main():
+                nodes = {{"meek": t.toy(folder, "meek"), "deaf": t.toy(folder, "deaf", t.DEAF_TO_INT)}}
+                run = t.Running(folder, nodes)
+                await run.supervisor.start()
+                await run.supervisor.wait_ready()
+                print("up", *(run.supervisor.pid(n) for n in nodes), flush=True)
+                await run.supervisor.wait_stop_asked()
+            asyncio.run(main())
+            """
+        )
+    )
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    process = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True, env=env)
+    try:
+        assert process.stdout is not None
+        word, *pids = process.stdout.readline().split()
+        assert word == "up"
+        assert len(pids) == 2
+    finally:
+        process.kill()
+        process.communicate()
+    wait_gone([int(pid) for pid in pids], 9.0)
+    assert runs.running() == [], "a dead supervisor's record must not be listed"
