@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Jerk-limited timing of joint paths.
+
+A path is followed exactly; only its speed is chosen. Ruckig gives the profile of one number, the way along a path from
+rest to rest, of seven pieces of constant jerk (never its `intermediate_positions`: in the wheels they call a service on
+the network). Samples lie on a grid and at the ends of those pieces, with velocities and accelerations, so that a
+follower's quintic interpolation is the profile itself on a straight joint line. s, rad, rad/s, rad/s², rad/s³.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import ruckig
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import make_interp_spline
+
+from openarm_common.errors import Code, OpenArmError
+
+Array = NDArray[np.float64]
+
+#: Samples of a path at which limits are looked at, and the excess over them that rounding may leave.
+_FINE = 400
+#: A path shorter than this, rad or m, is none.
+_NOTHING = 1e-9
+#: Two samples are at least this far apart, s.
+_SPACING = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class JointLimits:
+    """Velocity, acceleration and jerk limits of the joints, (n,) each."""
+
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+
+    def scaled(self, scale: float) -> JointLimits:
+        """The limits times `scale`.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when `scale` is not in (0, 1].
+        """
+        if not 0.0 < scale <= 1.0:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"velocity_scale is {scale}, expected 0 < scale <= 1")
+        return JointLimits(self.velocity * scale, self.acceleration * scale, self.jerk * scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Samples of a motion: times (m,) from 0, positions, velocities and accelerations (m, n) of the joints `names`."""
+
+    names: tuple[str, ...]
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+
+    @property
+    def duration(self) -> float:
+        """Time of the last sample, s."""
+        return float(self.t[-1])
+
+    def at(self, t: ArrayLike) -> tuple[Array, Array, Array]:
+        """Positions, velocities, accelerations (k, n) at times (k,), by quintic interpolation; held beyond the ends."""
+        times = np.clip(np.atleast_1d(np.asarray(t, dtype=np.float64)), self.t[0], self.t[-1])
+        if self.t.size == 1:
+            return tuple(np.repeat(x, times.size, axis=0) for x in (self.q, self.v, self.a))  # type: ignore[return-value]
+        i = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, self.t.size - 2)
+        h = (self.t[i + 1] - self.t[i])[:, None]
+        u = (times - self.t[i])[:, None] / h
+        q0, v0, a0 = self.q[i], self.v[i] * h, self.a[i] * h * h
+        dq, v1, a1 = self.q[i + 1] - q0, self.v[i + 1] * h, self.a[i + 1] * h * h
+        c3 = 10.0 * dq - 6.0 * v0 - 4.0 * v1 - 1.5 * a0 + 0.5 * a1
+        c4 = -15.0 * dq + 8.0 * v0 + 7.0 * v1 + 1.5 * a0 - a1
+        c5 = 6.0 * dq - 3.0 * (v0 + v1) - 0.5 * (a0 - a1)
+        q = q0 + u * (v0 + u * (0.5 * a0 + u * (c3 + u * (c4 + u * c5))))
+        v = (v0 + u * (a0 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))) / h
+        a = (a0 + u * (6.0 * c3 + u * (12.0 * c4 + u * 20.0 * c5))) / (h * h)
+        return q, v, a
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Way along a path over time: pieces of constant jerk that begin at `t` (k,) with the values `s`, `v`, `a`, `j`."""
+
+    t: Array
+    s: Array
+    v: Array
+    a: Array
+    j: Array
+    duration: float
+
+    def at(self, t: Array) -> tuple[Array, Array, Array, Array]:
+        """Way, speed, acceleration, jerk at times (k,)."""
+        i = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, self.t.size - 1)
+        h = np.clip(t, 0.0, self.duration) - self.t[i]
+        s, v, a, j = self.s[i], self.v[i], self.a[i], self.j[i]
+        return (
+            s + h * (v + h * (0.5 * a + h * j / 6.0)),
+            v + h * (a + 0.5 * h * j),
+            a + h * j,
+            j,
+        )
+
+    def slower(self, factor: float) -> Profile:
+        """The same way in `factor` times the time."""
+        k = factor
+        return Profile(self.t * k, self.s, self.v / k, self.a / k**2, self.j / k**3, self.duration * k)
+
+
+def profile(length: float, velocity: float, acceleration: float, jerk: float) -> Profile:
+    """Fastest way from rest to rest over `length` within the limits.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when a limit is not positive.
+    """
+    if not min(length, velocity, acceleration, jerk) > 0.0:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"length {length:g}, velocity {velocity:g}, acceleration {acceleration:g}, jerk {jerk:g}: expected all > 0",
+        )
+    generator, query, answer = ruckig.Ruckig(1), ruckig.InputParameter(1), ruckig.Trajectory(1)
+    query.current_position, query.target_position = [0.0], [length]
+    query.max_velocity, query.max_acceleration, query.max_jerk = [velocity], [acceleration], [jerk]
+    result = generator.calculate(query, answer)
+    if result not in (ruckig.Result.Working, ruckig.Result.Finished):
+        raise OpenArmError(Code.INTERNAL, f"ruckig answered {result} for a way of {length:g} from rest to rest")
+    pieces = answer.profiles[0][0]
+    h, j = np.array(pieces.t), np.array(pieces.j)
+    t = np.concatenate([[0.0], np.cumsum(h)])
+    s, v, a = np.zeros(h.size), np.zeros(h.size), np.zeros(h.size)
+    for i in range(h.size - 1):
+        a[i + 1] = a[i] + h[i] * j[i]
+        v[i + 1] = v[i] + h[i] * (a[i] + 0.5 * h[i] * j[i])
+        s[i + 1] = s[i] + h[i] * (v[i] + h[i] * (0.5 * a[i] + h[i] * j[i] / 6.0))
+    real = h > 1e-12
+    return Profile(t[:-1][real], s[real], v[real], a[real], j[real], float(t[-1]))
+
+
+def time_polyline(names: Sequence[str], waypoints: Array, limits: JointLimits, period: float = 0.02) -> Trajectory:
+    """Time straight joint segments, each from rest to rest.
+
+    Args:
+        names: Joints.
+        waypoints: (m, n) rad.
+        limits: What no joint exceeds.
+        period: Greatest time between two samples, s.
+    """
+    parts: list[Trajectory] = []
+    for start, end in zip(waypoints[:-1], waypoints[1:], strict=True):
+        difference = end - start
+        size = np.abs(difference)
+        if float(size.max()) < _NOTHING:
+            continue
+        with np.errstate(divide="ignore"):
+            v, a, j = (float(np.min(x / size)) for x in (limits.velocity, limits.acceleration, limits.jerk))
+        way = profile(1.0, v, a, j)
+        t = _sample_times(way, period)
+        s, ds, dds, _ = way.at(t)
+        q = start + s[:, None] * difference
+        q[-1] = end
+        parts.append(Trajectory(tuple(names), t, q, ds[:, None] * difference, dds[:, None] * difference))
+    return _joined(tuple(names), parts, waypoints[0], period)
+
+
+def time_path(
+    names: Sequence[str], path: Array, s: Array, limits: JointLimits, speed: float, period: float = 0.02
+) -> Trajectory:
+    """Time a smooth joint path from rest to rest.
+
+    The limits hold at every moment: a first profile is made from the path's steepest parts, and then slowed down as a
+    whole by what curvature adds, which scales velocity, acceleration and jerk by known powers.
+
+    Args:
+        names: Joints.
+        path: (m, n) rad, smooth and dense, m >= 6.
+        s: (m,) way along the path that rises from 0, for example of the tool, m.
+        limits: What no joint exceeds.
+        speed: Greatest ds/dt.
+        period: Greatest time between two samples, s.
+    """
+    if s[-1] < _NOTHING:
+        return _joined(tuple(names), [], path[0], period)
+    curve = make_interp_spline(s, path, k=5)
+    d1, d2, d3 = (curve.derivative(k) for k in (1, 2, 3))
+    fine = np.linspace(0.0, float(s[-1]), _FINE)
+    steepest = np.maximum(np.abs(d1(fine)).max(axis=0), 1e-9)
+    v, a, j = (float(np.min(x / steepest)) for x in (limits.velocity, limits.acceleration, limits.jerk))
+    way = profile(float(s[-1]), min(speed, v), a, j)
+    t = np.union1d(np.linspace(0.0, way.duration, _FINE), np.concatenate([way.t, way.t + 1e-9]))
+    x, dx, ddx, dddx = (value[:, None] for value in way.at(t))
+    q1, q2, q3 = d1(x[:, 0]), d2(x[:, 0]), d3(x[:, 0])
+    velocity = np.abs(q1 * dx) / limits.velocity
+    acceleration = np.abs(q2 * dx**2 + q1 * ddx) / limits.acceleration
+    # at the border of two pieces the jerk jumps: the grid holds both sides of it
+    jerk = np.abs(q3 * dx**3 + 3.0 * q2 * dx * ddx + q1 * dddx) / limits.jerk
+    factor = max(1.0, float(velocity.max()), float(acceleration.max()) ** 0.5, float(jerk.max()) ** (1.0 / 3.0))
+    way = way.slower(factor * (1.0 + 1e-6))
+    t = _sample_times(way, period)
+    x, dx, ddx, _ = (value[:, None] for value in way.at(t))
+    q1, q2 = d1(x[:, 0]), d2(x[:, 0])
+    q = np.asarray(curve(x[:, 0]))
+    q[0], q[-1] = path[0], path[-1]
+    return Trajectory(tuple(names), t, q, q1 * dx, q2 * dx**2 + q1 * ddx)
+
+
+def _sample_times(way: Profile, period: float) -> Array:
+    """Grid of at most `period`, joined with the borders of the pieces; grid points next to a border give way."""
+    grid = np.linspace(0.0, way.duration, max(2, int(np.ceil(way.duration / period)) + 1))
+    borders = np.concatenate([way.t, [way.duration]])
+    borders = borders[np.concatenate([[True], np.diff(borders) > _SPACING])]
+    borders[-1] = way.duration
+    far = np.min(np.abs(grid[:, None] - borders[None, :]), axis=1) > _SPACING
+    return np.sort(np.concatenate([grid[far], borders]))
+
+
+def _joined(names: tuple[str, ...], parts: list[Trajectory], q: Array, period: float) -> Trajectory:
+    """Parts one after the other (each begins where the last ended, at rest); a rest of one period when there is none."""
+    if not parts:
+        rest = np.zeros((2, q.size))
+        return Trajectory(names, np.array([0.0, period]), np.stack([q, q]), rest, rest)
+    t, offset = [parts[0].t], parts[0].duration
+    for part in parts[1:]:
+        t.append(part.t[1:] + offset)
+        offset += part.duration
+    q_, v, a = (np.concatenate([getattr(parts[0], k), *(getattr(p, k)[1:] for p in parts[1:])]) for k in ("q", "v", "a"))
+    return Trajectory(names, np.concatenate(t), q_, v, a)
