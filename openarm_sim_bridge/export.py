@@ -138,7 +138,7 @@ def render_png(
     image = render(scene, posture, width, height, view=view, seed=seed)
     ok, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     if not ok:
-        raise OpenArmError(Code.INTERNAL, f"PNG encoding of a {width}×{height} image failed")
+        raise OpenArmError(Code.INTERNAL, f"PNG encoding of a {width} x {height} image failed")
     try:
         Path(path).write_bytes(data.tobytes())
     except OSError as error:

@@ -178,7 +178,7 @@ def state_lines() -> list[str]:
     """Named postures of each group."""
 
     def state(group: str, name: str, values: dict[str, float]) -> list[str]:
-        joints = [f'    <joint name="{joint}" value="{value:g}"/>' for joint, value in values.items()]
+        joints = [f'    <joint name="{joint}" value="{value:.9g}"/>' for joint, value in values.items()]
         return [f'  <group_state name="{name}" group="{group}">', *joints, "  </group_state>"]
 
     def arm(side: Side, q: tuple[float, ...]) -> dict[str, float]:

@@ -1,0 +1,372 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The description against the number table of OpenArm v1.0 (tool centre point of 2026), written down here once more."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from types import ModuleType
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+import yourdfpy
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.description import BASE_LINK, SIDES, RobotDescription, Side, mirror
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import models_dir
+from openarm_sim_bridge.model import PhysicsConfig, robot_spec
+
+Array = NDArray[np.float64]
+HALF_PI = np.pi / 2
+
+# Right arm: offset of the joint frame, its roll, axis, limits (rad), effort (N m), velocity (rad/s).
+ARM = [
+    ((0, 0, 0.0625), 0, (0, 0, 1), (-1.396263, 3.490659), 40, 16.754666),
+    ((-0.0301, 0, 0.06), HALF_PI, (-1, 0, 0), (-0.174533, 3.316125), 40, 16.754666),
+    ((0.0301, 0, 0.06625), 0, (0, 0, 1), (-1.570796, 1.570796), 27, 5.445426),
+    ((0, 0.0315, 0.15375), 0, (0, 1, 0), (0, 2.443461), 27, 5.445426),
+    ((0, -0.0315, 0.0955), 0, (0, 0, 1), (-1.570796, 1.570796), 7, 20.943946),
+    ((0.0375, 0, 0.1205), 0, (1, 0, 0), (-0.785398, 0.785398), 7, 20.943946),
+    ((-0.0375, 0, 0), 0, (0, 1, 0), (-1.570796, 1.570796), 7, 20.943946),
+]
+IN_LINK7 = {"link8": (1e-6, 0.0205, 0), "hand": (0, 0, 0.1025), "hand_tcp": (0, 0, 0.1801)}
+LINK_NAMES = {"world", BASE_LINK} | {
+    f"openarm_{side}_{link}"
+    for side in SIDES
+    for link in [*(f"link{i}" for i in range(9)), "hand", "hand_tcp", "left_finger", "right_finger"]
+}
+
+
+def table_frames(side: Side, q: Array, finger: float) -> dict[str, Array]:
+    """Every frame of one arm, (4, 4) in the world, from the table alone."""
+    left = side == "left"
+    sign = -1.0 if left else 1.0
+    T = se3.make(se3.rot_x(sign * HALF_PI), (0, -sign * 0.031, 0.698))
+    frames = {"link0": T}
+    for i, (offset, roll, axis, *_) in enumerate(ARM):
+        turn = -1.0 if left and i == 6 else 1.0
+        T = T @ se3.make(se3.rot_x(sign * roll), offset) @ se3.make(se3.exp_so3(turn * q[i] * np.array(axis)))
+        frames[f"link{i + 1}"] = T
+    for name, offset in IN_LINK7.items():
+        frames[name] = T @ se3.make(None, offset)
+    for name, outward in (("left_finger", 1), ("right_finger", -1)):
+        frames[name] = T @ se3.make(None, (0, outward * (0.005 + finger), 0.1025))
+    return {f"openarm_{side}_{name}": pose for name, pose in frames.items()}
+
+
+def closed_form_tcp(q: Array) -> Array:
+    """Tool centre point of the right arm: three spheres of axes, 0.220, 0.216 and 0.1801 m apart."""
+    x, y, z = se3.rot_x, se3.rot_y, se3.rot_z
+    upper = x(HALF_PI) @ z(q[0]) @ x(HALF_PI - q[1]) @ z(q[2])
+    fore = upper @ y(q[3])
+    hand = fore @ z(q[4]) @ x(q[5]) @ y(q[6])
+    position = np.array([0, -0.1535, 0.698]) + 0.220 * upper[:, 2] + 0.216 * fore[:, 2] + 0.1801 * hand[:, 2]
+    return se3.make(hand, position)
+
+
+@pytest.fixture(scope="module")
+def description() -> RobotDescription:
+    return RobotDescription.load()
+
+
+@pytest.fixture(scope="module")
+def model(description: RobotDescription) -> mujoco.MjModel:
+    return robot_spec(description, PhysicsConfig()).compile()
+
+
+@pytest.fixture(scope="module")
+def configurations(description: RobotDescription) -> list[dict[str, float]]:
+    """1000 random configurations within the limits, by joint name."""
+    rng = np.random.default_rng(7)
+    names = [name for name, joint in description.joints.items() if joint.type != "fixed" and joint.mimic is None]
+    lower, upper = description.limits(names)
+    return [dict(zip(names, rng.uniform(lower, upper), strict=True)) for _ in range(1000)]
+
+
+def expected(description: RobotDescription, q: dict[str, float]) -> dict[str, Array]:
+    frames: dict[str, Array] = {BASE_LINK: np.eye(4)}
+    for side in SIDES:
+        arm = np.array([q[name] for name in description.arm_joints(side)])
+        frames |= table_frames(side, arm, q[description.finger_joint(side)])
+    return frames
+
+
+def test_a06_own_forward_kinematics_equals_the_table(
+    description: RobotDescription, configurations: list[dict[str, float]]
+) -> None:
+    worst = 0.0
+    for q in configurations:
+        poses = description.link_poses(q)
+        for name, T in expected(description, q).items():
+            worst = max(worst, float(np.abs(poses[name] - T).max()))
+    assert worst < 1e-9, worst
+
+
+def test_a06_tcp_equals_the_closed_form_and_the_left_arm_is_its_mirror_image(
+    description: RobotDescription, configurations: list[dict[str, float]]
+) -> None:
+    flip = np.diag([1.0, -1.0, 1.0])
+    for q in configurations:
+        right = np.array([q[name] for name in description.arm_joints("right")])
+        T = closed_form_tcp(right)
+        np.testing.assert_allclose(description.link_pose("openarm_right_hand_tcp", q), T, atol=1e-6)
+        left = dict(zip(description.arm_joints("left"), mirror(right), strict=True))
+        T_mirror = se3.make(flip @ T[:3, :3] @ flip, flip @ T[:3, 3])
+        np.testing.assert_allclose(description.link_pose("openarm_left_hand_tcp", left), T_mirror, atol=1e-6)
+
+
+def test_a06_a12_mujoco_forward_kinematics_equals_the_table(
+    description: RobotDescription, model: mujoco.MjModel, configurations: list[dict[str, float]]
+) -> None:
+    data = mujoco.MjData(model)
+    worst = 0.0
+    for q in configurations:
+        for name, joint in description.joints.items():
+            if joint.type != "fixed":
+                data.qpos[model.joint(name).qposadr[0]] = q[joint.mimic or name]
+        mujoco.mj_kinematics(model, data)
+        for name, T in expected(description, q).items():
+            body = data.body(name)
+            worst = max(worst, float(np.abs(body.xpos - T[:3, 3]).max()))
+            worst = max(worst, float(np.abs(body.xmat.reshape(3, 3) - T[:3, :3]).max()))
+        for side in SIDES:
+            tcp = description.tcp_link(side)
+            np.testing.assert_allclose(data.site(tcp).xpos, expected(description, q)[tcp][:3, 3], atol=1e-6)
+    assert worst < 1e-6, worst
+
+
+def test_a06_pinocchio_forward_kinematics_equals_the_table(
+    description: RobotDescription, configurations: list[dict[str, float]]
+) -> None:
+    model = pin.buildModelFromXML(description.urdf)
+    data = model.createData()
+    worst = 0.0
+    for q in configurations:
+        x = pin.neutral(model)
+        for name, joint in description.joints.items():
+            if joint.type != "fixed":
+                x[model.joints[model.getJointId(name)].idx_q] = q[joint.mimic or name]
+        pin.framesForwardKinematics(model, data, x)
+        for name, T in expected(description, q).items():
+            pose = data.oMf[model.getFrameId(name, pin.FrameType.BODY)]
+            worst = max(worst, float(np.abs(pose.homogeneous - T).max()))
+    assert worst < 1e-6, worst
+
+
+def test_world_positions_at_zero(description: RobotDescription) -> None:
+    zero = dict.fromkeys(description.joints, 0.0)
+    poses = description.link_poses(zero)
+    for side, sign in (("right", -1.0), ("left", 1.0)):
+        np.testing.assert_allclose(poses[f"openarm_{side}_hand_tcp"][:3, 3], [0, sign * 0.1535, 0.0819], atol=1e-9)
+        np.testing.assert_allclose(poses[f"openarm_{side}_hand_tcp"][:3, :3], se3.rot_x(np.pi), atol=1e-9)
+
+
+def test_a06_link_names_are_those_users_know(description: RobotDescription) -> None:
+    assert set(description.links) == LINK_NAMES
+    assert description.root == "world"
+    assert set(description.joints) == (
+        {"openarm_body_world_joint"}
+        | {f"openarm_{s}_openarm_body_link0_joint" for s in SIDES}
+        | {f"openarm_{s}_joint{i}" for s in SIDES for i in range(1, 9)}
+        | {f"{s}_openarm_hand_joint" for s in SIDES}
+        | {f"openarm_{s}_hand_tcp_joint" for s in SIDES}
+        | {f"openarm_{s}_finger_joint{i}" for s in SIDES for i in (1, 2)}
+    )
+
+
+def test_a06_names_and_limits_are_equal_in_table_urdf_mujoco_and_pinocchio(
+    description: RobotDescription, model: mujoco.MjModel
+) -> None:
+    pin_model = pin.buildModelFromXML(description.urdf)
+    moving = {name for name, joint in description.joints.items() if joint.type != "fixed"}
+    assert moving == {model.joint(i).name for i in range(model.njnt)} == set(pin_model.names) - {"universe"}
+    for side in SIDES:
+        for i, (name, row) in enumerate(zip(description.arm_joints(side), ARM, strict=True)):
+            low, high = row[3]
+            if side == "left" and i < 2:
+                low, high = -high, -low
+            joint = description.joint(name)
+            index = pin_model.joints[pin_model.getJointId(name)].idx_q
+            assert (joint.lower, joint.upper) == (low, high)
+            assert tuple(model.joint(name).range) == (low, high)
+            assert (pin_model.lowerPositionLimit[index], pin_model.upperPositionLimit[index]) == (low, high)
+            assert (joint.effort, joint.velocity) == row[4:]
+            assert pin_model.upperEffortLimit[index] == row[4]
+            assert tuple(model.actuator(name).forcerange) == (-row[4], row[4])
+            assert tuple(model.actuator(name).ctrlrange) == (low, high)
+        for number in (1, 2):
+            finger = description.joint(f"openarm_{side}_finger_joint{number}")
+            assert (finger.lower, finger.upper, finger.effort, finger.velocity) == (0.0, 0.044, 333.0, 10.0)
+
+
+def test_a06_yourdfpy_reads_the_same_robot(description: RobotDescription) -> None:
+    robot = yourdfpy.URDF.load(io.StringIO(description.urdf), build_scene_graph=True, load_meshes=False)
+    assert set(robot.link_map) == set(description.links)
+    assert robot.validate()
+    q = {name: 0.02 if "finger" in name else 0.3 for name in robot.actuated_joint_names}
+    robot.update_cfg(q)
+    for name, T in description.link_poses(q).items():
+        np.testing.assert_allclose(robot.get_transform(name, "world"), T, atol=1e-9, err_msg=name)
+
+
+def test_a13_collision_is_primitives_and_looks_stay_inside_their_bounds(description: RobotDescription) -> None:
+    def bounds(shapes: tuple[object, ...]) -> tuple[Array, Array]:
+        corners = []
+        for shape in shapes:
+            half = np.array(shape.size) / 2 if shape.kind == "box" else np.array([1, 1, 0]) * shape.size[0]
+            half = half if shape.kind == "box" else half + np.array([0, 0, shape.size[1] / 2])
+            signs = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
+            corners.append(se3.apply(shape.T_link_primitive, signs * half))
+        points = np.concatenate(corners)
+        return points.min(axis=0), points.max(axis=0)
+
+    for name, link in description.links.items():
+        assert not link.meshes
+        assert bool(link.collision) == bool(link.visual)
+        if link.collision:
+            (low, high), (seen_low, seen_high) = bounds(link.collision), bounds(link.visual)
+            assert (seen_low >= low - 1.5e-4).all() and (seen_high <= high + 1.5e-4).all(), name
+
+
+def test_a11_all_names_are_unique(description: RobotDescription, model: mujoco.MjModel) -> None:
+    shapes = [s.name for link in description.links.values() for s in link.visual + link.collision]
+    assert all(shapes) and len(shapes) == len(set(shapes))
+    assert all(model.geom(i).name for i in range(model.ngeom))  # MuJoCo drops the name of a duplicate
+
+
+def test_masses_and_tensors_are_possible(description: RobotDescription) -> None:
+    assert sum(link.mass for link in description.links.values()) == pytest.approx(25.67, abs=0.01)
+    for name, link in description.links.items():
+        if link.mass:
+            a, b, c = np.linalg.eigvalsh(link.inertia)
+            assert a > 0 and a + b >= c, name
+
+
+@pytest.mark.parametrize("group", ["left_arm", "right_arm", "both_arms", "left_gripper", "right_gripper"])
+def test_srdf_states_cover_their_group_within_limits(description: RobotDescription, group: str) -> None:
+    names = description.group_joints(group)
+    lower, upper = description.limits(names)
+    states = [name for g, name in description.semantics.states if g == group]
+    assert {"open", "closed"} <= set(states) or {"home", "official_home", "hands_up", "zero"} <= set(states)
+    for state in states:
+        q = description.group_state(group, state)
+        assert tuple(q) == names
+        values = np.array(list(q.values()))
+        assert (values >= lower).all() and (values <= upper).all()
+
+
+def test_srdf_home_is_the_observing_posture_and_mirrored(description: RobotDescription) -> None:
+    right = list(description.group_state("right_arm", "home").values())
+    assert right == [-0.2, 2.2, 0, 1.2, 0, 0, 0.4]
+    np.testing.assert_allclose(list(description.group_state("left_arm", "home").values()), mirror(right))
+    tcp = description.link_pose("openarm_right_hand_tcp", description.group_state("right_arm", "home"))[:3, 3]
+    np.testing.assert_allclose(tcp, [0.41, -0.39, 0.79], atol=0.006)
+    assert description.group_state("right_arm", "official_home")["openarm_right_joint4"] == 1.570796
+
+
+@pytest.fixture(scope="module")
+def generator() -> ModuleType:
+    path = models_dir() / "openarm" / "generate_srdf.py"
+    spec = importlib.util.spec_from_file_location("generate_srdf", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a74_collision_matrix_is_symmetric_and_keeps_what_must_be_checked(
+    description: RobotDescription, generator: ModuleType
+) -> None:
+    allowed = description.allowed_collisions
+    assert {generator.mirrored_pair(pair) for pair in allowed} == set(allowed)
+    assert not allowed & generator.always_checked()
+    assert generator.adjacent_pairs(description) <= allowed
+    assert generator.default_pairs() <= allowed
+    assert len(generator.adjacent_pairs(description)) == 22
+
+
+def test_a74_no_pair_that_is_said_never_to_touch_does(description: RobotDescription, generator: ModuleType) -> None:
+    touching = generator.touching_pairs(description, 3000)
+    never = description.allowed_collisions - generator.adjacent_pairs(description) - generator.default_pairs()
+    assert len(never) > 50
+    assert not never & touching
+
+
+MINI = """<robot name="mini">
+  <link name="base"><visual name="v"><geometry><sphere radius="0.1"/></geometry></visual></link>
+  <link name="slide"><collision name="c"><geometry><mesh filename="m.stl"/></geometry></collision></link>
+  <link name="follow"/>
+  <joint name="j1" type="prismatic"><parent link="base"/><child link="slide"/><axis xyz="0 0 2"/>
+    <limit lower="0" upper="1" effort="1" velocity="1"/></joint>
+  <joint name="j2" type="continuous"><parent link="slide"/><child link="follow"/><origin xyz="1 0 0" rpy="0 0 1"/>
+    <axis xyz="0 0 1"/><mimic joint="j1" multiplier="-2" offset="0.5"/></joint>
+</robot>"""
+
+
+def test_b07_any_robot_can_be_read() -> None:
+    robot = RobotDescription.from_urdf(MINI)
+    assert (robot.root, robot.name) == ("base", "mini")
+    assert robot.links["base"].visual[0].size == (0.1,)
+    assert robot.links["slide"].meshes == ("c",)
+    assert robot.joints["j2"].upper == np.inf
+    T = robot.link_pose("follow", {"j1": 0.25})
+    np.testing.assert_allclose(T, se3.make(se3.rot_z(1.0 - 2 * 0.25 + 0.5), (1, 0, 0.25)))
+    np.testing.assert_allclose(robot.link_poses({"j1": 0.25})["follow"], T)
+
+
+@pytest.mark.parametrize(
+    ("find", "replace", "words"),
+    [
+        ('<link name="follow"/>', '<link name="follow"/><link name="base"/>', "link name 'base' is used twice"),
+        ('name="j2"', 'name="j1"', "joint name 'j1' is used twice"),
+        ('name="c"', 'name="v"', "name 'v' is used twice"),
+        ('<child link="follow"/>', '<child link="nowhere"/>', "'nowhere', which does not exist"),
+        ('<link name="follow"/>', '<link name="follow"/><link name="loose"/>', "one root link, found 2: base, loose"),
+        ('<parent link="base"/>', '<parent link="follow"/>', "one root link, found 2|loop"),
+        ('type="continuous"', 'type="floating"', "supported: revolute, continuous, prismatic, fixed"),
+        ('<limit lower="0" upper="1" effort="1" velocity="1"/>', "", "no <limit>"),
+        ('lower="0"', 'lower="2"', "lower limit 2.0 above"),
+        ('xyz="1 0 0"', 'xyz="1 0 nan"', "3 finite numbers"),
+        ('mimic joint="j1"', 'mimic joint="j9"', "mimics 'j9', which does not exist"),
+        ("</robot>", "", "not XML"),
+        ('axis xyz="0 0 2"', 'axis xyz="0 0 0"', "axis"),
+        ("sphere", "cone", "<cone> is none of box, cylinder, sphere, mesh"),
+    ],
+)
+def test_a11_faulty_descriptions_are_refused_by_name(find: str, replace: str, words: str) -> None:
+    assert MINI.count(find) >= 1
+    with pytest.raises(OpenArmError, match=words) as caught:
+        RobotDescription.from_urdf(MINI.replace(find, replace, 1))
+    assert caught.value.code is Code.CONFIG_INVALID
+
+
+@pytest.mark.parametrize(
+    ("srdf", "words"),
+    [
+        ('<disable_collisions link1="base" link2="x"/>', "link 'x'"),
+        ('<group name="g"><joint name="j7"/></group>', "joint 'j7'"),
+        ('<group name="g"><chain base_link="base" tip_link="tip"/></group>', "link 'tip'"),
+        ('<group name="g"><group name="h"/></group>', "group 'h'"),
+        ('<group_state name="s" group="g"><joint name="j1" value="0"/></group_state>', "group 'g'"),
+    ],
+)
+def test_srdf_that_does_not_fit_the_urdf_is_refused(srdf: str, words: str) -> None:
+    with pytest.raises(OpenArmError, match=words):
+        RobotDescription.from_urdf(MINI, f"<robot>{srdf}</robot>")
+
+
+def test_questions_that_have_no_answer_list_what_there_is(description: RobotDescription) -> None:
+    with pytest.raises(OpenArmError, match="no position of joint 'openarm_left_joint1'"):
+        description.link_pose("openarm_left_link1", {"openarm_right_joint1": 0.0})
+    with pytest.raises(OpenArmError, match="no link 'hand' in robot 'openarm'; links: world"):
+        description.link_pose("hand", {})
+    with pytest.raises(OpenArmError, match="right_arm/wrist_look"):
+        description.group_state("right_arm", "dance")
+    with pytest.raises(OpenArmError, match="groups: left_arm"):
+        description.group_joints("legs")
+    with pytest.raises(OpenArmError, match="joints: openarm_body_world_joint"):
+        description.limits(["joint1"])
