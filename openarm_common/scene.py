@@ -205,7 +205,7 @@ def parse_scene(data: Mapping[str, Any], where: str) -> Scene:
     for a, b in itertools.combinations(scene.objects, 2):
         depth = _overlap(a, b, scene.table)
         if depth > _TOUCH:
-            faults.append(f"{_place(a)} and {_place(b)} overlap by {depth * 1e3:.0f} mm; move one of them")
+            faults.append(f"{_place(a)} and {_place(b)} overlap by {depth * 1e3:.1f} mm; move one of them")
     if faults:
         raise OpenArmError(Code.SCENE_INVALID, "; ".join(f"{where}: {fault}" for fault in faults))
     return scene
