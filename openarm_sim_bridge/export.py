@@ -33,7 +33,8 @@ def export(kind: Kind, scene: str | None = None, seed: int = 0) -> str:
     """Return the description as text.
 
     Args:
-        kind: "urdf": expanded, one file; "srdf"; "mjcf": as MuJoCo reads it, with actuators and contact settings.
+        kind: "urdf": expanded, one file; "srdf"; "mjcf": as MuJoCo reads it, with actuators and contact settings
+            (MuJoCo writes six digits).
         scene: For MJCF: name or path of a scene to put around the robot, with the cameras; None is the robot alone.
         seed: Of the scene "random".
 

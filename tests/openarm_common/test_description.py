@@ -229,12 +229,14 @@ def test_a13_collision_is_primitives_and_looks_stay_inside_their_bounds(descript
         assert bool(link.collision) == bool(link.visual)
         if link.collision:
             (low, high), (seen_low, seen_high) = bounds(link.collision), bounds(link.visual)
-            assert (seen_low >= low - 1.5e-4).all() and (seen_high <= high + 1.5e-4).all(), name
+            assert (seen_low >= low - 1.5e-4).all(), name
+            assert (seen_high <= high + 1.5e-4).all(), name
 
 
 def test_a11_all_names_are_unique(description: RobotDescription, model: mujoco.MjModel) -> None:
     shapes = [s.name for link in description.links.values() for s in link.visual + link.collision]
-    assert all(shapes) and len(shapes) == len(set(shapes))
+    assert all(shapes)
+    assert len(shapes) == len(set(shapes))
     assert all(model.geom(i).name for i in range(model.ngeom))  # MuJoCo drops the name of a duplicate
 
 
@@ -243,7 +245,8 @@ def test_masses_and_tensors_are_possible(description: RobotDescription) -> None:
     for name, link in description.links.items():
         if link.mass:
             a, b, c = np.linalg.eigvalsh(link.inertia)
-            assert a > 0 and a + b >= c, name
+            assert a > 0, name
+            assert a + b >= c, name
 
 
 @pytest.mark.parametrize("group", ["left_arm", "right_arm", "both_arms", "left_gripper", "right_gripper"])
@@ -256,7 +259,8 @@ def test_srdf_states_cover_their_group_within_limits(description: RobotDescripti
         q = description.group_state(group, state)
         assert tuple(q) == names
         values = np.array(list(q.values()))
-        assert (values >= lower).all() and (values <= upper).all()
+        assert (values >= lower).all()
+        assert (values <= upper).all()
 
 
 def test_srdf_home_is_the_observing_posture_and_mirrored(description: RobotDescription) -> None:
@@ -272,7 +276,8 @@ def test_srdf_home_is_the_observing_posture_and_mirrored(description: RobotDescr
 def generator() -> ModuleType:
     path = models_dir() / "openarm" / "generate_srdf.py"
     spec = importlib.util.spec_from_file_location("generate_srdf", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -158,7 +158,7 @@ def test_an_impossible_table_is_refused(table: dict[str, Any], words: str) -> No
 
 def test_one_object_can_be_checked_for_a_table() -> None:
     assert parse_object(cube(), Table(), "spawn").name == "red_cube"
-    with pytest.raises(OpenArmError, match="spawn: object 'red_cube' at .* is outside the table"):
+    with pytest.raises(OpenArmError, match=r"spawn: object 'red_cube' at .* is outside the table"):
         parse_object(cube(position=[2.0, 0.0]), Table(), "spawn")
     with pytest.raises(OpenArmError, match="spawn:shape"):
         parse_object(cube(shape="ball"), Table(), "spawn")
@@ -173,7 +173,7 @@ def test_unknown_scenes_and_objects_list_what_there_is(tmp_path: Path) -> None:
     with pytest.raises(OpenArmError, match=r"broken.yaml is not valid YAML") as caught:
         load_scene(broken)
     assert caught.value.code is Code.SCENE_INVALID
-    with pytest.raises(OpenArmError, match="no object 'cup'.*red_cube, green_cylinder, blue_can, yellow_box") as caught:
+    with pytest.raises(OpenArmError, match=r"no object 'cup'.*red_cube, green_cylinder, blue_can, yellow_box") as caught:
         load_scene("demo").object("cup")
     assert caught.value.code is Code.UNKNOWN_OBJECT
 
