@@ -16,7 +16,9 @@ import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
+from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.collision_robot import CollisionRobot
 
@@ -46,23 +48,14 @@ class Box:
             )
 
 
-@dataclass(frozen=True)
-class Clearance:
-    """Distances that pairs keep, m.
+class Clearance(Config):
+    """Distances that pairs keep, m; nearer is a collision."""
 
-    Attributes:
-        own: Between links of the arm, and between the arm and the robot's fixed body.
-        world: Between the arm and boxes or other arms, and between a held box and everything.
-        fingers: Between the gripper and boxes; smaller on the straight parts, where it works near a surface.
-        touch: Between the palm (and the rest of the arm) and a box that the fingers may touch.
-        rest: Between a held box and what it may stand on; negative allows an overlap, as boxes are estimates.
-    """
-
-    own: float = 0.003
-    world: float = 0.010
-    fingers: float = 0.010
-    touch: float = 0.002
-    rest: float = 0.0
+    own: float = Field(0.003, ge=0.0, le=0.05, description="between links of the arm, and to the robot's body, m")
+    world: float = Field(0.010, ge=0.0, le=0.1, description="arm to boxes and to the other arm, m")
+    hand: float = Field(0.010, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
+    touch: float = Field(0.002, ge=0.0, le=0.05, description="arm and palm to a box that the fingers may touch, m")
+    rest: float = Field(0.0, ge=-0.02, le=0.05, description="held box to what it stands on; < 0 allows overlap, m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +69,7 @@ class Surroundings:
         touchable: Ids of boxes that the fingers may touch.
         supports: Ids of boxes that a held box may stand on.
         clearance: Distances to keep.
+        own: Whether the arm is checked against itself and the robot's body; False leaves the other arm and the boxes.
     """
 
     state: Mapping[str, float]
@@ -84,6 +78,7 @@ class Surroundings:
     touchable: frozenset[str] = frozenset()
     supports: frozenset[str] = frozenset()
     clearance: Clearance = field(default_factory=Clearance)
+    own: bool = True
 
 
 @dataclass(frozen=True)
@@ -111,6 +106,9 @@ class CollisionScene:
     Args:
         robot: The robot seen by the arm.
         around: What is around it.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when two boxes have one id.
     """
 
     def __init__(self, robot: CollisionRobot, around: Surroundings) -> None:
@@ -118,6 +116,7 @@ class CollisionScene:
         self._around = around
         self._geometry = robot.geometry.copy()
         self._names = [*robot.links]
+        self._boxes: dict[str, int] = {}
         self._q = robot.configuration(around.state)
         self.levers = robot.levers
         pairs, required = self._pairs()
@@ -182,11 +181,15 @@ class CollisionScene:
             self._set_margins()
         return None
 
-    def place_held(self, held: Sequence[Box]) -> None:
-        """Move the held boxes to other poses in the tool frame (same number and sizes as the scene was built with)."""
-        first = len(self._robot.links)
-        for k, box in enumerate(held):
-            self._geometry.geometryObjects[first + k].placement = pin.SE3(self._robot.kinematics.tip @ box.T)
+    def place(self, id: str, T: Array) -> None:
+        """Move a box: `T` in the base frame, or in the tool frame for a held one."""
+        held = self._held_name(id) in self._boxes
+        index = self._boxes[self._held_name(id) if held else id]
+        self._geometry.geometryObjects[index].placement = pin.SE3(self._robot.kinematics.tip @ T if held else T)
+
+    def set_state(self, state: Mapping[str, float]) -> None:
+        """Move the robot's other joints."""
+        self._q = self._robot.configuration(state)
 
     def _colliding(self, q: ArrayLike) -> list[int]:
         self._q[self._robot.columns] = q
@@ -210,35 +213,42 @@ class CollisionScene:
     def _pairs(self) -> tuple[list[tuple[int, int]], list[float]]:
         """Add the boxes to the geometry; all pairs to check and the distance that each must keep."""
         robot, around, keep = self._robot, self._around, self._around.clearance
-        pairs = list(robot.pairs)
         own = robot.arm.fixed | robot.arm.moving
+        pairs = [pair for pair in robot.pairs if around.own or robot.links[pair[1]] not in own]
         required = [keep.own if robot.links[j] in own else keep.world for _, j in pairs]
         tool = robot.joints[-1]
-        held = [self._add(f"held {box.id}", tool, robot.kinematics.tip @ box.T, box) for box in around.held]
+        held = [self._add(self._held_name(box.id), tool, robot.kinematics.tip @ box.T, box) for box in around.held]
         for h in held:
             self.levers = np.maximum(self.levers, robot.levers_of(self._geometry.geometryObjects[h]))
             for i, link in enumerate(robot.links):
-                if link not in robot.arm.hand:
+                if link not in robot.arm.hand and (around.own or link not in own):
                     pairs.append((h, i))
                     required.append(keep.own if link in robot.arm.moving else keep.world)
         for box in around.boxes:
             b = self._add(box.id, 0, box.T, box)
             touchable = box.id in around.touchable
             for i in robot.moving:
-                finger = robot.links[i] in robot.arm.gripper
-                if touchable and finger:
+                link = robot.links[i]
+                if touchable and link in robot.arm.gripper:
                     continue
                 pairs.append((i, b))
-                required.append(keep.touch if touchable else keep.fingers if finger else keep.world)
+                required.append(keep.touch if touchable else keep.hand if link in robot.arm.hand else keep.world)
             for h in held:
                 pairs.append((h, b))
-                required.append(keep.rest if box.id in around.supports else keep.fingers)
+                required.append(keep.rest if box.id in around.supports else keep.hand)
         return pairs, required
 
+    @staticmethod
+    def _held_name(id: str) -> str:
+        return f"held {id}"
+
     def _add(self, name: str, joint: int, T: Array, box: Box) -> int:
+        if name in self._boxes:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"two boxes have the id {box.id!r}; ids must be unique")
         shape = pin.GeometryObject(name, joint, pin.SE3(T), coal.Box(*box.size.tolist()))
         self._names.append(name)
-        return self._geometry.addGeometryObject(shape)
+        self._boxes[name] = int(self._geometry.addGeometryObject(shape))
+        return self._boxes[name]
 
 
 def box_from(id: str, p: ArrayLike, size: ArrayLike, R: Array | None = None) -> Box:

@@ -7,6 +7,7 @@ planner knows of the world is two questions: does this configuration collide, is
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable
@@ -188,7 +189,9 @@ def shorten(
         if rng.random() < 0.5:
             i = int(rng.integers(1, len(points) - 1))
             a, b = points[i - 1], points[i + 1]
-            middle = a + (b - a) * float(np.clip((points[i] - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-12), 0, 1))
+            middle = a + (b - a) * float(
+                np.clip((points[i] - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-12), 0, 1)
+            )
             moved = points[i] + rng.random() * (middle - points[i])
             fresh, old = [a, moved, b], points[i - 1 : i + 2]
             first, last = i - 1, i + 1
@@ -199,9 +202,7 @@ def shorten(
             b = points[last] + w * (points[last + 1] - points[last])
             fresh, old = [points[first], a, b, points[last + 1]], points[first : last + 2]
             last += 1
-        if _cost(fresh, cost) < 0.99 * _cost(old, cost) and all(
-            edge_free(p, q) for p, q in zip(fresh[:-1], fresh[1:], strict=True)
-        ):
+        if _cost(fresh, cost) < 0.99 * _cost(old, cost) and all(edge_free(p, q) for p, q in itertools.pairwise(fresh)):
             points = _skip([*points[:first], *fresh, *points[last + 1 :]], edge_free)
     return np.array(points)
 
@@ -219,7 +220,7 @@ def _skip(points: list[Array], edge_free: Callable[[Array, Array], bool]) -> lis
 
 
 def _cost(points: list[Array], cost: Callable[[Array, Array], float]) -> float:
-    return sum(cost(a, b) for a, b in zip(points[:-1], points[1:], strict=True))
+    return sum(cost(a, b) for a, b in itertools.pairwise(points))
 
 
 def _cancelled() -> OpenArmError:

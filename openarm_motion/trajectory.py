@@ -9,6 +9,7 @@ follower's quintic interpolation is the profile itself on a straight joint line.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -150,7 +151,7 @@ def time_polyline(names: Sequence[str], waypoints: Array, limits: JointLimits, p
         period: Greatest time between two samples, s.
     """
     parts: list[Trajectory] = []
-    for start, end in zip(waypoints[:-1], waypoints[1:], strict=True):
+    for start, end in itertools.pairwise(waypoints):
         difference = end - start
         size = np.abs(difference)
         if float(size.max()) < _NOTHING:
@@ -218,7 +219,7 @@ def _sample_times(way: Profile, period: float) -> Array:
 
 
 def _joined(names: tuple[str, ...], parts: list[Trajectory], q: Array, period: float) -> Trajectory:
-    """Parts one after the other (each begins where the last ended, at rest); a rest of one period when there is none."""
+    """Parts one after the other, each beginning at rest where the last ended; a rest of one period without any."""
     if not parts:
         rest = np.zeros((2, q.size))
         return Trajectory(names, np.array([0.0, period]), np.stack([q, q]), rest, rest)
@@ -226,5 +227,7 @@ def _joined(names: tuple[str, ...], parts: list[Trajectory], q: Array, period: f
     for part in parts[1:]:
         t.append(part.t[1:] + offset)
         offset += part.duration
-    q_, v, a = (np.concatenate([getattr(parts[0], k), *(getattr(p, k)[1:] for p in parts[1:])]) for k in ("q", "v", "a"))
+    q_, v, a = (
+        np.concatenate([getattr(parts[0], k), *(getattr(p, k)[1:] for p in parts[1:])]) for k in ("q", "v", "a")
+    )
     return Trajectory(names, np.concatenate(t), q_, v, a)

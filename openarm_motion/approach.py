@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Choose and plan one of several approaches: free path, straight line to a target, straight line away from it.
+
+For each target every configuration is followed along both lines on its own branch, and kept when limits and clearance
+hold all the way; then one search runs from the start to the beginnings of all that were kept. What is refused says why.
+Base frame, m, rad.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.arm import Arm, Situation, first_contact, segment_time
+from openarm_motion.cartesian import Line, line_contact, solve_line
+from openarm_motion.collision import Box, CollisionScene
+from openarm_motion.inverse import Solution
+from openarm_motion.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+#: A configuration nearer to a joint limit than this is thought less of, rad.
+_COMFORT = 0.3
+#: Targets looked at for a start configuration before the search is tried.
+_GOALS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """One way to reach a place with the tool: lines from `pose` + `approach_offset` to `pose` to `retreat_offset`.
+
+    Attributes:
+        id: Returned in refusals.
+        pose: (4, 4) of the tool.
+        approach_offset: (3,) base frame.
+        retreat_offset: (3,) base frame.
+        score: A higher one is preferred.
+    """
+
+    id: str
+    pose: Array
+    approach_offset: Array
+    retreat_offset: Array
+    score: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class ApproachRequest:
+    """What `plan_approach` is asked.
+
+    Attributes:
+        targets: Any of them will do.
+        obstacles: Boxes beside the robot and the table, base frame.
+        attached: Boxes held by the arm, tool frame.
+        touchable: Ids of obstacles that the fingers may touch on the straight parts.
+        attached_after: The touchable obstacles are carried on the retreat (a grasp).
+        detached_after: The held boxes are left behind on the retreat (a place).
+    """
+
+    targets: tuple[Target, ...]
+    obstacles: tuple[Box, ...] = ()
+    attached: tuple[Box, ...] = ()
+    touchable: frozenset[str] = frozenset()
+    attached_after: bool = False
+    detached_after: bool = False
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Why a target was not chosen."""
+
+    id: str
+    code: Code
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class ApproachPlan:
+    """A plan for target number `chosen`; `held_after` are the boxes that the arm holds at its end, tool frame."""
+
+    chosen: int
+    transfer: Trajectory
+    approach: Trajectory
+    retreat: Trajectory
+    refusals: tuple[Refused, ...]
+    held_after: tuple[Box, ...]
+
+
+class ApproachFailedError(OpenArmError):
+    """No target could be planned; `refusals` has the reason of each."""
+
+    def __init__(self, code: Code, message: str, refusals: tuple[Refused, ...]) -> None:
+        super().__init__(code, message)
+        self.refusals = refusals
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    target: int
+    approach: Line
+    retreat: Line
+    cost: float
+
+
+def plan_approach(
+    arm: Arm,
+    now: Situation,
+    request: ApproachRequest,
+    report: Callable[[str, int], None] = lambda stage, tried: None,
+) -> ApproachPlan:
+    """Plan one of the targets.
+
+    Targets are looked at by score, those that differ by less than `score_step` together; within such a group short
+    travel and distance from joint limits decide.
+
+    Args:
+        arm: The arm.
+        now: The robot's state, where the arm starts, the velocity scale.
+        request: What is asked.
+        report: Called with "checking" or "planning" and the number of targets looked at so far.
+
+    Raises:
+        ApproachFailedError: UNREACHABLE, IN_COLLISION or NO_PLAN, with the reason for each target.
+        OpenArmError: INVALID_ARGUMENT, for a request without targets or with an unknown touchable id; IN_COLLISION,
+            when the arm starts in collision; CANCELLED.
+    """
+    _check(request)
+    end = time.monotonic() + arm.config.planning.time_limit
+    checks = _Checks(arm, now, request)
+    refusals: list[Refused] = []
+    tried = 0
+    groups = list(_by_score(request.targets, arm.config.planning.score_step))
+    for k, group in enumerate(groups):
+        candidates: list[_Candidate] = []
+        for index in group:
+            if now.stopped():
+                raise OpenArmError(Code.CANCELLED, "planning was stopped")
+            found, refused = checks.candidates(index)
+            candidates += found
+            if refused is not None:
+                refusals.append(refused)
+            tried += 1
+            report("checking", tried)
+        if not candidates:
+            continue
+        candidates = sorted(candidates, key=lambda c: c.cost)[:_GOALS]
+        report("planning", tried)
+        left = max(end - time.monotonic(), 0.1)
+        try:
+            goals = np.array([candidate.approach.q[0] for candidate in candidates])
+            path = arm.plan(checks.free, now, goals, left if k == len(groups) - 1 else 0.5 * left)
+        except OpenArmError as error:
+            if error.code != Code.NO_PLAN:
+                raise
+            ids = dict.fromkeys(request.targets[c.target].id for c in candidates)
+            refusals += [Refused(id, Code.NO_PLAN, error.message) for id in ids]
+            continue
+        best = candidates[path.goal]
+        return ApproachPlan(
+            chosen=best.target,
+            transfer=arm.time_free(path, now.scale),
+            approach=arm.time_line(best.approach, now.scale),
+            retreat=arm.time_line(best.retreat, now.scale),
+            refusals=tuple(refusals),
+            held_after=checks.held_after(request.targets[best.target].pose),
+        )
+    raise _failed(arm, tuple(refusals))
+
+
+class _Checks:
+    """The three surroundings of one request, built once, and what fits into them."""
+
+    def __init__(self, arm: Arm, now: Situation, request: ApproachRequest) -> None:
+        self._arm, self._now, self._request = arm, now, request
+        # hands grasp open; a hand that holds something keeps its opening until it lets go
+        opened = arm.config.planning.gripper_open
+        before = None if request.attached else opened
+        self.free = arm.scene(now.state, request.obstacles, request.attached, gripper=before)
+        arm.relax(self.free, now.start)
+        self._approach = arm.scene(
+            now.state, request.obstacles, request.attached, request.touchable, straight=True, gripper=before
+        )
+        self._carried = [box for box in request.obstacles if box.id in request.touchable]
+        if request.attached_after:
+            rest = [box for box in request.obstacles if box.id not in request.touchable]
+            held = [*request.attached, *self._carried]
+            self._retreat = arm.scene(now.state, rest, held, straight=True)
+        elif request.detached_after:
+            boxes = [*request.obstacles, *request.attached]
+            ids = request.touchable | {box.id for box in request.attached}
+            self._retreat = arm.scene(now.state, boxes, (), ids, straight=True, gripper=opened)
+        else:
+            self._retreat = self._approach
+
+    def held_after(self, pose: Array) -> tuple[Box, ...]:
+        """Boxes in the tool frame that the arm holds after the retreat."""
+        if self._request.detached_after:
+            return ()
+        if not self._request.attached_after:
+            return self._request.attached
+        T = se3.inverse(pose)
+        return (*self._request.attached, *(Box(box.id, T @ box.T, box.size) for box in self._carried))
+
+    def candidates(self, index: int) -> tuple[list[_Candidate], Refused | None]:
+        """The best configurations for a target, or why there is none."""
+        arm, target = self._arm, self._request.targets[index]
+        planning = arm.config.planning
+        solutions = arm.inverse.solutions(target.pose, planning.joint_margin, self._now.start)
+        if not solutions:
+            why = arm.inverse.why_not(target.pose, planning.joint_margin)
+            return [], Refused(target.id, Code.UNREACHABLE, f"{target.id}: {why}")
+        self._arrange(target.pose)
+        limits = arm.limits(self._now.scale)
+        ordered = sorted(solutions, key=lambda s: self._cost(s, segment_time(self._now.start, s.q, limits)))
+        kept: list[_Candidate] = []
+        faults: list[OpenArmError] = []
+        for solution in ordered:
+            try:
+                approach, retreat = self._lines(target, solution)
+            except OpenArmError as error:
+                faults.append(error)
+                continue
+            travel = segment_time(self._now.start, approach.q[0], limits)
+            kept.append(_Candidate(index, approach, retreat, self._cost(solution, travel)))
+            if len(kept) == planning.keep:
+                break
+        if kept:
+            return kept, None
+        # a collision got further than a line that can't be followed, so it says more
+        worst = next((fault for fault in faults if fault.code == Code.IN_COLLISION), faults[0])
+        text = f"{target.id}: {worst.message} ({len(faults)} configurations tried)"
+        return [], Refused(target.id, worst.code, text)
+
+    def _lines(self, target: Target, solution: Solution) -> tuple[Line, Line]:
+        """Both lines of a configuration at the target, free of collision.
+
+        Raises:
+            OpenArmError: UNREACHABLE or IN_COLLISION.
+        """
+        arm = self._arm
+        margin = arm.config.planning.joint_margin
+        _require(self._approach, solution.q, "at the target")
+        there = target.pose
+        away, back = there.copy(), there.copy()
+        back[:3, 3] += target.approach_offset
+        away[:3, 3] += target.retreat_offset
+        approach = solve_line(arm.inverse, solution, there, back, margin).reversed()
+        retreat = solve_line(arm.inverse, solution, there, away, margin)
+        for scene, line, what in ((self._approach, approach, "approach"), (self._retreat, retreat, "retreat")):
+            contact = line_contact(scene, line)
+            if contact is not None:
+                raise OpenArmError(Code.IN_COLLISION, f"on the {what} {contact}")
+        _require(self.free, approach.q[0], "before the approach")
+        return approach, retreat
+
+    def _arrange(self, pose: Array) -> None:
+        """Put boxes and fingers of the retreat where they are when the tool was at `pose`."""
+        if self._request.attached_after:
+            for box in self.held_after(pose):
+                self._retreat.place(box.id, box.T)
+            self._retreat.set_state(self._arm.with_gripper(self._now.state, self._opening(pose)))
+        elif self._request.detached_after:
+            for box in self._request.attached:
+                self._retreat.place(box.id, pose @ box.T)
+
+    def _cost(self, solution: Solution, travel: float) -> float:
+        """Seconds of travel, and up to one more for a configuration near to a joint limit."""
+        return travel + 1.0 - min(self._arm.kinematics.margin(solution.q), _COMFORT) / _COMFORT
+
+    def _opening(self, pose: Array) -> float:
+        """Finger position around what is carried: half its extent along the opening axis, the tool's y."""
+        extents = [float(np.abs(box.T[:3, :3].T @ pose[:3, 1]) @ box.size) for box in self._carried]
+        return min(self._arm.config.planning.gripper_open, 0.5 * max(extents, default=0.0))
+
+
+def _require(scene: CollisionScene, q: Array, where: str) -> None:
+    contact = first_contact(scene, q)
+    if contact is not None:
+        raise OpenArmError(Code.IN_COLLISION, f"{where} {contact}")
+
+
+def _check(request: ApproachRequest) -> None:
+    if not request.targets:
+        raise OpenArmError(Code.INVALID_ARGUMENT, "no targets, expected at least one")
+    known = {box.id for box in request.obstacles}
+    unknown = sorted(request.touchable - known)
+    if unknown:
+        there = ", ".join(sorted(known)) or "none"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"touchable {', '.join(unknown)} not among the obstacles: {there}")
+    if request.attached_after and request.detached_after:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, "attached_after_approach and detached_after_approach exclude each other"
+        )
+    for target in request.targets:
+        numbers = np.concatenate([target.pose.ravel(), target.approach_offset, target.retreat_offset, [target.score]])
+        if not np.all(np.isfinite(numbers)):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"target {target.id!r} has numbers that are not finite")
+
+
+def _by_score(targets: tuple[Target, ...], step: float) -> Iterator[list[int]]:
+    """Indices of targets whose scores are within `step` of the best of their group, best group first."""
+    order = sorted(range(len(targets)), key=lambda i: -targets[i].score)
+    while order:
+        least = targets[order[0]].score - step
+        group = [i for i in order if targets[i].score >= least]
+        yield group
+        order = order[len(group) :]
+
+
+def _failed(arm: Arm, refusals: tuple[Refused, ...]) -> ApproachFailedError:
+    """The furthest that any target got is the code; its sentence stands for the others."""
+    for code in (Code.NO_PLAN, Code.IN_COLLISION, Code.UNREACHABLE):
+        of_code = [refusal for refusal in refusals if refusal.code == code]
+        if of_code:
+            others = f" ({len(refusals) - 1} other targets refused)" if len(refusals) > 1 else ""
+            return ApproachFailedError(code, f"{arm.name} arm: {of_code[0].message}{others}", refusals)
+    return ApproachFailedError(Code.INTERNAL, f"{arm.name} arm: no target was refused and none was planned", refusals)
