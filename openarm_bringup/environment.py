@@ -20,9 +20,9 @@ from openarm_common.resources import config_dir
 
 SHM = Path("/dev/shm")
 
-#: MiB of /dev/shm that a participant takes beside its large segment, measured 0.6 (default) and 2.8 (large).
-_PLAIN_MIB = 1.0
-_LARGE_EXTRA_MIB = 3.0
+#: MiB of /dev/shm that a participant takes beside its large segment, measured.
+_PLAIN_MIB = 0.65
+_LARGE_EXTRA_MIB = 2.2
 
 #: The names that Fast DDS gives to its segments, ports, their locks and semaphores.
 _SEGMENT = re.compile(r"^(sem\.)?(fastrtps|fastdds|fast_datasharing)_")

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: `openarm COMMAND`.
+
+Commands are functions that return an `Outcome`; here alone it is printed, written as JSON and turned into the exit code.
+Modules of commands import heavy libraries inside their functions, so that `openarm --help` stays quick.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cyclopts
+from cyclopts import App
+
+from openarm_bringup import runs
+from openarm_bringup.outcome import Outcome, failure
+from openarm_common.errors import Code, OpenArmError
+
+HELP = """Eyes and hands for the OpenArm robot.
+
+`openarm demo` shows all of it; `openarm up` starts the node graph, `openarm pick red` asks it for a grasp."""
+EPILOGUE = """Every command takes `--json [PATH]`: the outcome as JSON, on stdout or in PATH (a name ending in .json).
+Exit code 0: what was asked happened. 1: it did not; a code and a sentence say why. 2: the call was wrong."""
+
+
+def build_app() -> App:
+    """Return the application with all its commands."""
+    from openarm_bringup import checks_cli, demo_cli, doctor_cli, graph_cli, inspect_cli, model_cli, pick_cli, up_cli
+
+    app = App(name="openarm", help=HELP, help_epilogue=EPILOGUE, help_format="markdown", version=_version)
+    app.command(up_cli.up)
+    app.command(pick_cli.pick)
+    app.command(demo_cli.demo)
+    app.command(checks_cli.test)
+    app.command(checks_cli.check)
+    app.command(doctor_cli.doctor)
+    app.command(inspect_cli.ps)
+    app.command(inspect_cli.logs)
+    app.command(model_cli.model)
+    app.command(graph_cli.app)
+    return app
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run one command line and return its exit code."""
+    tokens, sink = take_json(argv)
+    app = build_app()
+    try:
+        result = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
+    except cyclopts.CycloptsError as error:
+        return _refuse(str(error), Code.INVALID_ARGUMENT, sink)
+    except OpenArmError as error:
+        if error.code == Code.INVALID_ARGUMENT:
+            return _refuse(error.message, error.code, sink)
+        result = failure(error)
+    except KeyboardInterrupt:
+        result = Outcome(False, "stopped by Ctrl-C", Code.CANCELLED)
+    if not isinstance(result, Outcome):  # --help and --version have printed
+        return 0
+    _show(result, sink)
+    return result.exit_code
+
+
+def take_json(argv: Sequence[str]) -> tuple[list[str], str | None]:
+    """Split `--json [PATH]` off; the sink is None (not asked for), "-" (stdout) or a path.
+
+    A value is taken as the path only when it ends in .json or is "-", so that `--json pick red` means what it says.
+    """
+    tokens = list(argv)
+    rest = tokens.index("--") if "--" in tokens else len(tokens)
+    for index, token in enumerate(tokens[:rest]):
+        if token.startswith("--json="):
+            return tokens[:index] + tokens[index + 1 :], token.removeprefix("--json=") or "-"
+        if token == "--json":
+            after = tokens[index + 1] if index + 1 < rest else ""
+            if after == "-" or after.endswith(".json"):
+                return tokens[:index] + tokens[index + 2 :], after
+            return tokens[:index] + tokens[index + 1 :], "-"
+    return tokens, None
+
+
+def _show(outcome: Outcome, sink: str | None) -> None:
+    if sink == "-":
+        _print(json.dumps(outcome.as_json(), indent=2, default=str))
+        return
+    if sink is not None:
+        runs.write_json(Path(sink), outcome.as_json())
+    if outcome.text:
+        _print(outcome.text)
+    if outcome.success:
+        if outcome.message:
+            _print(outcome.message)
+    else:
+        _complain(f"{outcome.code}: {outcome.message}")
+
+
+def _refuse(message: str, code: Code, sink: str | None) -> int:
+    _show(Outcome(False, message, code), sink)
+    return 2
+
+
+def _print(text: str) -> None:
+    sys.stdout.write(text.rstrip("\n") + "\n")
+    sys.stdout.flush()
+
+
+def _complain(text: str) -> None:
+    sys.stderr.write(f"openarm: {text}\n")
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("openarm-vision")
+    except PackageNotFoundError:
+        return "unknown (run from a checkout that is not installed)"
+
+
+def main() -> None:
+    """Run the command line of this process."""
+    sys.exit(run(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

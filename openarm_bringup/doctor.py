@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of the machine and the installation. Each takes what it judges and returns a finding with what to do."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+Level = Literal["ok", "note", "error"]
+
+#: The one ROS distribution that the suite is built for, and the major version of its rclpy.
+DISTRO = "jazzy"
+RCLPY_MAJOR = 7
+PYTHONS = ((3, 11), (3, 12), (3, 13))
+
+#: distribution → (lowest version, first version that does not do, what it is for); mujoco is the first that is looked at.
+WANTED: Mapping[str, tuple[tuple[int, ...], tuple[int, ...] | None, str]] = {
+    "mujoco": ((4, 0), None, "simulator"),
+    "opencv-python-headless": ((4, 13), (5,), "images; 5.0 has no calibrateHandEye"),
+    "numpy": ((2, 0), None, "arrays"),
+    "scipy": ((1, 11), None, "geometry"),
+    "numba": ((0, 60), None, "kernels"),
+    "pin": ((3, 0), None, "kinematics"),
+    "ompl": ((2, 0), None, "planner"),
+    "ruckig": ((0, 14), None, "trajectories"),
+    "pydantic": ((2, 0), None, "configuration"),
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Args:
+        name: What.
+        level: ok, note (works, but look) or error (will not work).
+        seen: What was found.
+        advice: What to do; empty when nothing.
+    """
+
+    name: str
+    level: Level
+    seen: str
+    advice: str = ""
+
+
+def version_tuple(text: str) -> tuple[int, ...]:
+    """Return the leading numbers of a version."""
+    return tuple(int(part) for part in re.findall(r"\d+", text.split("+")[0])[:3])
+
+
+def check_python(version: tuple[int, int], system: str, machine: str) -> Finding:
+    """Judge interpreter and machine: the ROS wheels exist for CPython 3.11 to 3.13 on Linux x86-64."""
+    seen = f"CPython {version[0]}.{version[1]} on {system} {machine}"
+    if (system, machine) != ("Linux", "x86_64"):
+        advice = "the ROS 2 wheels exist for Linux x86_64 only; elsewhere build the suite in a native ROS 2 Jazzy with colcon"
+        return Finding("python", "error", seen, advice)
+    if version not in PYTHONS:
+        return Finding("python", "error", seen, "use CPython 3.11, 3.12 or 3.13 (OPENARM_PYTHON=/path ./openarm)")
+    return Finding("python", "ok", seen)
+
+
+def check_versions(installed: Mapping[str, str]) -> list[Finding]:
+    """Judge the installed versions against what the suite was built with; the simulator comes first."""
+    findings: list[Finding] = []
+    for name, (lowest, first_bad, purpose) in WANTED.items():
+        version = installed.get(name)
+        wanted = f">= {'.'.join(map(str, lowest))}" + (f", < {'.'.join(map(str, first_bad))}" if first_bad else "")
+        if version is None:
+            findings.append(Finding(name, "error", f"not installed ({purpose})", f"run ./openarm again, or install {name} {wanted}"))
+        elif version_tuple(version) < lowest or (first_bad and version_tuple(version) >= first_bad):
+            findings.append(Finding(name, "error", f"{version} ({purpose})", f"needs {wanted}; remove .venv and run ./openarm"))
+        else:
+            findings.append(Finding(name, "ok", f"{version} ({purpose})"))
+    return findings
+
+
+def check_opencv(installed: Mapping[str, str], links_gl: bool) -> Finding:
+    """Judge which OpenCV is there: only the headless build needs no libGL and fights with no other."""
+    others = [name for name in installed if name.startswith("opencv-") and name != "opencv-python-headless"]
+    if others:
+        advice = f"they overwrite each other: uninstall {', '.join(others)}, then reinstall opencv-python-headless"
+        return Finding("opencv build", "error", f"{', '.join(others)} beside the headless one", advice)
+    if links_gl:
+        return Finding("opencv build", "error", "linked against libGL", "install opencv-python-headless instead")
+    return Finding("opencv build", "ok", "headless, needs no libGL")
+
+
+def check_ros(environ: Mapping[str, str], rclpy_file: str | None, rclpy_version: str, prefix: str) -> list[Finding]:
+    """Judge that there is one ROS, that it is Jazzy, and that wheels and a sourced ROS are not mixed."""
+    if rclpy_file is None:
+        return [Finding("ros", "error", "rclpy cannot be imported", "run ./openarm, or source /opt/ros/jazzy/setup.sh")]
+    sourced = sorted(
+        {
+            found
+            for key in ("AMENT_PREFIX_PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "CMAKE_PREFIX_PATH")
+            for found in re.findall(r"/opt/ros/([a-z]+)", environ.get(key, ""))
+        }
+        | ({environ["ROS_DISTRO"]} if environ.get("ROS_DISTRO") else set())
+    )
+    if len(sourced) > 1:
+        advice = f"source one only: open a new shell without the lines that source {' or '.join(d for d in sourced if d != DISTRO)}"
+        return [Finding("ros", "error", f"several ROS distributions are sourced: {', '.join(sourced)}", advice)]
+    if sourced and sourced != [DISTRO]:
+        return [Finding("ros", "error", f"ROS {sourced[0]} is sourced", f"the suite is for {DISTRO}; open a shell without it")]
+    from_wheels = rclpy_file.startswith(prefix)
+    if sourced and from_wheels:
+        advice = "use one of them: ./openarm leaves a sourced ROS aside; a colcon workspace needs no .venv"
+        return [Finding("ros", "error", f"ROS {DISTRO} is sourced, but rclpy comes from the wheels in {prefix}", advice)]
+    major = version_tuple(rclpy_version)[:1]
+    if major and major != (RCLPY_MAJOR,):
+        return [Finding("ros", "error", f"rclpy {rclpy_version}", f"{DISTRO} has rclpy {RCLPY_MAJOR}; another ROS is in the way")]
+    origin = f"wheels in {prefix}" if from_wheels else f"a native ROS {DISTRO}"
+    return [Finding("ros", "ok", f"rclpy {rclpy_version} from {origin}, no other ROS is sourced")]
+
+
+def check_rmw(environ: Mapping[str, str]) -> list[Finding]:
+    """Judge the variables that decide how processes find each other."""
+    findings: list[Finding] = []
+    rmw = environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
+    if rmw == "rmw_fastrtps_cpp":
+        findings.append(Finding("rmw", "ok", rmw))
+    else:
+        advice = "large images rely on the Fast DDS profile of the suite; unset RMW_IMPLEMENTATION"
+        findings.append(Finding("rmw", "note", rmw, advice))
+    if environ.get("ROS_LOCALHOST_ONLY", "0") == "1":
+        advice = "it is deprecated and overrides ROS_AUTOMATIC_DISCOVERY_RANGE; unset it"
+        findings.append(Finding("discovery", "note", "ROS_LOCALHOST_ONLY is set", advice))
+    else:
+        reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "localhost (set by the graph)")
+        findings.append(Finding("discovery", "ok", reach))
+    if environ.get("FASTRTPS_DEFAULT_PROFILES_FILE"):
+        advice = "every process takes it, and with a large segment each takes that much of /dev/shm; unset it unless wanted"
+        findings.append(Finding("fast dds profile", "note", environ["FASTRTPS_DEFAULT_PROFILES_FILE"], advice))
+    return findings
+
+
+def check_domain(text: str, first_ephemeral_port: int) -> Finding:
+    """Judge ROS_DOMAIN_ID: a number, and its ports below those that the system gives to other programs."""
+    if not text.isdecimal() or int(text) > 232:
+        return Finding("domain", "error", f"ROS_DOMAIN_ID={text!r}", "set a number from 0 to 101")
+    last_port = 7400 + 250 * int(text) + 249
+    if last_port >= first_ephemeral_port:
+        advice = f"its UDP ports (up to {last_port}) can be taken by other programs; choose one from 0 to 101"
+        return Finding("domain", "note", f"ROS_DOMAIN_ID={text}", advice)
+    return Finding("domain", "ok", f"ROS_DOMAIN_ID={text}, UDP ports {last_port - 249} to {last_port}")
+
+
+def check_ports(taken: Sequence[int], domain: int) -> Finding:
+    """Judge that the domain's discovery ports can be used on this machine."""
+    if taken:
+        advice = "another program holds them without sharing; choose another ROS_DOMAIN_ID"
+        return Finding("ports", "error", f"UDP {', '.join(map(str, taken))} of domain {domain} cannot be opened", advice)
+    return Finding("ports", "ok", f"the UDP ports of domain {domain} can be opened")
+
+
+def check_shm(total_mib: float, free_mib: float, need_mib: float, graph: str) -> Finding:
+    """Judge /dev/shm against what the graph takes of it."""
+    seen = f"{free_mib:.0f} of {total_mib:.0f} MiB free, graph {graph} needs {need_mib:.0f}"
+    if free_mib >= need_mib:
+        return Finding("/dev/shm", "ok", seen)
+    if total_mib >= need_mib:
+        return Finding("/dev/shm", "error", seen, "stop other graphs, or remove what dead ones left: `fastdds shm clean`")
+    advice = "images would be lost; give the container more (`docker run --shm-size=256m`) or remount it: `mount -o remount,size=256m /dev/shm`"
+    return Finding("/dev/shm", "error", seen, advice)
+
+
+def check_gl(milliseconds: Mapping[str, float | str], chosen: str) -> Finding:
+    """Judge the off-screen renderers, each with its time for one image or why it failed."""
+    seen = ", ".join(f"{name} {value:.0f} ms" if isinstance(value, float) else f"{name} {value}" for name, value in milliseconds.items())
+    if isinstance(milliseconds.get(chosen), float):
+        return Finding("rendering", "ok", f"MUJOCO_GL={chosen}: {seen}; no display is needed")
+    working = [name for name, value in milliseconds.items() if isinstance(value, float)]
+    if working:
+        return Finding("rendering", "error", seen, f"set MUJOCO_GL={working[0]}")
+    return Finding("rendering", "error", seen, "install a software renderer: apt-get install libegl1 libgl1 libegl-mesa0")
+
+
+def check_imports(failed: Mapping[str, str], purpose: str, names: Sequence[str]) -> Finding:
+    """Judge that all packages of one purpose can be imported."""
+    if not failed:
+        return Finding(purpose, "ok", f"{', '.join(names)} can be imported")
+    name, why = next(iter(failed.items()))
+    return Finding(purpose, "error", f"{name} cannot be imported: {why}", "run ./openarm again; it repairs the installation")
+
+
+def check_machine(cores: int, memory_gib: float, load: float, display: bool, wsl: bool) -> Finding:
+    """Judge the machine; a display is never needed."""
+    seen = f"{cores} cores, {memory_gib:.0f} GiB, load {load:.1f}, {'WSL, ' if wsl else ''}{'a' if display else 'no'} display (none is needed)"
+    if cores < 2:
+        return Finding("machine", "note", seen, "images and control share one core; expect a real-time factor below 1")
+    if load > cores:
+        return Finding("machine", "note", seen, "other programs are busy; images may come late")
+    return Finding("machine", "ok", seen)

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Judges a pick-and-place by ground truth that no node reads.
+
+All poses are in the world frame (m, quaternions xyzw), velocities in m/s and rad/s, times in ns of simulated time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from openarm_common import se3
+from openarm_common.config import Config
+
+
+class JudgeConfig(Config):
+    """What counts as placed."""
+
+    place_tolerance: float = Field(0.020, gt=0, description="m, footprint centre to target")
+    lift: float = Field(0.05, gt=0, description="m, least rise of the centre during the run")
+    tilt: float = Field(math.radians(10.0), gt=0, description="rad, between the upward axis before and after")
+    height: float = Field(0.005, gt=0, description="m, centre after against centre before (it stands, and on the table)")
+    speed: float = Field(0.005, gt=0, description="m/s at rest")
+    turn: float = Field(0.05, gt=0, description="rad/s at rest")
+    rest: float = Field(0.5, gt=0, description="s of simulated time at rest at the end")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One object at one time."""
+
+    t_ns: int
+    p_world: NDArray[np.float64]
+    q_xyzw: NDArray[np.float64]
+    linear: NDArray[np.float64]
+    angular: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What ground truth says of one run.
+
+    Args:
+        placed: Lifted, then upright and at rest within tolerance of the target.
+        reasons: What is wrong, one sentence each; empty when placed.
+        place_error: m, horizontal, footprint centre to target.
+        rise: m, greatest rise of the centre.
+        tilt: rad, change of the upward axis.
+        speed: m/s, greatest over the last `rest` seconds.
+        false_success: The run claimed success and the object is not placed.
+    """
+
+    placed: bool
+    reasons: tuple[str, ...]
+    place_error: float
+    rise: float
+    tilt: float
+    speed: float
+    false_success: bool
+
+
+def judge(
+    track: Sequence[Sample], target_xy: tuple[float, float], *, claimed: bool, config: JudgeConfig | None = None
+) -> Verdict:
+    """Judge one object's track from before the grasp to after it.
+
+    Args:
+        track: Samples in the order of time, the first from before anything moved.
+        target_xy: Where the footprint centre should be, m, world.
+        claimed: Whether the run reported success.
+        config: Tolerances.
+
+    Raises:
+        ValueError: The track is empty or not in the order of time.
+    """
+    rules = config or JudgeConfig()
+    if not track or any(later.t_ns < earlier.t_ns for earlier, later in zip(track, track[1:], strict=False)):
+        raise ValueError(f"a track needs samples in the order of time, got {len(track)}")
+    first, last = track[0], track[-1]
+    error = math.hypot(last.p_world[0] - target_xy[0], last.p_world[1] - target_xy[1])
+    rise = float(max(sample.p_world[2] for sample in track) - first.p_world[2])
+    tilt = _tilt(first.q_xyzw, last.q_xyzw)
+    end = [sample for sample in track if last.t_ns - sample.t_ns <= rules.rest * 1e9]
+    speed = max(float(np.linalg.norm(sample.linear)) for sample in end)
+    turn = max(float(np.linalg.norm(sample.angular)) for sample in end)
+    sink = float(last.p_world[2] - first.p_world[2])
+    reasons: list[str] = []
+    if rise < rules.lift:
+        reasons.append(f"never lifted: it rose {1e3 * rise:.0f} mm, at least {1e3 * rules.lift:.0f} were expected")
+    if not error <= rules.place_tolerance:  # a target of NaN (none was chosen) is not met
+        reasons.append(
+            f"stands {1e3 * error:.1f} mm from the target, at most {1e3 * rules.place_tolerance:.0f} are allowed"
+        )
+    if tilt > rules.tilt:
+        reasons.append(f"not upright: tilted by {math.degrees(tilt):.0f} degrees")
+    if abs(sink) > rules.height:
+        reasons.append(f"does not stand on the table as before: its centre is {1e3 * sink:+.0f} mm higher")
+    if speed > rules.speed or turn > rules.turn:
+        reasons.append(f"not at rest: {1e3 * speed:.0f} mm/s, {turn:.2f} rad/s")
+    placed = not reasons
+    return Verdict(placed, tuple(reasons), error, rise, tilt, speed, claimed and not placed)
+
+
+def at_rest(sample: Sample, config: JudgeConfig | None = None) -> bool:
+    """Tell whether an object moves no more than resting contact lets it."""
+    rules = config or JudgeConfig()
+    return bool(np.linalg.norm(sample.linear) <= rules.speed and np.linalg.norm(sample.angular) <= rules.turn)
+
+
+def _tilt(before_xyzw: NDArray[np.float64], after_xyzw: NDArray[np.float64]) -> float:
+    """Return by how much the axis that pointed up has left the vertical, rad."""
+    up_in_object = se3.matrix_from_quat_xyzw(before_xyzw).T @ np.array([0.0, 0.0, 1.0])
+    up_now = se3.matrix_from_quat_xyzw(after_xyzw) @ up_in_object
+    return math.acos(min(1.0, max(-1.0, float(up_now[2]))))

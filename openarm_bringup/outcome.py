@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every command gives back: one object for people, scripts and the exit code."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from openarm_common.errors import Code, OpenArmError
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The end of a command.
+
+    Args:
+        success: Whether what was asked happened.
+        message: One sentence for people.
+        code: Why it did not; OK when it did.
+        data: What `--json` writes beside success, code and message.
+        text: Longer text for people (a table, a drawing), printed before the message.
+    """
+
+    success: bool
+    message: str = ""
+    code: str = Code.OK
+    data: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    text: str = ""
+
+    @property
+    def exit_code(self) -> int:
+        """0 when what was asked happened, else 1 (a wrong call, 2, never gets this far)."""
+        return 0 if self.success else 1
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what `--json` writes."""
+        return {"success": self.success, "code": str(self.code), "message": self.message, **self.data}
+
+
+def failure(error: OpenArmError, **data: Any) -> Outcome:
+    """Return the outcome of an error."""
+    return Outcome(False, error.message, error.code, data)

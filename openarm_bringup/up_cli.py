@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm up`: start a graph and keep it until Ctrl-C."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from openarm_bringup.graph import Discovery, Graph, load_graph
+from openarm_bringup.outcome import Outcome, failure
+from openarm_common.errors import Code, OpenArmError
+
+STYLES = {"ready": "green", "failed": "bold red", "backoff": "yellow", "exited": "yellow", "stopped": "dim"}
+
+
+def up(
+    graph: str = "sim",
+    *,
+    set_: Annotated[tuple[str, ...], Parameter(name="--set", negative=(), consume_multiple=False)] = (),
+    scene: str | None = None,
+    seed: int | None = None,
+    mount_seed: str | None = None,
+    domain: int | None = None,
+    discovery: Discovery | None = None,
+) -> Outcome:
+    """Start the nodes of a graph, and stop them at Ctrl-C (a second Ctrl-C hurries).
+
+    Args:
+        graph: Name of a graph (sim, sim_only, perception, motion) or a file.
+        set_: A parameter, as node.param=value; may be given several times.
+        scene: Name or path of a scene, or "random".
+        seed: Seed of a random scene.
+        mount_seed: Seed of the true camera mounts, or "none" for the nominal ones.
+        domain: ROS_DOMAIN_ID; the environment's, or 0, when not given.
+        discovery: Whom the nodes meet; localhost when the graph says nothing else.
+    """
+    overrides = {"scene": scene, "seed": seed, "mount_seed": mount_seed, "domain": domain, "discovery": discovery}
+    loaded = load_graph(graph, overrides=overrides, sets=set_)
+    from openarm_bringup.runs import new_run_dir
+
+    return asyncio.run(_up(loaded, new_run_dir()))
+
+
+async def _up(graph: Graph, run_dir: Path) -> Outcome:
+    from rich.console import Console
+
+    from openarm_bringup.environment import domain_id
+    from openarm_bringup.session import running_graph
+    from openarm_bringup.supervisor import Event
+
+    console = Console(stderr=True, highlight=False)
+    began = time.monotonic()
+
+    def show(event: Event) -> None:
+        style = STYLES.get(event.state, "")
+        line = event.detail.partition("\n")[0]
+        console.print(f"[dim]{event.seconds:6.1f} s[/dim]  {event.node:<22} ", end="")
+        console.print(f"{event.state:<9}", style=style, end=" ")
+        console.print(line, markup=False)
+
+    data: dict[str, Any] = {"graph": graph.name, "run_dir": str(run_dir), "domain": domain_id(graph)}
+    try:
+        async with running_graph(graph, run_dir, show) as supervisor:
+            await supervisor.wait_ready()
+            data["ready_s"] = round(time.monotonic() - began, 2)
+            console.print(
+                f"[bold green]{graph.name} is ready[/bold green] after {data['ready_s']:.1f} s: "
+                f"domain {data['domain']}, logs in {run_dir / 'logs'}; Ctrl-C stops it"
+            )
+            await supervisor.wait_stop_asked()
+            data["states"] = supervisor.states()
+    except OpenArmError as error:
+        if error.code != Code.CANCELLED:
+            return failure(error, **data)
+        return Outcome(False, error.message, error.code, data)
+    return Outcome(True, f"{graph.name} stopped; no process is left, the logs are in {run_dir / 'logs'}", data=data)
