@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
-from types import ModuleType
 
 import mujoco
 import numpy as np
@@ -16,8 +14,7 @@ from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.description import BASE_LINK, SIDES, RobotDescription, Side, mirror
-from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import models_dir
+from openarm_common.errors import OpenArmError
 from openarm_sim_bridge.model import PhysicsConfig, robot_spec
 
 Array = NDArray[np.float64]
@@ -247,121 +244,6 @@ def test_masses_and_tensors_are_possible(description: RobotDescription) -> None:
             a, b, c = np.linalg.eigvalsh(link.inertia)
             assert a > 0, name
             assert a + b >= c, name
-
-
-@pytest.mark.parametrize("group", ["left_arm", "right_arm", "both_arms", "left_gripper", "right_gripper"])
-def test_srdf_states_cover_their_group_within_limits(description: RobotDescription, group: str) -> None:
-    names = description.group_joints(group)
-    lower, upper = description.limits(names)
-    states = [name for g, name in description.semantics.states if g == group]
-    assert {"open", "closed"} <= set(states) or {"home", "official_home", "hands_up", "zero"} <= set(states)
-    for state in states:
-        q = description.group_state(group, state)
-        assert tuple(q) == names
-        values = np.array(list(q.values()))
-        assert (values >= lower).all()
-        assert (values <= upper).all()
-
-
-def test_srdf_home_is_the_observing_posture_and_mirrored(description: RobotDescription) -> None:
-    right = list(description.group_state("right_arm", "home").values())
-    assert right == [-0.2, 2.2, 0, 1.2, 0, 0, 0.4]
-    np.testing.assert_allclose(list(description.group_state("left_arm", "home").values()), mirror(right))
-    tcp = description.link_pose("openarm_right_hand_tcp", description.group_state("right_arm", "home"))[:3, 3]
-    np.testing.assert_allclose(tcp, [0.41, -0.39, 0.79], atol=0.006)
-    assert description.group_state("right_arm", "official_home")["openarm_right_joint4"] == 1.570796
-
-
-@pytest.fixture(scope="module")
-def generator() -> ModuleType:
-    path = models_dir() / "openarm" / "generate_srdf.py"
-    spec = importlib.util.spec_from_file_location("generate_srdf", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_a74_collision_matrix_is_symmetric_and_keeps_what_must_be_checked(
-    description: RobotDescription, generator: ModuleType
-) -> None:
-    allowed = description.allowed_collisions
-    assert {generator.mirrored_pair(pair) for pair in allowed} == set(allowed)
-    assert not allowed & generator.always_checked()
-    assert generator.adjacent_pairs(description) <= allowed
-    assert generator.default_pairs() <= allowed
-    assert len(generator.adjacent_pairs(description)) == 22
-
-
-def test_a74_no_pair_that_is_said_never_to_touch_does(description: RobotDescription, generator: ModuleType) -> None:
-    touching = generator.touching_pairs(description, 3000)
-    never = description.allowed_collisions - generator.adjacent_pairs(description) - generator.default_pairs()
-    assert len(never) > 50
-    assert not never & touching
-
-
-MINI = """<robot name="mini">
-  <link name="base"><visual name="v"><geometry><sphere radius="0.1"/></geometry></visual></link>
-  <link name="slide"><collision name="c"><geometry><mesh filename="m.stl"/></geometry></collision></link>
-  <link name="follow"/>
-  <joint name="j1" type="prismatic"><parent link="base"/><child link="slide"/><axis xyz="0 0 2"/>
-    <limit lower="0" upper="1" effort="1" velocity="1"/></joint>
-  <joint name="j2" type="continuous"><parent link="slide"/><child link="follow"/><origin xyz="1 0 0" rpy="0 0 1"/>
-    <axis xyz="0 0 1"/><mimic joint="j1" multiplier="-2" offset="0.5"/></joint>
-</robot>"""
-
-
-def test_b07_any_robot_can_be_read() -> None:
-    robot = RobotDescription.from_urdf(MINI)
-    assert (robot.root, robot.name) == ("base", "mini")
-    assert robot.links["base"].visual[0].size == (0.1,)
-    assert robot.links["slide"].meshes == ("c",)
-    assert robot.joints["j2"].upper == np.inf
-    T = robot.link_pose("follow", {"j1": 0.25})
-    np.testing.assert_allclose(T, se3.make(se3.rot_z(1.0 - 2 * 0.25 + 0.5), (1, 0, 0.25)))
-    np.testing.assert_allclose(robot.link_poses({"j1": 0.25})["follow"], T)
-
-
-@pytest.mark.parametrize(
-    ("find", "replace", "words"),
-    [
-        ('<link name="follow"/>', '<link name="follow"/><link name="base"/>', "link name 'base' is used twice"),
-        ('name="j2"', 'name="j1"', "joint name 'j1' is used twice"),
-        ('name="c"', 'name="v"', "name 'v' is used twice"),
-        ('<child link="follow"/>', '<child link="nowhere"/>', "'nowhere', which does not exist"),
-        ('<link name="follow"/>', '<link name="follow"/><link name="loose"/>', "one root link, found 2: base, loose"),
-        ('<parent link="base"/>', '<parent link="follow"/>', "one root link, found 2|loop"),
-        ('type="continuous"', 'type="floating"', "supported: revolute, continuous, prismatic, fixed"),
-        ('<limit lower="0" upper="1" effort="1" velocity="1"/>', "", "no <limit>"),
-        ('lower="0"', 'lower="2"', "lower limit 2.0 above"),
-        ('xyz="1 0 0"', 'xyz="1 0 nan"', "3 finite numbers"),
-        ('mimic joint="j1"', 'mimic joint="j9"', "mimics 'j9', which does not exist"),
-        ("</robot>", "", "not XML"),
-        ('axis xyz="0 0 2"', 'axis xyz="0 0 0"', "axis"),
-        ("sphere", "cone", "<cone> is none of box, cylinder, sphere, mesh"),
-    ],
-)
-def test_a11_faulty_descriptions_are_refused_by_name(find: str, replace: str, words: str) -> None:
-    assert MINI.count(find) >= 1
-    with pytest.raises(OpenArmError, match=words) as caught:
-        RobotDescription.from_urdf(MINI.replace(find, replace, 1))
-    assert caught.value.code is Code.CONFIG_INVALID
-
-
-@pytest.mark.parametrize(
-    ("srdf", "words"),
-    [
-        ('<disable_collisions link1="base" link2="x"/>', "link 'x'"),
-        ('<group name="g"><joint name="j7"/></group>', "joint 'j7'"),
-        ('<group name="g"><chain base_link="base" tip_link="tip"/></group>', "link 'tip'"),
-        ('<group name="g"><group name="h"/></group>', "group 'h'"),
-        ('<group_state name="s" group="g"><joint name="j1" value="0"/></group_state>', "group 'g'"),
-    ],
-)
-def test_srdf_that_does_not_fit_the_urdf_is_refused(srdf: str, words: str) -> None:
-    with pytest.raises(OpenArmError, match=words):
-        RobotDescription.from_urdf(MINI, f"<robot>{srdf}</robot>")
 
 
 def test_questions_that_have_no_answer_list_what_there_is(description: RobotDescription) -> None:

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Groups, postures and the collision matrix of openarm.srdf, and an SRDF that does not fit its URDF."""
+
+from __future__ import annotations
+
+import importlib.util
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from openarm_common.description import RobotDescription, mirror
+from openarm_common.errors import OpenArmError
+from openarm_common.resources import models_dir
+
+MINI = """<robot name="mini"><link name="base"/><link name="slide"/>
+  <joint name="j1" type="prismatic"><parent link="base"/><child link="slide"/>
+    <limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
+
+@pytest.fixture(scope="module")
+def description() -> RobotDescription:
+    return RobotDescription.load()
+
+
+@pytest.mark.parametrize("group", ["left_arm", "right_arm", "both_arms", "left_gripper", "right_gripper"])
+def test_srdf_states_cover_their_group_within_limits(description: RobotDescription, group: str) -> None:
+    names = description.group_joints(group)
+    lower, upper = description.limits(names)
+    states = [name for g, name in description.semantics.states if g == group]
+    assert {"open", "closed"} <= set(states) or {"home", "official_home", "hands_up", "zero"} <= set(states)
+    for state in states:
+        q = description.group_state(group, state)
+        assert tuple(q) == names
+        values = np.array(list(q.values()))
+        assert (values >= lower).all()
+        assert (values <= upper).all()
+
+
+def test_srdf_home_is_the_observing_posture_and_mirrored(description: RobotDescription) -> None:
+    right = list(description.group_state("right_arm", "home").values())
+    assert right == [-0.2, 2.2, 0, 1.2, 0, 0, 0.4]
+    np.testing.assert_allclose(list(description.group_state("left_arm", "home").values()), mirror(right))
+    tcp = description.link_pose("openarm_right_hand_tcp", description.group_state("right_arm", "home"))[:3, 3]
+    np.testing.assert_allclose(tcp, [0.41, -0.39, 0.79], atol=0.006)
+    assert description.group_state("right_arm", "official_home")["openarm_right_joint4"] == 1.570796
+
+
+@pytest.fixture(scope="module")
+def generator() -> ModuleType:
+    path = models_dir() / "openarm" / "generate_srdf.py"
+    spec = importlib.util.spec_from_file_location("generate_srdf", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a74_collision_matrix_is_symmetric_and_keeps_what_must_be_checked(
+    description: RobotDescription, generator: ModuleType
+) -> None:
+    allowed = description.allowed_collisions
+    assert {generator.mirrored_pair(pair) for pair in allowed} == set(allowed)
+    assert not allowed & generator.always_checked()
+    assert generator.adjacent_pairs(description) <= allowed
+    assert generator.default_pairs() <= allowed
+    assert len(generator.adjacent_pairs(description)) == 22
+
+
+def test_a74_no_pair_that_is_said_never_to_touch_does(description: RobotDescription, generator: ModuleType) -> None:
+    touching = generator.touching_pairs(description, 3000)
+    never = description.allowed_collisions - generator.adjacent_pairs(description) - generator.default_pairs()
+    assert len(never) > 50
+    assert not never & touching
+
+
+@pytest.mark.parametrize(
+    ("srdf", "words"),
+    [
+        ('<disable_collisions link1="base" link2="x"/>', "link 'x'"),
+        ('<group name="g"><joint name="j7"/></group>', "joint 'j7'"),
+        ('<group name="g"><chain base_link="base" tip_link="tip"/></group>', "link 'tip'"),
+        ('<group name="g"><group name="h"/></group>', "group 'h'"),
+        ('<group_state name="s" group="g"><joint name="j1" value="0"/></group_state>', "group 'g'"),
+    ],
+)
+def test_srdf_that_does_not_fit_the_urdf_is_refused(srdf: str, words: str) -> None:
+    with pytest.raises(OpenArmError, match=words):
+        RobotDescription.from_urdf(MINI, f"<robot>{srdf}</robot>")
