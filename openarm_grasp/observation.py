@@ -2,13 +2,13 @@
 """From frames of detections to one trusted object.
 
 All poses are in the base frame. A detection is an upright box: its z axis is up, ``size[0]`` and ``size[1]`` are the
-footprint edges along its x and y, ``size[2]`` its height. A box has no front: turned by 90° with its edges swapped it is
+footprint edges along its x and y, ``size[2]`` its height. A box has no front: turned by 90° with swapped edges it is
 the same box.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -81,6 +81,21 @@ class Sighting:
     others: tuple[Detection, ...]
     t_ns: int
     spread: float
+
+
+def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Frame, ...]:
+    """Frames of detections in the base frame.
+
+    Args:
+        frames: In some frame.
+        lookup: T_base_frame (4, 4) of that frame at a stamp in ns.
+    """
+    moved: list[Frame] = []
+    for frame in frames:
+        T = lookup(frame.t_ns)
+        found = (Detection(d.label, d.score, T @ d.T_base_object, d.size) for d in frame.detections)
+        moved.append(Frame(frame.t_ns, tuple(found)))
+    return tuple(moved)
 
 
 def labels_in_view(frames: Sequence[Frame]) -> list[str]:

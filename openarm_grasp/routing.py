@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Literal
 
 from openarm_common.errors import Code, OpenArmError
 
 #: The arms of the description, by side.
-ARMS = ("left", "right")
+ARMS: tuple[Literal["left", "right"], ...] = ("left", "right")
 
 
 def arm_order(arm: str, y: float, overlap_half_width: float) -> tuple[str, ...]:

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ask for grasps from plain Python: no node, no executor and no spinning in the caller's code."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import rclpy
+from action_msgs.msg import GoalStatus
+from openarm_interfaces.action import Pick
+from openarm_interfaces.msg import GraspStatus
+from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+from openarm_common.convert import xyz
+from openarm_common.errors import Code, OpenArmError
+
+OnFeedback = Callable[[GraspStatus], None]
+#: How often a waiting call looks up, so that Ctrl-C is noticed.
+_LOOK_S = 0.1
+
+
+@dataclass(frozen=True)
+class GraspResult:
+    """How a grasp ended.
+
+    Attributes:
+        success: The object was placed and seen there (dry run: it could be).
+        code: `openarm_common.errors.Code`.
+        message: What happened, in a sentence or two.
+        label: What was picked.
+        arm: The arm that was used, or "".
+        attempts: Physical attempts.
+        place_position: (x, y, z) of the target on the table, base frame, m.
+        duration: s of robot time.
+    """
+
+    success: bool
+    code: Code
+    message: str
+    label: str
+    arm: str
+    attempts: int
+    place_position: tuple[float, float, float]
+    duration: float
+
+    def raise_for_code(self) -> Self:
+        """Return the result of a success.
+
+        Raises:
+            OpenArmError: With code and message, for anything else.
+        """
+        if not self.success:
+            raise OpenArmError(self.code, self.message)
+        return self
+
+
+class GraspClient:
+    """Asks the grasp node; a context manager.
+
+    It brings its own ROS context, node and background thread, so it also works beside an rclpy program.
+
+    Args:
+        timeout: Longest wait for the grasp node to be there and to answer, s of wall clock.
+
+    Example:
+        ``with GraspClient() as grasp: print(grasp.pick("red").message)``
+    """
+
+    def __init__(self, *, timeout: float = 10.0) -> None:
+        self._timeout = timeout
+        self._context = Context()
+        # Ctrl-C stays the caller's.
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = Node("grasp_client", context=self._context)
+        self._client = ActionClient(self._node, Pick, "/grasp/pick")
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._goal: ClientGoalHandle | None = None
+        self._callback_error: Exception | None = None
+        self._thread = threading.Thread(target=self._spin, name="grasp_client", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the background thread and leave the graph; a running grasp goes on."""
+        if not self._context.ok():
+            return
+        self._executor.shutdown(timeout_sec=2.0)
+        self._thread.join(timeout=5.0)
+        self._client.destroy()
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def pick(
+        self,
+        label: str = "",
+        *,
+        arm: str = "auto",
+        place: Sequence[float] | None = None,
+        dry_run: bool = False,
+        timeout: float = 300.0,
+        on_feedback: OnFeedback | None = None,
+    ) -> GraspResult:
+        """Pick an object and place it; returns when that has ended, well or not.
+
+        Args:
+            label: What to pick; "" takes the detection with the highest score.
+            arm: "auto", "left" or "right".
+            place: (x, y) or (x, y, z) of the footprint centre, base frame, m; z is not read. None lets a free spot be
+                chosen.
+            dry_run: Plan and report, do not move.
+            timeout: s of wall clock; then the grasp is cancelled.
+            on_feedback: Called with each `GraspStatus`, in the background thread; it may call `cancel`.
+
+        Returns:
+            The result; `raise_for_code` turns a failure into an exception.
+
+        Raises:
+            OpenArmError: NOT_READY, when no grasp node answers; TIMEOUT; INVALID_ARGUMENT, for a place that is not two or
+                three numbers.
+        """
+        goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run)
+        if place is not None:
+            if len(place) not in (2, 3):
+                raise OpenArmError(Code.INVALID_ARGUMENT, f"place {list(place)} must be x, y or x, y, z in metres")
+            goal.has_place_position = True
+            goal.place_position.x, goal.place_position.y = float(place[0]), float(place[1])
+            goal.place_position.z = float(place[2]) if len(place) == 3 else 0.0
+        self._callback_error = None
+        if not self._client.wait_for_server(timeout_sec=self._timeout):
+            raise OpenArmError(
+                Code.NOT_READY,
+                f"no action /grasp/pick within {self._timeout:g} s: is the graph up (./openarm up), with the same"
+                " ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE?",
+            )
+        handle = self._wait(
+            self._client.send_goal_async(goal, self._feedback(on_feedback)), self._timeout, "acceptance"
+        )
+        if not handle.accepted:
+            raise OpenArmError(Code.BUSY, "the grasp node rejected the goal")
+        self._goal = handle
+        try:
+            answer = self._wait(handle.get_result_async(), timeout, "the end of the grasp")
+        except BaseException:
+            # Whatever keeps the caller from waiting (a deadline, Ctrl-C): nobody would see the arm go on.
+            self._wait(handle.cancel_goal_async(), 2.0, "the cancel")
+            raise
+        finally:
+            self._goal = None
+        if answer.status == GoalStatus.STATUS_UNKNOWN:
+            raise OpenArmError(Code.NOT_READY, "the grasp node no longer knows the goal: it was started anew")
+        return _result(answer.result)
+
+    def cancel(self) -> None:
+        """Ask the running pick to stop; it returns with CANCELLED, the arm holding where it is."""
+        goal = self._goal
+        if goal is not None:
+            goal.cancel_goal_async()
+
+    def _feedback(self, on_feedback: OnFeedback | None) -> Callable[[Any], None] | None:
+        if on_feedback is None:
+            return None
+
+        def deliver(message: Any) -> None:
+            try:
+                on_feedback(message.feedback.status)
+            except Exception as error:
+                # Raised in the background it would stop the thread; `_wait` raises it where the caller is.
+                self._callback_error = error
+
+        return deliver
+
+    def _wait(self, future: Future, timeout: float, what: str) -> Any:
+        done = threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        deadline = time.monotonic() + timeout
+        while not done.wait(_LOOK_S):
+            if self._callback_error is not None:
+                error, self._callback_error = self._callback_error, None
+                raise error
+            if not self._thread.is_alive():
+                raise OpenArmError(Code.NOT_READY, f"the grasp client was closed while waiting for {what}")
+            if time.monotonic() > deadline:
+                raise OpenArmError(Code.TIMEOUT, f"no answer within {timeout:g} s while waiting for {what}")
+        return future.result()
+
+    def _spin(self) -> None:
+        try:
+            self._executor.spin()
+        except ExternalShutdownException:
+            self._node.get_logger().debug("the context was shut down")
+
+
+def _result(message: Pick.Result) -> GraspResult:
+    x, y, z = (float(v) for v in xyz(message.place_position))
+    code = Code(message.code) if message.code in Code.__members__ else Code.INTERNAL
+    return GraspResult(
+        message.success,
+        code,
+        message.message,
+        message.label,
+        message.arm,
+        message.attempts,
+        (x, y, z),
+        message.duration,
+    )

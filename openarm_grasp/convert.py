@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Between messages and the frozen data of the core. Poses are in the base frame unless a name says otherwise."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from geometry_msgs.msg import Point
+from numpy.typing import NDArray
+from openarm_interfaces.action import MoveArm, Pick, PlanApproach
+from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspStatus
+from openarm_interfaces.srv import ComputeIK, Grasp
+from std_msgs.msg import ColorRGBA
+from vision_msgs.msg import Detection3DArray
+from visualization_msgs.msg import Marker, MarkerArray
+
+from openarm_common.convert import matrix_to_pose, ns_to_stamp, point, pose_to_matrix, stamp_to_ns, vector, xyz
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.node import BASE_FRAME
+from openarm_grasp.candidates import Box, GraspCandidate
+from openarm_grasp.effects import GoHome, GraspOutcome, GraspRequest, MoveLinear, PlanGrasp, Planned, PlanPlace
+from openarm_grasp.machine import GraspMachine
+from openarm_grasp.observation import Detection, Frame
+from openarm_grasp.place import PlaceTarget
+
+Array = NDArray[np.float64]
+
+_CHOSEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
+_OFFERED = ColorRGBA(r=0.4, g=0.5, b=0.9, a=0.35)
+
+
+# --- requests and answers
+def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
+    """The user's wish; a service request and an action goal have the same fields."""
+    p = message.place_position
+    place = (p.x, p.y, p.z) if message.has_place_position else None
+    return GraspRequest(message.label, message.arm or "auto", place, message.dry_run)
+
+
+def fill_answer(answer: Grasp.Response | Pick.Result, outcome: GraspOutcome) -> None:
+    """Write an outcome into a service response or an action result."""
+    answer.success = outcome.success
+    answer.code = outcome.code.value
+    answer.message = outcome.message
+    answer.label = outcome.label
+    answer.arm = outcome.arm
+    answer.attempts = outcome.attempts
+    answer.place_position = point(outcome.place_position)
+    answer.duration = outcome.duration
+
+
+def status_msg(machine: GraspMachine, t_ns: int) -> GraspStatus:
+    """Where the grasp stands."""
+    message = GraspStatus(
+        state=machine.state.value,
+        previous_state=machine.previous.value,
+        reason=machine.reason,
+        attempt=machine.attempt,
+        label=machine.label,
+        arm=machine.arm,
+    )
+    message.header.stamp = ns_to_stamp(t_ns)
+    message.header.frame_id = BASE_FRAME
+    return message
+
+
+# --- detections
+def frame_from_msg(message: Detection3DArray) -> Frame:
+    """One frame of detections, in the frame that its header names.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for a pose that is not one.
+    """
+    found: list[Detection] = []
+    for item in message.detections:
+        if not item.results:
+            continue
+        best = max(item.results, key=lambda r: r.hypothesis.score)
+        T = pose_to_matrix(item.bbox.center)
+        found.append(Detection(best.hypothesis.class_id, best.hypothesis.score, T, xyz(item.bbox.size)))
+    return Frame(stamp_to_ns(message.header.stamp), tuple(found))
+
+
+# --- planning
+def box_to_msg(box: Box) -> CollisionBox:
+    """A collision box; its frame is the user's affair."""
+    return CollisionBox(id=box.id, pose=matrix_to_pose(box.T_frame_box), size=vector(box.size))
+
+
+def plan_goal(effect: PlanGrasp | PlanPlace, velocity_scale: float) -> PlanApproach.Goal:
+    """The planning goal of a grasp (the target may be touched, and is carried on the retreat) or of a place."""
+    return _grasp_goal(effect, velocity_scale) if isinstance(effect, PlanGrasp) else _place_goal(effect, velocity_scale)
+
+
+def _grasp_goal(effect: PlanGrasp, velocity_scale: float) -> PlanApproach.Goal:
+    return PlanApproach.Goal(
+        arm=effect.arm,
+        targets=_targets(effect.candidates),
+        obstacles=[box_to_msg(box) for box in (*effect.obstacles, effect.target)],
+        touchable=[effect.target.id],
+        attached_after_approach=True,
+        velocity_scale=velocity_scale,
+    )
+
+
+def _place_goal(effect: PlanPlace, velocity_scale: float) -> PlanApproach.Goal:
+    start: list[float] = []
+    if effect.after is not None:
+        points = getattr(effect.after, "points", None)
+        if not points:
+            raise OpenArmError(Code.INTERNAL, f"{type(effect.after).__name__} is not a trajectory with points")
+        start = list(points[-1].positions)
+    return PlanApproach.Goal(
+        arm=effect.arm,
+        targets=_targets(effect.targets),
+        obstacles=[box_to_msg(box) for box in effect.obstacles],
+        attached=[box_to_msg(effect.held)],
+        touchable=[effect.held.id],
+        detached_after_approach=True,
+        start=start,
+        velocity_scale=velocity_scale,
+    )
+
+
+def _targets(ways: Iterable[GraspCandidate | PlaceTarget]) -> list[ApproachTarget]:
+    return [
+        ApproachTarget(
+            id=way.id,
+            pose=matrix_to_pose(way.T_base_tcp),
+            approach_offset=vector(way.approach_offset),
+            retreat_offset=vector(way.retreat_offset),
+            score=way.score,
+        )
+        for way in ways
+    ]
+
+
+def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
+    """A plan, or why there is none.
+
+    Raises:
+        OpenArmError: With the planner's code, when it found no plan; INTERNAL, when it chose what was not offered.
+    """
+    if not result.success:
+        raise OpenArmError(code_from_text(result.code, Code.NO_PLAN), _refusal(result))
+    if not 0 <= result.chosen < offered:
+        raise OpenArmError(Code.INTERNAL, f"the planner chose target {result.chosen} of {offered}")
+    return Planned(result.chosen, result.transfer, result.approach, result.retreat, result.planning_time)
+
+
+def _refusal(result: PlanApproach.Result) -> str:
+    counts = Counter(r.code for r in result.refusals)
+    text = result.message or "no plan"
+    if not counts:
+        return text
+    return f"{text} ({', '.join(f'{n} × {code}' for code, n in counts.most_common())})"
+
+
+def reach_request(arm: str, T_base_tcp: Array) -> ComputeIK.Request:
+    """Ask how near an arm's TCP comes to a point, in any orientation."""
+    request = ComputeIK.Request(arm=arm, free_orientation=True)
+    request.pose.header.frame_id = BASE_FRAME
+    request.pose.pose = matrix_to_pose(T_base_tcp)
+    return request
+
+
+def reach_from_msg(arm: str, answer: ComputeIK.Response, T_base_tcp: Array) -> dict[str, float]:
+    """Distance in m by arm; empty when the answer says nothing about it."""
+    if answer.success:
+        return {arm: answer.position_error}
+    if answer.code != Code.UNREACHABLE:
+        return {}
+    return {arm: float(np.linalg.norm(xyz(answer.nearest.position) - T_base_tcp[:3, 3]))}
+
+
+def home_goal(arm: str, named: str, effect: GoHome, velocity_scale: float) -> MoveArm.Goal:
+    """A free path to a named posture."""
+    return MoveArm.Goal(
+        arm=arm,
+        kind=MoveArm.Goal.NAMED,
+        named=named,
+        obstacles=[box_to_msg(box) for box in effect.obstacles],
+        velocity_scale=velocity_scale,
+    )
+
+
+def linear_goal(effect: MoveLinear, velocity_scale: float) -> MoveArm.Goal:
+    """A straight line of the TCP."""
+    goal = MoveArm.Goal(arm=effect.arm, kind=MoveArm.Goal.LINEAR, velocity_scale=velocity_scale)
+    goal.pose.header.frame_id = BASE_FRAME
+    goal.pose.pose = matrix_to_pose(effect.T_base_tcp)
+    return goal
+
+
+def code_from_text(text: str, otherwise: Code) -> Code:
+    """The code that a message names; `otherwise` for one that is not of the suite, or claims success in a failure."""
+    return Code(text) if text in Code.__members__ and text != Code.OK else otherwise
+
+
+# --- pictures
+def candidate_markers(candidates: Sequence[GraspCandidate], chosen: str, t_ns: int) -> MarkerArray:
+    """An arrow along the approach of each candidate and a bar along its opening axis; the chosen one is green."""
+    markers = [Marker(action=Marker.DELETEALL)]
+    for i, c in enumerate(candidates):
+        tip = c.T_base_tcp[:3, 3]
+        half = 0.5 * c.width * c.T_base_tcp[:3, 1]
+        color = _CHOSEN if c.id == chosen else _OFFERED
+        shaft = _points(tip + c.approach_offset, tip)
+        arrow = Marker(ns="approach", id=i, type=Marker.ARROW, color=color, points=shaft)
+        arrow.scale = vector((0.004, 0.008, 0.012))
+        bar = Marker(ns="opening", id=i, type=Marker.LINE_STRIP, color=color, points=_points(tip - half, tip + half))
+        bar.scale.x = 0.003
+        markers += [arrow, bar]
+    for marker in markers:
+        marker.header.frame_id = BASE_FRAME
+        marker.header.stamp = ns_to_stamp(t_ns)
+        marker.pose.orientation.w = 1.0
+    return MarkerArray(markers=markers)
+
+
+def _points(*positions: np.ndarray) -> list[Point]:
+    return [point(p) for p in positions]
