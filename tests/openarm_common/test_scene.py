@@ -87,6 +87,8 @@ def test_mass_follows_from_the_volume_where_none_is_given() -> None:
         ({"size": [0.05, 0.05]}, r"objects.0.size"),
         ({"mass": -1}, "objects.0.mass"),
         ({"name": "Red Cube"}, "objects.0.name"),
+        ({"name": "table"}, "objects.0.name: .*reserved"),
+        ({"name": "openarm_right_hand"}, "objects.0.name: .*reserved"),
         ({"yaw": float("nan")}, "objects.0.yaw: .*finite"),
         ({"position": [0.3, float("inf")]}, "objects.0.position"),
         ({"radius": 0.1}, "objects.0.radius: unknown key"),
@@ -173,7 +175,7 @@ def test_unknown_scenes_and_objects_list_what_there_is(tmp_path: Path) -> None:
     with pytest.raises(OpenArmError, match=r"broken.yaml is not valid YAML") as caught:
         load_scene(broken)
     assert caught.value.code is Code.SCENE_INVALID
-    with pytest.raises(OpenArmError, match=r"no object 'cup'.*red_cube, green_cylinder, blue_can, yellow_box") as caught:
+    with pytest.raises(OpenArmError, match=r"no object 'cup'.*red_cube, green_cylinder, blue_can") as caught:
         load_scene("demo").object("cup")
     assert caught.value.code is Code.UNKNOWN_OBJECT
 

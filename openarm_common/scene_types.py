@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a scene is made of: table, objects, their colours.
+
+Positions are in the base frame (`world`, `openarm_body_link0`: x forward, y left, z up), metres; yaw is about z, rad.
+Each type checks its own fields; whether objects fit the table and each other is checked by `openarm_common.scene`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from openarm_common import se3
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+
+Array = NDArray[np.float64]
+Rgba = tuple[float, float, float, float]
+
+#: Colours of objects; each lies inside one hue range of `config/params/detector.yaml`.
+PALETTE: Mapping[str, Rgba] = MappingProxyType(
+    {
+        "red": (0.80, 0.08, 0.08, 1.0),
+        "orange": (0.95, 0.45, 0.04, 1.0),
+        "yellow": (0.93, 0.82, 0.05, 1.0),
+        "green": (0.08, 0.58, 0.18, 1.0),
+        "blue": (0.06, 0.25, 0.80, 1.0),
+        "purple": (0.46, 0.10, 0.66, 1.0),
+    }
+)
+SHAPES = ("box", "cylinder")
+RESERVED_NAMES = ("world", "floor", "table", "table_top")
+DENSITY = 700.0  # kg/m3, of an object without a mass: hard wood
+MAX_EDGE = 0.30  # m
+MIN_EDGE = 0.01  # m
+#: The front of the pedestal's column; a table that reaches further back would stand in it.
+_COLUMN_FRONT = 0.035
+
+
+class Table(Config):
+    """A table with four legs; its top is a box."""
+
+    top_z: float = Field(0.40, ge=0.05, le=1.2, description="height of the top, m")
+    x: tuple[float, float] = Field((0.11, 0.81), description="front and back edge, m")
+    y: tuple[float, float] = Field((-0.60, 0.60), description="right and left edge, m")
+    thickness: float = Field(0.04, gt=0.0, le=0.2, description="of the top, m")
+
+    @field_validator("x", "y")
+    @classmethod
+    def _ascending(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not value[0] < value[1]:
+            raise ValueError("expected [low, high] with low < high")
+        return value
+
+    @field_validator("x")
+    @classmethod
+    def _clear_of_pedestal(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] < _COLUMN_FRONT:
+            raise ValueError(f"the front edge would stand in the pedestal; expected at least {_COLUMN_FRONT}")
+        return value
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Middle of the top, m."""
+        return (self.x[0] + self.x[1]) / 2.0, (self.y[0] + self.y[1]) / 2.0
+
+    @property
+    def extents(self) -> tuple[float, float, float]:
+        """Edges of the top, m."""
+        return self.x[1] - self.x[0], self.y[1] - self.y[0], self.thickness
+
+
+class SceneObject(Config):
+    """A free body in one plain colour.
+
+    `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height.
+    `position` is x, y, or x, y, z of the centre; without z the object stands on the table.
+    """
+
+    name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")
+    label: str = Field("", description="what the detector calls it; the colour where it is not given")
+    shape: str = Field(description="box or cylinder")
+    size: tuple[float, float, float] = Field(description="extents, m")
+    color: str = Field(description="a colour of the palette")
+    mass: float = Field(0.0, ge=0.0, le=10.0, description="kg; 0 is the volume times the density of hard wood")
+    position: tuple[float, float] | tuple[float, float, float] = Field(description="of the centre, m")
+    yaw: float = Field(0.0, description="rad")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _label_is_color(cls, data: Any) -> Any:
+        return {"label": data.get("color", "")} | data if isinstance(data, dict) else data
+
+    @field_validator("name")
+    @classmethod
+    def _free_name(cls, value: str) -> str:
+        if value in RESERVED_NAMES or value.startswith("openarm_"):
+            reserved = ", ".join(RESERVED_NAMES)
+            raise ValueError(
+                f"reserved for the surroundings and the robot ({reserved}, openarm_…); choose another name"
+            )
+        return value
+
+    @field_validator("shape")
+    @classmethod
+    def _known_shape(cls, value: str) -> str:
+        if value not in SHAPES:
+            raise ValueError(f"unknown shape; shapes: {', '.join(SHAPES)}")
+        return value
+
+    @field_validator("color")
+    @classmethod
+    def _known_color(cls, value: str) -> str:
+        if value not in PALETTE:
+            raise ValueError(f"unknown colour; colours: {', '.join(PALETTE)}")
+        return value
+
+    @field_validator("size")
+    @classmethod
+    def _possible_size(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not all(MIN_EDGE <= edge <= MAX_EDGE for edge in value):
+            raise ValueError(f"too large or too small; expected every extent in {MIN_EDGE} .. {MAX_EDGE} m")
+        return value
+
+    @field_validator("position", "yaw")
+    @classmethod
+    def _finite(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        if not np.isfinite(value).all():
+            raise ValueError("expected finite numbers")
+        return value
+
+    @property
+    def rgba(self) -> Rgba:
+        """Colour."""
+        return PALETTE[self.color]
+
+    @property
+    def volume(self) -> float:
+        """Cubic metres."""
+        x, y, z = self.size
+        return x * y * z * (math.pi / 4.0 if self.shape == "cylinder" else 1.0)
+
+    @property
+    def mass_kg(self) -> float:
+        """Mass, kg: as given, or by volume."""
+        return self.mass or self.volume * DENSITY
+
+    def centre(self, table: Table) -> tuple[float, float, float]:
+        """Position of the centre, m; on the table where the scene gives no z."""
+        z = self.position[2] if len(self.position) == 3 else table.top_z + self.size[2] / 2.0
+        return self.position[0], self.position[1], z
+
+    def T_world_object(self, table: Table) -> Array:
+        """Pose, (4, 4)."""
+        return se3.make(se3.rot_z(self.yaw), self.centre(table))
+
+    def outline(self) -> Array:
+        """Convex outline (n, 2) of the footprint in the base frame, m."""
+        if self.shape == "cylinder":
+            angles = np.arange(32) * (math.tau / 32.0)
+            corners = np.stack([np.cos(angles), np.sin(angles)], axis=1) * (self.size[0] / 2.0)
+        else:
+            corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (np.array(self.size[:2]) / 2.0)
+        return corners @ se3.rot_z(self.yaw)[:2, :2].T + np.array(self.position[:2])
+
+
+class Scene(Config):
+    """A table and what is on it."""
+
+    name: str = Field("scene", min_length=1)
+    table: Table = Table()
+    objects: tuple[SceneObject, ...] = ()
+
+    def object(self, name: str) -> SceneObject:
+        """Return the object of that name.
+
+        Raises:
+            OpenArmError: UNKNOWN_OBJECT, listing the objects there are.
+        """
+        for item in self.objects:
+            if item.name == name:
+                return item
+        there = ", ".join(item.name for item in self.objects) or "none"
+        raise OpenArmError(Code.UNKNOWN_OBJECT, f"no object {name!r} in scene {self.name!r}; objects: {there}")
