@@ -61,7 +61,9 @@ def check() -> Outcome:
         results[name] = subprocess.run([sys.executable, "-m", *command], cwd=root, check=False).returncode
     failed = [name for name, code in results.items() if code != 0]
     if failed:
-        return Outcome(False, f"{', '.join(failed)} found faults; see the lines above", Code.INTERNAL, {"checks": results})
+        return Outcome(
+            False, f"{', '.join(failed)} found faults; see the lines above", Code.INTERNAL, {"checks": results}
+        )
     return Outcome(True, "style and types are sound", data={"checks": results})
 
 
@@ -79,5 +81,7 @@ def _in_order(tests: Path) -> list[str]:
 def _checkout() -> Path:
     root = Path(__file__).resolve().parents[1]
     if not (root / "tests").is_dir():
-        raise OpenArmError(Code.ENVIRONMENT, f"there are no tests beside {root / 'openarm_bringup'}; run this in a checkout")
+        raise OpenArmError(
+            Code.ENVIRONMENT, f"there are no tests beside {root / 'openarm_bringup'}; run this in a checkout"
+        )
     return root

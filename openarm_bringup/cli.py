@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line: `openarm COMMAND`.
 
-Commands are functions that return an `Outcome`; here alone it is printed, written as JSON and turned into the exit code.
-Modules of commands import heavy libraries inside their functions, so that `openarm --help` stays quick.
+Commands are functions that return an `Outcome`; here alone it is printed, written as JSON and turned into the exit
+code. Modules of commands import heavy libraries inside their functions, so that `openarm --help` stays quick.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import cyclopts
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from openarm_bringup import runs
 from openarm_bringup.outcome import Outcome, failure
@@ -30,7 +30,14 @@ def build_app() -> App:
     """Return the application with all its commands."""
     from openarm_bringup import checks_cli, demo_cli, doctor_cli, graph_cli, inspect_cli, model_cli, pick_cli, up_cli
 
-    app = App(name="openarm", help=HELP, help_epilogue=EPILOGUE, help_format="markdown", version=_version)
+    app = App(
+        name="openarm",
+        help=HELP,
+        help_epilogue=EPILOGUE,
+        help_format="markdown",
+        version=_version,
+        default_parameter=Parameter(negative_iterable=()),
+    )
     app.command(up_cli.up)
     app.command(pick_cli.pick)
     app.command(demo_cli.demo)

@@ -15,7 +15,7 @@ DISTRO = "jazzy"
 RCLPY_MAJOR = 7
 PYTHONS = ((3, 11), (3, 12), (3, 13))
 
-#: distribution → (lowest version, first version that does not do, what it is for); mujoco is the first that is looked at.
+#: distribution → (lowest version, first that does not do, what it is for); mujoco is the first that is looked at.
 WANTED: Mapping[str, tuple[tuple[int, ...], tuple[int, ...] | None, str]] = {
     "mujoco": ((4, 0), None, "simulator"),
     "opencv-python-headless": ((4, 13), (5,), "images; 5.0 has no calibrateHandEye"),
@@ -55,7 +55,7 @@ def check_python(version: tuple[int, int], system: str, machine: str) -> Finding
     """Judge interpreter and machine: the ROS wheels exist for CPython 3.11 to 3.13 on Linux x86-64."""
     seen = f"CPython {version[0]}.{version[1]} on {system} {machine}"
     if (system, machine) != ("Linux", "x86_64"):
-        advice = "the ROS 2 wheels exist for Linux x86_64 only; elsewhere build the suite in a native ROS 2 Jazzy with colcon"
+        advice = "the ROS 2 wheels exist for Linux x86_64 only; elsewhere build the suite with colcon in a native Jazzy"
         return Finding("python", "error", seen, advice)
     if version not in PYTHONS:
         return Finding("python", "error", seen, "use CPython 3.11, 3.12 or 3.13 (OPENARM_PYTHON=/path ./openarm)")
@@ -69,9 +69,13 @@ def check_versions(installed: Mapping[str, str]) -> list[Finding]:
         version = installed.get(name)
         wanted = f">= {'.'.join(map(str, lowest))}" + (f", < {'.'.join(map(str, first_bad))}" if first_bad else "")
         if version is None:
-            findings.append(Finding(name, "error", f"not installed ({purpose})", f"run ./openarm again, or install {name} {wanted}"))
+            findings.append(
+                Finding(name, "error", f"not installed ({purpose})", f"run ./openarm again, or install {name} {wanted}")
+            )
         elif version_tuple(version) < lowest or (first_bad and version_tuple(version) >= first_bad):
-            findings.append(Finding(name, "error", f"{version} ({purpose})", f"needs {wanted}; remove .venv and run ./openarm"))
+            findings.append(
+                Finding(name, "error", f"{version} ({purpose})", f"needs {wanted}; remove .venv and run ./openarm")
+            )
         else:
             findings.append(Finding(name, "ok", f"{version} ({purpose})"))
     return findings
@@ -101,17 +105,27 @@ def check_ros(environ: Mapping[str, str], rclpy_file: str | None, rclpy_version:
         | ({environ["ROS_DISTRO"]} if environ.get("ROS_DISTRO") else set())
     )
     if len(sourced) > 1:
-        advice = f"source one only: open a new shell without the lines that source {' or '.join(d for d in sourced if d != DISTRO)}"
+        advice = f"source one only: open a shell that does not source {' or '.join(d for d in sourced if d != DISTRO)}"
         return [Finding("ros", "error", f"several ROS distributions are sourced: {', '.join(sourced)}", advice)]
     if sourced and sourced != [DISTRO]:
-        return [Finding("ros", "error", f"ROS {sourced[0]} is sourced", f"the suite is for {DISTRO}; open a shell without it")]
+        return [
+            Finding(
+                "ros", "error", f"ROS {sourced[0]} is sourced", f"the suite is for {DISTRO}; open a shell without it"
+            )
+        ]
     from_wheels = rclpy_file.startswith(prefix)
     if sourced and from_wheels:
         advice = "use one of them: ./openarm leaves a sourced ROS aside; a colcon workspace needs no .venv"
-        return [Finding("ros", "error", f"ROS {DISTRO} is sourced, but rclpy comes from the wheels in {prefix}", advice)]
+        return [
+            Finding("ros", "error", f"ROS {DISTRO} is sourced, but rclpy comes from the wheels in {prefix}", advice)
+        ]
     major = version_tuple(rclpy_version)[:1]
     if major and major != (RCLPY_MAJOR,):
-        return [Finding("ros", "error", f"rclpy {rclpy_version}", f"{DISTRO} has rclpy {RCLPY_MAJOR}; another ROS is in the way")]
+        return [
+            Finding(
+                "ros", "error", f"rclpy {rclpy_version}", f"{DISTRO} has rclpy {RCLPY_MAJOR}; another ROS is in the way"
+            )
+        ]
     origin = f"wheels in {prefix}" if from_wheels else f"a native ROS {DISTRO}"
     return [Finding("ros", "ok", f"rclpy {rclpy_version} from {origin}, no other ROS is sourced")]
 
@@ -132,7 +146,9 @@ def check_rmw(environ: Mapping[str, str]) -> list[Finding]:
         reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "localhost (set by the graph)")
         findings.append(Finding("discovery", "ok", reach))
     if environ.get("FASTRTPS_DEFAULT_PROFILES_FILE"):
-        advice = "every process takes it, and with a large segment each takes that much of /dev/shm; unset it unless wanted"
+        advice = (
+            "every process takes it, and with a large segment each takes that much of /dev/shm; unset it unless wanted"
+        )
         findings.append(Finding("fast dds profile", "note", environ["FASTRTPS_DEFAULT_PROFILES_FILE"], advice))
     return findings
 
@@ -152,7 +168,9 @@ def check_ports(taken: Sequence[int], domain: int) -> Finding:
     """Judge that the domain's discovery ports can be used on this machine."""
     if taken:
         advice = "another program holds them without sharing; choose another ROS_DOMAIN_ID"
-        return Finding("ports", "error", f"UDP {', '.join(map(str, taken))} of domain {domain} cannot be opened", advice)
+        return Finding(
+            "ports", "error", f"UDP {', '.join(map(str, taken))} of domain {domain} cannot be opened", advice
+        )
     return Finding("ports", "ok", f"the UDP ports of domain {domain} can be opened")
 
 
@@ -162,20 +180,30 @@ def check_shm(total_mib: float, free_mib: float, need_mib: float, graph: str) ->
     if free_mib >= need_mib:
         return Finding("/dev/shm", "ok", seen)
     if total_mib >= need_mib:
-        return Finding("/dev/shm", "error", seen, "stop other graphs, or remove what dead ones left: `fastdds shm clean`")
-    advice = "images would be lost; give the container more (`docker run --shm-size=256m`) or remount it: `mount -o remount,size=256m /dev/shm`"
+        return Finding(
+            "/dev/shm", "error", seen, "stop other graphs, or remove what dead ones left: `fastdds shm clean`"
+        )
+    advice = (
+        "images would be lost; give the container more (`docker run --shm-size=256m`), or "
+        "`mount -o remount,size=256m /dev/shm`"
+    )
     return Finding("/dev/shm", "error", seen, advice)
 
 
 def check_gl(milliseconds: Mapping[str, float | str], chosen: str) -> Finding:
     """Judge the off-screen renderers, each with its time for one image or why it failed."""
-    seen = ", ".join(f"{name} {value:.0f} ms" if isinstance(value, float) else f"{name} {value}" for name, value in milliseconds.items())
+    seen = ", ".join(
+        f"{name} {value:.0f} ms" if isinstance(value, float) else f"{name} {value}"
+        for name, value in milliseconds.items()
+    )
     if isinstance(milliseconds.get(chosen), float):
         return Finding("rendering", "ok", f"MUJOCO_GL={chosen}: {seen}; no display is needed")
     working = [name for name, value in milliseconds.items() if isinstance(value, float)]
     if working:
         return Finding("rendering", "error", seen, f"set MUJOCO_GL={working[0]}")
-    return Finding("rendering", "error", seen, "install a software renderer: apt-get install libegl1 libgl1 libegl-mesa0")
+    return Finding(
+        "rendering", "error", seen, "install a software renderer: apt-get install libegl1 libgl1 libegl-mesa0"
+    )
 
 
 def check_imports(failed: Mapping[str, str], purpose: str, names: Sequence[str]) -> Finding:
@@ -183,12 +211,15 @@ def check_imports(failed: Mapping[str, str], purpose: str, names: Sequence[str])
     if not failed:
         return Finding(purpose, "ok", f"{', '.join(names)} can be imported")
     name, why = next(iter(failed.items()))
-    return Finding(purpose, "error", f"{name} cannot be imported: {why}", "run ./openarm again; it repairs the installation")
+    return Finding(
+        purpose, "error", f"{name} cannot be imported: {why}", "run ./openarm again; it repairs the installation"
+    )
 
 
 def check_machine(cores: int, memory_gib: float, load: float, display: bool, wsl: bool) -> Finding:
     """Judge the machine; a display is never needed."""
-    seen = f"{cores} cores, {memory_gib:.0f} GiB, load {load:.1f}, {'WSL, ' if wsl else ''}{'a' if display else 'no'} display (none is needed)"
+    seen = f"{cores} cores, {memory_gib:.0f} GiB, load {load:.1f}, {'WSL, ' if wsl else ''}"
+    seen += f"{'a' if display else 'no'} display (none is needed)"
     if cores < 2:
         return Finding("machine", "note", seen, "images and control share one core; expect a real-time factor below 1")
     if load > cores:

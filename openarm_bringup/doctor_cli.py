@@ -55,14 +55,17 @@ def doctor(*, graph: str = "sim") -> Outcome:
     data = {"findings": [vars(finding) for finding in findings]}
     text = _table(findings)
     if errors:
-        message = f"{len(errors)} of {len(findings)} checks failed; first: {errors[0].name}: {errors[0].advice or errors[0].seen}"
+        first = errors[0]
+        message = f"{len(errors)} of {len(findings)} checks failed; {first.name}: {first.advice or first.seen}"
         return Outcome(False, message, Code.ENVIRONMENT, data, text)
     return Outcome(True, f"all {len(findings)} checks passed", data=data, text=text)
 
 
 def gather(graph: str) -> list[Finding]:
     """Make every check, the simulator's version first."""
-    installed = {dist.metadata["Name"].lower(): dist.version for dist in metadata.distributions() if dist.metadata["Name"]}
+    installed = {
+        dist.metadata["Name"].lower(): dist.version for dist in metadata.distributions() if dist.metadata["Name"]
+    }
     version = (sys.version_info.major, sys.version_info.minor)
     findings = checks.check_versions(installed)
     findings.append(checks.check_python(version, platform.system(), platform.machine()))
@@ -129,7 +132,7 @@ def _opencv_links_gl() -> bool:
     """Tell whether cv2 pulls libGL in, from what a process that imports it has mapped."""
     code = "import cv2; print('libGL.so' in open('/proc/self/maps').read())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
-    return done.returncode != 0 and "libGL" in done.stderr or done.stdout.strip() == "True"
+    return (done.returncode != 0 and "libGL" in done.stderr) or done.stdout.strip() == "True"
 
 
 def _render_times() -> dict[str, float | str]:

@@ -49,7 +49,9 @@ def check(graph: str = "sim") -> Outcome:
         message = f"node {name}: there is no module {module}; is the package that holds it installed?"
         return Outcome(False, message, Code.CONFIG_INVALID, data)
     return Outcome(
-        True, f"{loaded.name}: {len(loaded.nodes)} nodes, {need:.0f} MiB of /dev/shm ({free:.0f} free): sound", data=data
+        True,
+        f"{loaded.name}: {len(loaded.nodes)} nodes, {need:.0f} MiB of /dev/shm ({free:.0f} free): sound",
+        data=data,
     )
 
 

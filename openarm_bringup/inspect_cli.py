@@ -88,7 +88,9 @@ def logs(
     with path.open(encoding="utf-8", errors="replace") as log:
         last = list(deque(log, maxlen=lines))
         if not follow:
-            return Outcome(True, data={"log": str(path), "lines": [line.rstrip("\n") for line in last]}, text="".join(last))
+            return Outcome(
+                True, data={"log": str(path), "lines": [line.rstrip("\n") for line in last]}, text="".join(last)
+            )
         sys.stdout.writelines(last)
         try:
             while True:

@@ -6,6 +6,7 @@ All poses are in the world frame (m, quaternions xyzw), velocities in m/s and ra
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +25,9 @@ class JudgeConfig(Config):
     place_tolerance: float = Field(0.020, gt=0, description="m, footprint centre to target")
     lift: float = Field(0.05, gt=0, description="m, least rise of the centre during the run")
     tilt: float = Field(math.radians(10.0), gt=0, description="rad, between the upward axis before and after")
-    height: float = Field(0.005, gt=0, description="m, centre after against centre before (it stands, and on the table)")
+    height: float = Field(
+        0.005, gt=0, description="m, centre after against centre before (it stands, and on the table)"
+    )
     speed: float = Field(0.005, gt=0, description="m/s at rest")
     turn: float = Field(0.05, gt=0, description="rad/s at rest")
     rest: float = Field(0.5, gt=0, description="s of simulated time at rest at the end")
@@ -79,7 +82,7 @@ def judge(
         ValueError: The track is empty or not in the order of time.
     """
     rules = config or JudgeConfig()
-    if not track or any(later.t_ns < earlier.t_ns for earlier, later in zip(track, track[1:], strict=False)):
+    if not track or any(later.t_ns < earlier.t_ns for earlier, later in itertools.pairwise(track)):
         raise ValueError(f"a track needs samples in the order of time, got {len(track)}")
     first, last = track[0], track[-1]
     error = math.hypot(last.p_world[0] - target_xy[0], last.p_world[1] - target_xy[1])

@@ -6,6 +6,7 @@ Runs in a thread and a ROS context of its own, so that whoever asks for grasps i
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -33,9 +34,7 @@ T = TypeVar("T")
 Frame = tuple[int, Picture]
 
 _RELIABLE = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
-_LATCHED = QoSProfile(
-    depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
+_LATCHED = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _NEWEST = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -109,9 +108,10 @@ class Observer:
                 value = condition()
                 if value is not None and value is not False:
                     return value
-                if not self._changed.wait(timeout=max(0.0, min(0.2, deadline - time.monotonic()))):
-                    if time.monotonic() >= deadline:
-                        raise OpenArmError(Code.TIMEOUT, f"{what} was not there within {seconds:g} s")
+                left = deadline - time.monotonic()
+                if left <= 0.0:
+                    raise OpenArmError(Code.TIMEOUT, f"{what} was not there within {seconds:g} s")
+                self._changed.wait(timeout=min(0.2, left))
 
     def truth(self) -> Truth | None:
         """Return the newest ground truth, or None before the first."""
@@ -205,10 +205,8 @@ class Observer:
             self._on_step(step)
 
     def _spin(self) -> None:
-        try:
+        with contextlib.suppress(ExternalShutdownException):  # __exit__ has shut the context down
             self._executor.spin()
-        except ExternalShutdownException:
-            pass  # __exit__ has shut the context down
 
 
 def _sample(t_ns: int, state: ObjectState) -> Sample:

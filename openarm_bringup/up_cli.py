@@ -20,7 +20,7 @@ STYLES = {"ready": "green", "failed": "bold red", "backoff": "yellow", "exited":
 def up(
     graph: str = "sim",
     *,
-    set_: Annotated[tuple[str, ...], Parameter(name="--set", negative=(), consume_multiple=False)] = (),
+    set_: Annotated[tuple[str, ...], Parameter(name="--set")] = (),
     scene: str | None = None,
     seed: int | None = None,
     mount_seed: str | None = None,

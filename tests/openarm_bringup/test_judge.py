@@ -78,7 +78,11 @@ def test_motion_before_the_last_half_second_does_not_count() -> None:
 
 @given(yaw=st.floats(-math.pi, math.pi), dx=st.floats(-0.1, 0.1))
 def test_yaw_never_counts_as_tilt_and_the_error_is_horizontal(yaw: float, dx: float) -> None:
-    track = [sample(0.0, 0.2, 0.1, 0.43), sample(1.0, *TARGET, 0.6), sample(2.0, TARGET[0] + dx, TARGET[1], 0.43, yaw=yaw)]
+    track = [
+        sample(0.0, 0.2, 0.1, 0.43),
+        sample(1.0, *TARGET, 0.6),
+        sample(2.0, TARGET[0] + dx, TARGET[1], 0.43, yaw=yaw),
+    ]
     verdict = judge(track, TARGET, claimed=True)
     assert verdict.tilt < 1e-6
     assert verdict.place_error == pytest.approx(abs(dx), abs=1e-12)
