@@ -132,8 +132,8 @@ class GraspClient:
             The result; `raise_for_code` turns a failure into an exception.
 
         Raises:
-            OpenArmError: NOT_READY, when no grasp node answers; TIMEOUT; INVALID_ARGUMENT, for a place that is not two or
-                three numbers.
+            OpenArmError: NOT_READY, when no grasp node answers; TIMEOUT; INVALID_ARGUMENT, for a place that is not two
+                or three numbers.
         """
         goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run)
         if place is not None:
@@ -149,9 +149,8 @@ class GraspClient:
                 f"no action /grasp/pick within {self._timeout:g} s: is the graph up (./openarm up), with the same"
                 " ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE?",
             )
-        handle = self._wait(
-            self._client.send_goal_async(goal, self._feedback(on_feedback)), self._timeout, "acceptance"
-        )
+        sent = self._client.send_goal_async(goal, self._feedback(on_feedback))
+        handle = self._wait(sent, self._timeout, "acceptance of the goal")
         if not handle.accepted:
             raise OpenArmError(Code.BUSY, "the grasp node rejected the goal")
         self._goal = handle
@@ -159,7 +158,7 @@ class GraspClient:
             answer = self._wait(handle.get_result_async(), timeout, "the end of the grasp")
         except BaseException:
             # Whatever keeps the caller from waiting (a deadline, Ctrl-C): nobody would see the arm go on.
-            self._wait(handle.cancel_goal_async(), 2.0, "the cancel")
+            _done(handle.cancel_goal_async()).wait(2.0)
             raise
         finally:
             self._goal = None
@@ -187,8 +186,7 @@ class GraspClient:
         return deliver
 
     def _wait(self, future: Future, timeout: float, what: str) -> Any:
-        done = threading.Event()
-        future.add_done_callback(lambda _: done.set())
+        done = _done(future)
         deadline = time.monotonic() + timeout
         while not done.wait(_LOOK_S):
             if self._callback_error is not None:
@@ -207,16 +205,21 @@ class GraspClient:
             self._node.get_logger().debug("the context was shut down")
 
 
+def _done(future: Future) -> threading.Event:
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    return done
+
+
 def _result(message: Pick.Result) -> GraspResult:
     x, y, z = (float(v) for v in xyz(message.place_position))
-    code = Code(message.code) if message.code in Code.__members__ else Code.INTERNAL
     return GraspResult(
-        message.success,
-        code,
-        message.message,
-        message.label,
-        message.arm,
-        message.attempts,
-        (x, y, z),
-        message.duration,
+        success=message.success,
+        code=Code(message.code) if message.code in Code.__members__ else Code.INTERNAL,
+        message=message.message,
+        label=message.label,
+        arm=message.arm,
+        attempts=message.attempts,
+        place_position=(x, y, z),
+        duration=message.duration,
     )

@@ -95,7 +95,9 @@ class GraspNode(BaseNode[GraspConfig]):
             return await self._run(request, on_status)
         except OpenArmError as error:
             self.get_logger().warning(f"grasp of {request.label!r} refused: {error}")
-            self.diagnose(False, f"{error.code}: {error.message}", state=self._machine.state.value)
+            self.diagnose(
+                error.code is not Code.NOT_READY, f"{error.code}: {error.message}", state=self._machine.state.value
+            )
             return GraspOutcome(error.code, error.message, request.label)
         finally:
             self._executor.end()
@@ -108,7 +110,7 @@ class GraspNode(BaseNode[GraspConfig]):
             try:
                 outcome = await self._executor.perform(recipe)
             except Exception as error:
-                # A fault of this program, not of the grasp: the request must still be answered, and the next one served.
+                # A fault of this program: the request must still be answered, and the next one served.
                 self.get_logger().error(traceback.format_exc())
                 outcome = Outcome(Code.INTERNAL, f"{type(error).__name__}: {error}; see the log of the grasp node")
             recipe = self._machine.step(outcome, self._executor.now_ns)
@@ -147,9 +149,8 @@ class GraspNode(BaseNode[GraspConfig]):
             on_status(status)
         if machine.memory is None and machine.outcome is None:
             return
-        self.get_logger().info(
-            f"{status.previous_state} -> {status.state} at {t_ns * 1e-9:.2f} s, attempt {status.attempt}: {status.reason}"
-        )
+        change = f"{status.previous_state} -> {status.state} at {t_ns * 1e-9:.2f} s, attempt {status.attempt}"
+        self.get_logger().info(f"{change}: {status.reason}")
         self.diagnose(True, f"{status.state}: {status.reason}", state=status.state, label=status.label, arm=status.arm)
         memory = machine.memory
         if memory is not None and machine.state in (State.PLAN, State.MOVE_TO_PREGRASP):

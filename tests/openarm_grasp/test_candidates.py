@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Candidates: directions, heights, offsets, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.candidates import (
+    USED_PENALTY,
+    held_box,
+    obstacle_boxes,
+    propose,
+    target_box,
+    tcp_height,
+)
+from openarm_grasp.config import GraspConfig, HandConfig
+from openarm_grasp.observation import Detection
+
+TABLE = 0.40
+CONFIG = GraspConfig()
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def box(x=0.26, y=-0.2, yaw=0.3, size=(0.04, 0.06, 0.05), label="red") -> Detection:
+    T = se3.make(se3.rot_z(yaw), (x, y, TABLE + size[2] / 2.0))
+    return Detection(label, 0.9, T, np.array(size))
+
+
+boxes = st.builds(
+    box,
+    x=st.floats(0.16, 0.36),
+    y=st.floats(-0.42, 0.42),
+    yaw=st.floats(-np.pi, np.pi),
+    size=st.tuples(st.floats(0.04, 0.07), st.floats(0.04, 0.08), st.floats(0.04, 0.115)),
+)
+
+
+@given(boxes)
+def test_b42_the_best_grasp_comes_from_straight_above(target):
+    best = propose(target, CONFIG)[0]
+    assert best.tilt == 0.0
+    assert best.T_base_tcp[:3, 2] @ DOWN >= 0.99
+
+
+@given(boxes)
+def test_b42_each_tilt_leans_by_its_angle(target):
+    for c in propose(target, CONFIG):
+        assert c.T_base_tcp[:3, 2] @ DOWN == pytest.approx(np.cos(c.tilt))
+
+
+@given(boxes)
+def test_b43_opening_axis_is_horizontal_and_parallel_to_an_edge(target):
+    edges = target.T_base_object[:2, :2]
+    for c in propose(target, CONFIG):
+        y_tool = c.T_base_tcp[:3, 1]
+        assert abs(y_tool[2]) < 1e-9
+        assert np.max(np.abs(y_tool[:2] @ edges)) > 1.0 - 1e-9
+
+
+@given(boxes)
+def test_b44_tool_z_is_the_approach_and_tool_y_spans_the_width(target):
+    for c in propose(target, CONFIG):
+        R = c.T_base_tcp[:3, :3]
+        assert pytest.approx(np.eye(3), abs=1e-9) == R @ R.T
+        assert np.linalg.det(R) == pytest.approx(1.0)
+        # Out of the fingers: from the pre-grasp to the grasp.
+        assert -c.approach_offset @ R[:, 2] == pytest.approx(CONFIG.approach.pregrasp_distance)
+        across = abs(R[:, 1] @ target.T_base_object[:3, 0]) > 0.5
+        assert c.width == target.size[0 if across else 1]
+
+
+@given(boxes)
+def test_b45_b46_pregrasp_is_straight_behind_the_grasp(target):
+    for c in propose(target, CONFIG):
+        assert 0.05 <= np.linalg.norm(c.approach_offset) <= 0.08
+        pregrasp = c.T_base_tcp[:3, 3] + c.approach_offset
+        if c.tilt == 0.0:
+            assert pregrasp[2] - c.T_base_tcp[2, 3] == pytest.approx(CONFIG.approach.pregrasp_distance)
+            assert pregrasp[:2] == pytest.approx(target.p_base[:2])
+        assert c.retreat_offset == pytest.approx((0.0, 0.0, CONFIG.approach.lift_height))
+
+
+def test_b46_pregrasp_distance_of_6_cm_is_a_parameter():
+    config = GraspConfig.model_validate({"approach": {"pregrasp_distance": 0.06}})
+    top_down = propose(box(), config)[0]
+    assert top_down.approach_offset[2] == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize("value", [0.04, 0.09])
+def test_b45_pregrasp_distance_is_5_to_8_cm(value):
+    with pytest.raises(ValueError, match="pregrasp_distance"):
+        GraspConfig.model_validate({"approach": {"pregrasp_distance": value}})
+
+
+def test_b48_pregrasp_distance_must_exceed_the_path_tolerance():
+    with pytest.raises(ValueError, match="at least twice path_tolerance"):
+        GraspConfig.model_validate({"approach": {"pregrasp_distance": 0.06, "path_tolerance": 0.035}})
+
+
+@pytest.mark.parametrize(
+    ("height", "tilt_deg", "expected"),
+    [
+        (0.04, 0.0, 0.012),  # the tips decide
+        (0.08, 0.0, 0.035),  # the palm decides: 0.08 - 0.045
+        (0.062, 0.0, 0.017),
+        (0.115, 0.0, 0.070),
+        (0.04, 30.0, 0.021),
+        (0.115, 30.0, 0.085),
+    ],
+)
+def test_tcp_height_clears_tips_and_palm(height, tilt_deg, expected):
+    assert tcp_height(height, np.radians(tilt_deg), HandConfig()) == pytest.approx(expected)
+
+
+@given(boxes)
+def test_tcp_stands_over_the_centre_and_above_the_table(target):
+    for c in propose(target, CONFIG):
+        assert c.T_base_tcp[:2, 3] == pytest.approx(target.p_base[:2])
+        assert c.T_base_tcp[2, 3] >= TABLE + 0.012
+        assert target.top - c.T_base_tcp[2, 3] <= 0.045 + 1e-9
+
+
+def test_a_square_box_offers_both_edges_flips_tilts_and_leans():
+    found = propose(box(size=(0.05, 0.05, 0.05)), CONFIG)
+    assert len(found) == 2 * 2 * (1 + 3 * 2)
+    assert len({c.id for c in found}) == len(found)
+
+
+def test_tilts_are_tried_in_order():
+    tilts = [c.tilt for c in propose(box(), CONFIG)]
+    assert tilts == sorted(tilts)
+
+
+def test_leaning_away_from_the_shoulder_comes_first():
+    found = propose(box(x=0.3, y=-0.15, yaw=np.pi / 2), CONFIG, shoulder_xy=(0.0, -0.15))
+    leaning = next(c for c in found if c.tilt > 0.0 and abs(c.T_base_tcp[0, 2]) > 0.1)
+    assert leaning.T_base_tcp[0, 2] > 0.0
+
+
+def test_score_is_the_sum_of_its_parts():
+    for c in propose(box(), CONFIG):
+        assert c.score == pytest.approx(sum(c.parts.values()))
+        assert set(c.parts) == {"tilt", "width", "side", "used"}
+
+
+def test_a_used_candidate_comes_last():
+    first = propose(box(), CONFIG)[0]
+    again = propose(box(), CONFIG, used=frozenset({first.id}))
+    assert again[-1].id == first.id
+    assert again[-1].parts["used"] == -USED_PENALTY
+
+
+def test_only_the_narrow_edge_of_a_wide_box_is_grasped():
+    found = propose(box(size=(0.05, 0.09, 0.05)), CONFIG)
+    assert {c.width for c in found} == {0.05}
+
+
+def test_b17_too_wide_states_widths_and_limit():
+    with pytest.raises(OpenArmError) as error:
+        propose(box(size=(0.08, 0.09, 0.05)), CONFIG)
+    assert error.value.code is Code.TOO_WIDE
+    assert "80 mm × 90 mm" in error.value.message
+    assert "70 mm" in error.value.message
+
+
+def test_a_70_mm_side_measured_a_millimetre_too_wide_is_still_grasped():
+    assert propose(box(size=(0.071, 0.071, 0.05)), CONFIG)
+
+
+def test_target_box_ends_above_the_table_and_at_the_top():
+    target = box()
+    made = target_box(target, CONFIG)
+    half = made.size[2] / 2.0
+    assert made.T_frame_box[2, 3] - half == pytest.approx(TABLE + CONFIG.approach.table_gap)
+    assert made.T_frame_box[2, 3] + half == pytest.approx(target.top)
+
+
+def test_obstacles_are_inflated_sideways_and_upwards():
+    other = box(label="blue")
+    made = obstacle_boxes([other], CONFIG)[0]
+    assert made.id == "detected/blue_0"
+    assert made.size == pytest.approx(other.size + np.array([0.01, 0.01, 0.005]))
+    assert made.T_frame_box[2, 3] - made.size[2] / 2.0 == pytest.approx(other.bottom)
+
+
+def test_held_box_is_the_target_seen_from_the_hand():
+    target, c = box(), propose(box(), CONFIG)[0]
+    held = held_box(target, c, CONFIG)
+    assert c.T_base_tcp @ held.T_frame_box == pytest.approx(target_box(target, CONFIG).T_frame_box)
+    # Centred between the fingers.
+    assert held.T_frame_box[1, 3] == pytest.approx(0.0, abs=1e-9)

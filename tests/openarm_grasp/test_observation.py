@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From frames to one trusted object."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.observation import Detection, Frame, average, find, in_base, on_table
+
+
+def seen(label="red", x=0.26, y=-0.2, z=0.425, yaw=0.0, size=(0.04, 0.06, 0.05), score=0.9) -> Detection:
+    return Detection(label, score, se3.make(se3.rot_z(yaw), (x, y, z)), np.array(size))
+
+
+def frames(*detections: tuple[Detection, ...]) -> list[Frame]:
+    return [Frame(i * 100_000_000, d) for i, d in enumerate(detections)]
+
+
+def look(seq, label="red"):
+    return find(seq, label, match_radius=0.03, agree_within=0.003)
+
+
+def test_agreeing_frames_are_averaged_and_others_kept():
+    blue = seen("blue", y=-0.35)
+    sighting = look(frames((seen(x=0.260), blue), (seen(x=0.262), blue), (seen(x=0.261), blue)))
+    assert sighting.target.p_base[0] == pytest.approx(0.261)
+    assert [d.label for d in sighting.others] == ["blue"]
+    assert sighting.t_ns == 200_000_000
+
+
+def test_unknown_label_is_refused_with_what_is_in_view():
+    with pytest.raises(OpenArmError) as error:
+        look(frames((seen("red"), seen("blue"))), "mug")
+    assert error.value.code is Code.UNKNOWN_OBJECT
+    assert error.value.message == "no 'mug' in view; in view: blue, red"
+
+
+def test_an_empty_view_says_so():
+    with pytest.raises(OpenArmError) as error:
+        look(frames((), ()))
+    assert error.value.code is Code.NOTHING_DETECTED
+
+
+@pytest.mark.parametrize(
+    "sequence",
+    [
+        ((seen(x=0.26),), (seen(x=0.265),)),  # moves 5 mm
+        ((), (seen(),)),  # has just come
+        ((seen(),), ()),  # has just gone
+        ((seen(x=0.36),), (seen(x=0.26),)),  # somewhere else
+    ],
+)
+def test_an_object_that_moves_or_flickers_is_not_trusted(sequence):
+    with pytest.raises(OpenArmError) as error:
+        look(frames(*sequence))
+    assert error.value.code is Code.STALE_DATA
+
+
+def test_b27_without_a_label_the_highest_score_is_taken():
+    pair = (seen("red", score=0.5), seen("blue", y=0.2, score=0.8))
+    assert look(frames(pair, pair), "").target.label == "blue"
+
+
+@given(st.floats(-3.0, 3.0), st.integers(-2, 2))
+def test_a_box_described_with_swapped_edges_is_the_same_box(yaw, turns):
+    size = (0.04, 0.06, 0.05)
+    turned = (size[1], size[0], size[2]) if turns % 2 else size
+    mean = average([seen(yaw=yaw + turns * np.pi / 2, size=turned), seen(yaw=yaw, size=size)])
+    assert mean.size == pytest.approx(size)
+    assert abs(np.sin(mean.yaw - yaw)) < 1e-6
+
+
+def test_a_box_on_the_table_ends_at_the_table():
+    d = on_table(seen(z=0.43, size=(0.04, 0.04, 0.05)), 0.40)
+    assert d.bottom == pytest.approx(0.40)
+    assert d.top == pytest.approx(0.455)
+
+
+def test_a_box_on_something_else_keeps_its_bottom():
+    d = seen(z=0.50)
+    assert on_table(d, 0.40) is d
+
+
+def test_a_flat_detection_is_refused():
+    with pytest.raises(OpenArmError, match="above the table"):
+        on_table(seen(z=0.39, size=(0.04, 0.04, 0.02)), 0.40)
+
+
+def test_frames_move_to_the_base_frame_at_their_stamps():
+    asked: list[int] = []
+
+    def lookup(t_ns):
+        asked.append(t_ns)
+        return se3.make(p=(0.0, 0.0, 0.4))
+
+    moved = in_base(frames((seen(z=0.025),), (seen(z=0.025),)), lookup)
+    assert asked == [0, 100_000_000]
+    assert moved[1].detections[0].p_base[2] == pytest.approx(0.425)

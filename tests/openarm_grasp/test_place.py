@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Placing: the object's place in the hand, free spots, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.candidates import propose
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.observation import Detection
+from openarm_grasp.place import check_position, free_spots, place_targets, yaw_offsets
+
+CONFIG = GraspConfig()
+TABLE_X, TABLE_Y = (0.11, 0.81), (-0.60, 0.60)
+
+
+def box(x=0.26, y=-0.2, yaw=0.3, size=(0.04, 0.06, 0.05), label="red") -> Detection:
+    return Detection(label, 0.9, se3.make(se3.rot_z(yaw), (x, y, 0.4 + size[2] / 2.0)), np.array(size))
+
+
+@given(st.floats(-3.0, 3.0), st.integers(0, 27), st.floats(0.16, 0.36), st.floats(-0.42, -0.06))
+def test_the_object_keeps_its_place_in_the_hand(yaw, which, x, y):
+    target = box(yaw=yaw)
+    candidate = propose(target, CONFIG)[which % 14]
+    T_tcp_object = se3.inverse(candidate.T_base_tcp) @ target.T_base_object
+    for t in place_targets(target, candidate, [np.array([x, y])], CONFIG):
+        T_base_object = t.T_base_tcp @ T_tcp_object
+        assert T_base_object[:2, 3] == pytest.approx((x, y))
+        # Upright, a millimetre above touching, turned by the offset.
+        assert T_base_object[2, 2] == pytest.approx(1.0)
+        assert T_base_object[2, 3] - target.size[2] / 2.0 == pytest.approx(0.401)
+        turn = target.T_base_object[:3, :3].T @ T_base_object[:3, :3]
+        assert turn == pytest.approx(se3.rot_z(t.yaw_offset), abs=1e-9)
+
+
+def test_the_hand_comes_from_above_and_leaves_along_its_own_axis():
+    candidate = propose(box(), CONFIG)[-1]
+    assert candidate.tilt > 0.7
+    for t in place_targets(box(), candidate, [np.array([0.2, -0.3])], CONFIG):
+        assert t.approach_offset == pytest.approx((0.0, 0.0, CONFIG.approach.pregrasp_distance))
+        assert t.retreat_offset == pytest.approx(-CONFIG.approach.pregrasp_distance * t.T_base_tcp[:3, 2])
+        assert t.position == pytest.approx((0.2, -0.3, 0.4))
+
+
+def test_small_turns_of_every_spot_come_before_large_turns_of_the_first():
+    spots = [np.array([0.2, -0.3]), np.array([0.3, -0.3])]
+    ids = [t.id for t in place_targets(box(), propose(box(), CONFIG)[0], spots, CONFIG)]
+    assert ids[0] == "spot0/yaw+0"
+    assert set(ids[:6]) == {f"spot{i}/yaw{y}" for i in (0, 1) for y in ("+0", "+30", "-30")}
+    assert len(ids) == 24
+
+
+def test_scores_follow_the_order():
+    targets = place_targets(box(), propose(box(), CONFIG)[0], [np.array([0.2, -0.3])], CONFIG)
+    scores = [t.score for t in targets]
+    assert scores == sorted(scores, reverse=True)
+    assert len(set(scores)) == len(scores)
+
+
+@pytest.mark.parametrize(("step", "count"), [(15.0, 24), (30.0, 12), (90.0, 4), (180.0, 2), (100.0, 3)])
+def test_yaw_offsets_go_once_round(step, count):
+    offsets = yaw_offsets(step)
+    assert len(offsets) == count
+    assert offsets[0] == 0.0
+    assert len({round(np.cos(o), 6) + 1j * round(np.sin(o), 6) for o in offsets}) == count
+
+
+@pytest.mark.parametrize("arm", ["left", "right"])
+def test_p19_free_spots_keep_clear_of_neighbours_and_origin(arm):
+    side = 1.0 if arm == "left" else -1.0
+    target, others = (
+        box(y=side * 0.2),
+        [box(x=0.3, y=side * 0.33, label="blue"), box(x=0.2, y=side * 0.1, label="green")],
+    )
+    spots = free_spots(arm, target, others, CONFIG)
+    assert 1 <= len(spots) <= CONFIG.place.spots
+    for spot in spots:
+        assert 0.16 <= spot[0] <= 0.36
+        assert 0.06 <= side * spot[1] <= 0.42
+        assert np.linalg.norm(spot - target.p_base[:2]) >= 0.08
+        assert min(np.linalg.norm(spot - d.p_base[:2]) for d in others) >= 0.10
+
+
+def test_a_full_table_has_no_free_spot():
+    crowd = [box(x=x, y=y, label="blue") for x in np.arange(0.1, 0.5, 0.08) for y in np.arange(-0.5, 0.0, 0.08)]
+    with pytest.raises(OpenArmError) as error:
+        free_spots("right", box(), crowd, CONFIG)
+    assert error.value.code is Code.PLACE_FAILED
+
+
+@pytest.mark.parametrize("position", [(0.05, 0.0), (0.3, 0.7), (float("nan"), 0.1), (0.3, float("inf"), 0.4)])
+def test_a_place_off_the_table_is_refused(position):
+    with pytest.raises(OpenArmError) as error:
+        check_position(position, box(), [], TABLE_X, TABLE_Y)
+    assert error.value.code is Code.INVALID_ARGUMENT
+    assert "not on the table" in error.value.message
+
+
+def test_a_place_on_another_object_is_refused_with_its_name():
+    with pytest.raises(OpenArmError, match="'blue' stands 20 mm") as error:
+        check_position((0.30, -0.30), box(), [box(x=0.32, y=-0.30, label="blue")], TABLE_X, TABLE_Y)
+    assert error.value.code is Code.IN_COLLISION
+
+
+def test_a_place_beside_another_object_is_left_to_the_planner():
+    p = check_position((0.30, -0.30, 9.9), box(), [box(x=0.36, y=-0.30, label="blue")], TABLE_X, TABLE_Y)
+    assert p == pytest.approx((0.30, -0.30))

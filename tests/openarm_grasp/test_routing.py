@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which arm, and the sentence for what no arm reaches."""
+
+from __future__ import annotations
+
+import pytest
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.routing import arm_order, out_of_reach
+
+
+@pytest.mark.parametrize(
+    ("arm", "y", "expected"),
+    [
+        ("auto", 0.30, ("left",)),
+        ("auto", -0.30, ("right",)),
+        ("auto", 0.05, ("left", "right")),
+        ("auto", -0.05, ("right", "left")),
+        ("", -0.30, ("right",)),
+        ("left", -0.30, ("left",)),
+        ("right", 0.30, ("right",)),
+    ],
+)
+def test_p11_arms_by_side_and_overlap(arm, y, expected):
+    assert arm_order(arm, y, 0.12) == expected
+
+
+def test_an_unknown_arm_is_refused_with_the_choices():
+    with pytest.raises(OpenArmError, match="auto, left, right") as error:
+        arm_order("middle", 0.0, 0.12)
+    assert error.value.code is Code.INVALID_ARGUMENT
+
+
+def test_out_of_reach_names_the_nearest_arm_first():
+    text = out_of_reach("'red' at (0.7, 0.0, 0.4) m", {"left": 0.31, "right": 0.23})
+    assert text.index("right arm gets within 230 mm") < text.index("left arm gets within 310 mm")
+
+
+def test_a_point_that_is_reached_but_not_graspable_says_so():
+    assert "no orientation" in out_of_reach("'red'", {"right": 0.0})
