@@ -50,6 +50,23 @@ class Pacer:
         self._due_ns = None
 
 
+class RateDivider:
+    """Which control ticks to use, so that the mean rate is exact though it does not divide that of the ticks.
+
+    Args:
+        rate: Uses a second of simulated time.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self._period_ns = 1e9 / rate
+        self._count: int | None = None
+
+    def due(self, t_ns: int) -> bool:
+        """Whether the tick at `t_ns` is the first of a new period. Ask for every tick, in order."""
+        before, self._count = self._count, int((t_ns + 1) // self._period_ns)  # + 1: rounding loses no border
+        return before is not None and self._count != before
+
+
 class RealTimeFactor:
     """Simulated over wall time in a sliding window.
 

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from openarm_sim_bridge.pacing import Pacer, PeriodMeter, RealTimeFactor
+from openarm_sim_bridge.pacing import Pacer, PeriodMeter, RateDivider, RealTimeFactor
 
 MS = 1_000_000
 
@@ -76,3 +77,14 @@ def test_period_figures() -> None:
     meter.restart()
     meter.add(now + 10**12)
     assert meter.figures().max_ms == 30.0
+
+
+@pytest.mark.parametrize("rate", [5.0, 15.0, 30.0, 33.3, 100.0])
+def test_p24_frames_keep_their_mean_rate_though_it_does_not_divide_the_ticks(rate: float) -> None:
+    divider = RateDivider(rate)
+    start = 123_450_000_000
+    due = [t for t in range(start, start + 60 * 10**9, 10_000_000) if divider.due(t)]
+    assert len(due) == pytest.approx(60 * rate, abs=1)
+    gaps = np.diff(due) * 1e-9
+    assert gaps.max() <= 1.0 / rate + 0.010 + 1e-9
+    assert gaps.min() >= 1.0 / rate - 0.010 - 1e-9

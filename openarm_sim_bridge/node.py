@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `mujoco_bridge`: a simulated robot behind the topics and actions of the real one.
+
+Threads: physics (steps the world at 100 Hz, publishes its state), render (draws the cameras that are watched), and the
+executor (services, actions, commands). They share only what `Simulation.call` and `RenderThread.offer` hand over.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
+
+from openarm_common.cameras import load_cameras
+from openarm_common.errors import OpenArmError
+from openarm_common.node import QOS_COMMAND, BaseNode, reliable, run
+from openarm_common.scene import Scene, load_scene
+from openarm_sim_bridge.action_executor import ArmActionServer, GripperActionServer
+from openarm_sim_bridge.camera_publisher import CameraPublisher
+from openarm_sim_bridge.config import BridgeConfig
+from openarm_sim_bridge.controller import RobotController
+from openarm_sim_bridge.service_executor import SimulationServices
+from openarm_sim_bridge.simulation import Simulation
+from openarm_sim_bridge.stage import Stage
+from openarm_sim_bridge.state_publisher import StatePublisher
+from openarm_sim_bridge.world import JointReadout
+
+WATCH_PERIOD_S = 0.2
+REPORT_PERIOD_S = 1.0
+#: Slower than this share of the asked speed is told as a fault.
+_SLOW = 0.9
+
+
+class MujocoBridge(BaseNode[BridgeConfig]):
+    """The simulation and everything it offers.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID or SCENE_INVALID, when the world can't be made.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("mujoco_bridge", BridgeConfig, **kwargs)
+        config = self.config
+        cameras = load_cameras(Path(config.cameras) if config.cameras else None)
+        scene = load_scene(config.scene, config.seed)
+        stage = Stage(self.description, cameras, config.mount_seed if config.mount_seed >= 0 else None, config.physics)
+        world = stage.world(scene)
+        controller = RobotController(stage.arms(), stage.grippers(), world, config.trajectory, config.gripper)
+        self._controller = controller
+        self._simulation = Simulation(world, controller, self._observe, speed=config.speed)
+        self._simulation.set_paused(config.paused)
+
+        self._states = StatePublisher(
+            self, self.description, world.joint_names, config.tf_rate, config.ground_truth_rate
+        )
+        self._images = CameraPublisher(self, cameras, config.depth_encoding, self._on_render_failure)
+        self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
+
+        self.create_subscription(JointState, "/joint_commands", self._on_command, QOS_COMMAND)
+        self._arms = [ArmActionServer(self, side, arm, self._simulation) for side, arm in controller.arms.items()]
+        self._grippers = [
+            GripperActionServer(self, side, gripper, self._simulation) for side, gripper in controller.grippers.items()
+        ]
+        self._sim_services = SimulationServices(self, stage, scene, self._simulation, self._on_scene)
+
+        self._render_fault = ""
+        self._warned: set[str] = set()
+        self._drawn: dict[str, int] = self._images.rendered
+        self.create_timer(WATCH_PERIOD_S, self._images.poll, clock=self.wall_clock)
+        self.create_timer(REPORT_PERIOD_S, self._report, clock=self.wall_clock)
+
+        self._on_scene(scene)
+        self._simulation.start()
+        self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation is running")
+
+    def close(self) -> None:
+        """Stop physics and drawing, then the rest."""
+        self._simulation.stop()
+        self._images.close()
+        for server in (*self._arms, *self._grippers):
+            server.destroy()
+        super().close()
+
+    def _observe(self, state: JointReadout) -> None:
+        """End of a tick, in the thread of the simulation."""
+        self._states.publish(state, self._simulation.world)
+        self._images.tick(self._simulation.world)
+
+    def _on_command(self, message: JointState) -> None:
+        """Position targets; a part of the joints will do."""
+        logger = self.get_logger()
+        try:
+            command = self._controller.check_command(message.name, message.position)
+        except OpenArmError as error:
+            logger.error(f"/joint_commands refused: {error}", throttle_duration_sec=1.0)
+            return
+        for name in set(command.unknown) - self._warned:
+            self._warned.add(name)
+            known = ", ".join(self._simulation.world.joint_names)
+            logger.warning(f"/joint_commands: unknown joint {name!r} is ignored; joints: {known}")
+        busy = self._controller.busy(command)
+        if busy:
+            names = ", ".join(busy)
+            logger.warning(f"/joint_commands: {names} follow a goal; ignored until it ends", throttle_duration_sec=1.0)
+        self._simulation.call(lambda: self._controller.command(command))
+
+    def _on_scene(self, scene: Scene) -> None:
+        self._states.publish_static(self.description, scene.table.top_z)
+
+    def _on_render_failure(self, error: OpenArmError) -> None:
+        self._render_fault = str(error)
+        self.get_logger().error(f"no images: {error}")
+
+    def _report(self) -> None:
+        """Once a second: how well the simulation keeps up."""
+        simulation, config = self._simulation, self.config
+        factor, period = simulation.real_time_factor.value, simulation.periods.figures()
+        self._real_time_factor.publish(Float64(data=0.0 if simulation.paused else factor))
+        drawn, before = self._images.rendered, self._drawn
+        self._drawn = drawn
+        fault = simulation.fault or self._render_fault
+        slow = not simulation.paused and config.speed > 0.0 and period.n > 100 and factor < _SLOW * config.speed
+        if not fault and slow:
+            fault = f"slower than asked: {factor:.2f} simulated seconds a second, expected {config.speed:g}"
+        self.diagnose(
+            not fault,
+            fault or ("paused" if simulation.paused else "running"),
+            real_time_factor=f"{factor:.3f}",
+            joint_state_period_p50_ms=f"{period.p50_ms:.2f}",
+            joint_state_period_p99_ms=f"{period.p99_ms:.2f}",
+            joint_state_period_max_ms=f"{period.max_ms:.2f}",
+            wall_time_skipped_s=f"{simulation.skipped_s:.2f}",
+            frames_dropped=self._images.dropped,
+            **{f"frames_{name}": count - before[name] for name, count in drawn.items()},
+        )
+
+
+def make() -> MujocoBridge:
+    """Make the node for a process of its own."""
+    # The physics thread must not wait 5 ms (the default) for another thread to let go of the interpreter.
+    sys.setswitchinterval(0.0005)
+    node = MujocoBridge()
+    mujoco.set_mju_user_warning(lambda text: node.get_logger().warning(f"MuJoCo: {text}"))  # not into a file
+    gc.collect()
+    gc.freeze()  # what is there now stays; later collections are short
+    return node
+
+
+def main() -> None:
+    """Run the node."""
+    run(make)
+
+
+if __name__ == "__main__":
+    main()

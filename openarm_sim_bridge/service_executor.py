@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The services of the simulation: reset and exchange the world, pause, step, add an object.
+
+What takes longer than a tick (reading a scene, compiling a model) runs in a worker thread; the world itself changes
+between two ticks, in the thread of the simulation.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeVar
+
+from openarm_interfaces.srv import ResetWorld, SetPause, SpawnObject, StepSimulation
+
+from openarm_common.convert import pose_to_matrix, xyz
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.node import BaseNode
+from openarm_common.scene import Scene, load_scene
+from openarm_sim_bridge.simulation import Simulation
+from openarm_sim_bridge.stage import Stage, with_object
+from openarm_sim_bridge.state_publisher import WORLD_FRAME
+
+T = TypeVar("T")
+
+_ANSWER_S = 1.0
+_STEPPING_S = 60.0
+_UPRIGHT = 1e-3
+
+
+class SimulationServices:
+    """/sim/reset_world, /sim/set_pause, /sim/step, /sim/spawn_object.
+
+    Args:
+        node: Owner.
+        stage: Makes worlds.
+        scene: The scene that the world shows.
+        simulation: Whose world it is.
+        on_scene: Called (in a worker thread) with a scene that was loaded.
+    """
+
+    def __init__(
+        self,
+        node: BaseNode[Any],
+        stage: Stage,
+        scene: Scene,
+        simulation: Simulation,
+        on_scene: Callable[[Scene], None],
+    ) -> None:
+        self._node = node
+        self._stage = stage
+        self._loaded = self._present = scene
+        self._simulation = simulation
+        self._on_scene = on_scene
+        self._changing = threading.Lock()
+        node.create_service(ResetWorld, "/sim/reset_world", self._on_reset)
+        node.create_service(SetPause, "/sim/set_pause", self._on_pause)
+        node.create_service(StepSimulation, "/sim/step", self._on_step)
+        node.create_service(SpawnObject, "/sim/spawn_object", self._on_spawn)
+
+    # --- callbacks
+    async def _on_reset(self, request: ResetWorld.Request, response: ResetWorld.Response) -> ResetWorld.Response:
+        return await self._answer(response, self._node.in_thread(self._reset, request.scene, request.seed))
+
+    async def _on_pause(self, request: SetPause.Request, response: SetPause.Response) -> SetPause.Response:
+        return await self._answer(response, self._node.in_thread(self._pause, request.paused))
+
+    async def _on_step(
+        self, request: StepSimulation.Request, response: StepSimulation.Response
+    ) -> StepSimulation.Response:
+        return await self._answer(response, self._node.in_thread(self._step, request.steps))
+
+    async def _on_spawn(self, request: SpawnObject.Request, response: SpawnObject.Response) -> SpawnObject.Response:
+        return await self._answer(response, self._node.in_thread(self._spawn, request))
+
+    async def _answer(self, response: Any, work: Awaitable[str]) -> Any:
+        try:
+            response.message = await work
+            response.success = True
+        except OpenArmError as error:
+            response.success = False
+            response.message = str(error)
+            self._node.get_logger().warning(str(error))
+        return response
+
+    # --- work, in a worker thread
+    def _reset(self, source: str, seed: int) -> str:
+        with self._changing:
+            if seed < 0:
+                raise OpenArmError(Code.SCENE_INVALID, f"seed is {seed}, expected 0 or more")
+            scene = load_scene(source, seed) if source else self._loaded
+            if scene == self._present:
+                self._between_ticks(self._reset_world)
+            else:
+                compiled = self._stage.compile(self._simulation.world, scene)
+                self._between_ticks(lambda: self._exchange(compiled))
+            self._loaded = self._present = scene
+        self._on_scene(scene)
+        return f"scene {scene.name!r} with {len(scene.objects)} objects"
+
+    def _pause(self, paused: bool) -> str:
+        self._between_ticks(lambda: self._simulation.set_paused(paused))
+        return "paused" if paused else "running"
+
+    def _step(self, steps: int) -> str:
+        stepping = self._between_ticks(lambda: self._simulation.advance(steps))
+        try:
+            t_ns = stepping.result(timeout=_STEPPING_S)
+        except TimeoutError as error:
+            raise OpenArmError(Code.TIMEOUT, f"{steps} steps took more than {_STEPPING_S:.0f} s") from error
+        return f"simulated time is {t_ns * 1e-9:.3f} s"
+
+    def _spawn(self, request: SpawnObject.Request) -> str:
+        with self._changing:
+            scene = with_object(self._present, _object_of(request, self._present.table.top_z))
+            compiled = self._stage.compile(self._simulation.world, scene)
+            self._between_ticks(lambda: self._simulation.world.extend(compiled))
+            self._present = scene
+        return f"{request.name!r} is in the world"
+
+    def _between_ticks(self, fn: Callable[[], T]) -> T:
+        try:
+            return self._simulation.call(fn).result(timeout=_ANSWER_S)
+        except TimeoutError as error:
+            raise OpenArmError(Code.TIMEOUT, f"the physics did not answer within {_ANSWER_S:.0f} s") from error
+
+    # --- between two ticks
+    def _reset_world(self) -> None:
+        self._simulation.world.reset()
+        self._simulation.restart()
+
+    def _exchange(self, compiled: Any) -> None:
+        self._simulation.world.exchange(compiled)
+        self._simulation.restart()
+
+
+def _object_of(request: SpawnObject.Request, table_top_z: float) -> dict[str, Any]:
+    """Keys of a `SceneObject`.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for a frame that is neither table nor world, or a tilted object.
+    """
+    frame = request.pose.header.frame_id or "table"
+    if frame not in ("table", WORLD_FRAME):
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, f"pose is in the frame {frame!r}, expected 'table' (also when empty) or 'world'"
+        )
+    T = pose_to_matrix(request.pose.pose)
+    if T[2, 2] < 1.0 - _UPRIGHT:
+        raise OpenArmError(Code.INVALID_ARGUMENT, "the pose is tilted, expected a turn about z only")
+    x, y, z = (float(v) for v in T[:3, 3])
+    # On the table z = 0 says that the object stands there.
+    stands = frame == "table" and z == 0.0
+    return {
+        "name": request.name,
+        "shape": request.shape,
+        "size": tuple(xyz(request.size).tolist()),
+        "color": request.color,
+        "mass": request.mass,
+        "position": (x, y) if stands else (x, y, z + (table_top_z if frame == "table" else 0.0)),
+        "yaw": math.atan2(T[1, 0], T[0, 0]),
+    }

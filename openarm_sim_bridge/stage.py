@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which world is simulated: the robot and its cameras in a scene that can be exchanged and added to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from openarm_common.cameras import CameraConfig
+from openarm_common.description import SIDES, RobotDescription
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene import Scene, SceneObject, parse_object
+from openarm_sim_bridge.compiled import CompiledWorld, TrackedObject
+from openarm_sim_bridge.model import PhysicsConfig, build_spec
+from openarm_sim_bridge.trajectory import JointGroup
+from openarm_sim_bridge.world import World
+
+
+class Stage:
+    """Makes worlds from scenes.
+
+    Args:
+        description: The robot.
+        cameras: By name.
+        mount_seed: Of the camera mounts' errors; None is the nominal mounts.
+        physics: Solver, contacts, actuators.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        cameras: Mapping[str, CameraConfig],
+        mount_seed: int | None,
+        physics: PhysicsConfig,
+    ) -> None:
+        self._description = description
+        self._cameras = cameras
+        self._mount_seed = mount_seed
+        self._physics = physics
+        self.joint_names = tuple(
+            name for side in SIDES for name in (*description.arm_joints(side), description.finger_joint(side))
+        )
+        self.home: dict[str, float] = {}
+        for side in SIDES:
+            self.home |= description.group_state(f"{side}_arm", "home") | {description.finger_joint(side): 0.0}
+
+    def arms(self) -> dict[str, JointGroup]:
+        """Joint group of each arm, by side."""
+        return {side: self._group(self._description.arm_joints(side)) for side in SIDES}
+
+    def grippers(self) -> dict[str, JointGroup]:
+        """Joint group (the driving finger joint) of each gripper, by side."""
+        return {side: self._group((self._description.finger_joint(side),)) for side in SIDES}
+
+    def world(self, scene: Scene) -> World:
+        """Make a world; the robot stands in its home posture, grippers closed.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when the model can't be built.
+        """
+        spec = build_spec(self._description, scene, self._cameras, self._mount_seed, self._physics)
+        return World(spec, joint_names=self.joint_names, home=self.home, objects=tracked(scene))
+
+    def compile(self, world: World, scene: Scene) -> CompiledWorld:
+        """Compile another scene for a world to take; slow, changes nothing.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when the model can't be built.
+        """
+        spec = build_spec(self._description, scene, self._cameras, self._mount_seed, self._physics)
+        return world.compile(spec, tracked(scene))
+
+    def _group(self, names: tuple[str, ...]) -> JointGroup:
+        lower, upper = self._description.limits(names)
+        return JointGroup(names, lower, upper, self._description.velocity_limits(names))
+
+
+def tracked(scene: Scene) -> tuple[TrackedObject, ...]:
+    """What the judge is told of a scene."""
+    return tuple(TrackedObject(item.name, item.label, item.size) for item in scene.objects)
+
+
+def with_object(scene: Scene, data: Mapping[str, Any]) -> Scene:
+    """Return the scene with one more object.
+
+    Args:
+        scene: The present scene.
+        data: Keys of `SceneObject`.
+
+    Raises:
+        OpenArmError: SCENE_INVALID, when the object is wrong, off the table, or its name is taken.
+    """
+    item: SceneObject = parse_object(data, scene.table, "object")
+    if any(item.name == other.name for other in scene.objects):
+        names = ", ".join(other.name for other in scene.objects)
+        raise OpenArmError(Code.SCENE_INVALID, f"there is an object {item.name!r} already; names in use: {names}")
+    return scene.model_copy(update={"objects": (*scene.objects, item)})
