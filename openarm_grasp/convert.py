@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -117,7 +116,6 @@ def _place_goal(effect: PlanPlace, velocity_scale: float) -> PlanApproach.Goal:
         targets=_targets(effect.targets),
         obstacles=[box_to_msg(box) for box in effect.obstacles],
         attached=[box_to_msg(effect.held)],
-        touchable=[effect.held.id],
         detached_after_approach=True,
         start=start,
         velocity_scale=velocity_scale,
@@ -144,18 +142,10 @@ def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
         OpenArmError: With the planner's code, when it found no plan; INTERNAL, when it chose what was not offered.
     """
     if not result.success:
-        raise OpenArmError(code_from_text(result.code, Code.NO_PLAN), _refusal(result))
+        raise OpenArmError(code_from_text(result.code, Code.NO_PLAN), result.message or "no plan")
     if not 0 <= result.chosen < offered:
         raise OpenArmError(Code.INTERNAL, f"the planner chose target {result.chosen} of {offered}")
     return Planned(result.chosen, result.transfer, result.approach, result.retreat, result.planning_time)
-
-
-def _refusal(result: PlanApproach.Result) -> str:
-    counts = Counter(r.code for r in result.refusals)
-    text = result.message or "no plan"
-    if not counts:
-        return text
-    return f"{text} ({', '.join(f'{n} × {code}' for code, n in counts.most_common())})"
 
 
 def reach_request(arm: str, T_base_tcp: Array) -> ComputeIK.Request:

@@ -59,12 +59,12 @@ def place_targets(
     """
     T_object_tcp = se3.inverse(target.T_base_object) @ candidate.T_base_tcp
     yaws = yaw_offsets(config.place.yaw_step_deg)
-    # Small turns of every spot come first: a hopeless spot must not use up the planner's patience.
-    order = sorted(
-        ((i, yaw) for i in range(len(spots)) for yaw in yaws), key=lambda o: (abs(o[1]) > np.pi / 4.0, o[0], abs(o[1]))
-    )
+    # Small turns of every spot come first: a hopeless spot must not use up the planner's patience. Turns of one spot
+    # score alike, so that the planner takes the one that is near.
+    groups = [(far, i) for far in (False, True) for i in range(len(spots))]
+    order = [(rank, i, yaw) for rank, (far, i) in enumerate(groups) for yaw in yaws if (abs(yaw) > np.pi / 4.0) == far]
     found: list[PlaceTarget] = []
-    for rank, (i, yaw) in enumerate(order):
+    for rank, i, yaw in order:
         x, y = float(spots[i][0]), float(spots[i][1])
         p = np.array([x, y, target.p_base[2] + config.place.release_height])
         T_base_tcp = se3.make(se3.rot_z(yaw) @ target.T_base_object[:3, :3], p) @ T_object_tcp

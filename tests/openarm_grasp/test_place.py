@@ -59,7 +59,7 @@ def test_scores_follow_the_order():
     targets = place_targets(box(), propose(box(), CONFIG)[0], [np.array([0.2, -0.3])], CONFIG)
     scores = [t.score for t in targets]
     assert scores == sorted(scores, reverse=True)
-    assert len(set(scores)) == len(scores)
+    assert len(set(scores)) == 2  # small turns, large turns
 
 
 @pytest.mark.parametrize(("step", "count"), [(15.0, 24), (30.0, 12), (90.0, 4), (180.0, 2), (100.0, 3)])
