@@ -13,6 +13,8 @@ Level = Literal["ok", "note", "error"]
 #: The one ROS distribution that the suite is built for, and the major version of its rclpy.
 DISTRO = "jazzy"
 RCLPY_MAJOR = 7
+#: UDP ports that fifty participants of a domain take from its first one on.
+PORTS = 110
 PYTHONS = ((3, 11), (3, 12), (3, 13))
 
 #: distribution → (lowest version, first that does not do, what it is for); mujoco is the first that is looked at.
@@ -157,11 +159,11 @@ def check_domain(text: str, first_ephemeral_port: int) -> Finding:
     """Judge ROS_DOMAIN_ID: a number, and its ports below those that the system gives to other programs."""
     if not text.isdecimal() or int(text) > 232:
         return Finding("domain", "error", f"ROS_DOMAIN_ID={text!r}", "set a number from 0 to 101")
-    last_port = 7400 + 250 * int(text) + 249
+    last_port = 7400 + 250 * int(text) + PORTS
     if last_port >= first_ephemeral_port:
         advice = f"its UDP ports (up to {last_port}) can be taken by other programs; choose one from 0 to 101"
         return Finding("domain", "note", f"ROS_DOMAIN_ID={text}", advice)
-    return Finding("domain", "ok", f"ROS_DOMAIN_ID={text}, UDP ports {last_port - 249} to {last_port}")
+    return Finding("domain", "ok", f"ROS_DOMAIN_ID={text}, UDP ports {last_port - PORTS} to {last_port}")
 
 
 def check_ports(taken: Sequence[int], domain: int) -> Finding:

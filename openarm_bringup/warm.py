@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m openarm_bringup.warm`: compile every numba kernel once, so that no node waits for it at its first use."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from openarm_common.cameras import Intrinsics
+from openarm_motion.warm import warm as warm_motion
+from openarm_perception.depth import Deprojector, DepthLimits
+
+
+def warm_perception() -> None:
+    """Run the depth kernels with both encodings."""
+    intrinsics = Intrinsics.from_fovy(8, 6, 1.0)
+    deprojector = Deprojector(DepthLimits())
+    for depth in (np.full((6, 8), 500, np.uint16), np.full((6, 8), 0.5, np.float32)):
+        deprojector.organised(depth, intrinsics)
+        deprojector.valid_points(depth, intrinsics)
+
+
+def main() -> None:
+    """Warm all packages that have kernels."""
+    warm_perception()
+    warm_motion()
+
+
+if __name__ == "__main__":
+    main()

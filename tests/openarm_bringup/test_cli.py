@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: exit codes, JSON, one clear sentence for every error and never a traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from openarm_bringup import cli, graph_cli, runs
+from openarm_bringup.checks_cli import _in_order
+from openarm_bringup.demo import parse_seeds
+from openarm_bringup.outcome import Outcome
+from openarm_common.errors import Code, OpenArmError
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(autouse=True)
+def own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "xdg").mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "xdg"))
+    monkeypatch.setenv("OPENARM_RUNS", str(tmp_path / "runs"))
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+
+
+@pytest.mark.parametrize(
+    ("argv", "path", "rest"),
+    [
+        (["ps"], None, ["ps"]),
+        (["ps", "--json"], "-", ["ps"]),
+        (["--json", "pick", "red"], "-", ["pick", "red"]),
+        (["pick", "--json", "red"], "-", ["pick", "red"]),
+        (["ps", "--json", "a/b.json"], "a/b.json", ["ps"]),
+        (["ps", "--json=out.txt"], "out.txt", ["ps"]),
+        (["test", "--", "--json"], None, ["test", "--", "--json"]),
+    ],
+)
+def test_json_may_stand_anywhere_and_its_path_is_optional(argv: list[str], path: str | None, rest: list[str]) -> None:
+    assert cli.take_json(argv) == (rest, path)
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["frobnicate"], "Unknown command"),
+        (["up", "no_such_graph"], "no graph 'no_such_graph'; give a file, or one of"),
+        (["up", "--set", "grasp"], "expected node.param=value"),
+        (["up", "--set", "nobody.x=1"], "has no node 'nobody'; its nodes are"),
+        (["up", "--domain", "many"], "--domain"),
+        (["pick", "red", "--arm", "third"], "third"),
+        (["pick", "red", "--place", "1", "2"], "--place"),
+        (["demo", "--seeds", "9-3"], "expected numbers such as 0-19"),
+        (["logs", "grasp", "--run", "nope"], "there is no run 'nope'"),
+        (["model", "step"], "step"),
+    ],
+)
+def test_wrong_call_ends_with_2_and_one_sentence(
+    argv: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.run(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("openarm: INVALID_ARGUMENT: ")
+    assert words in err
+    assert "Traceback" not in err
+
+
+def test_refused_call_is_json_too(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["up", "no_such_graph", "--json"]) == 2
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["success"] is False
+    assert answer["code"] == "INVALID_ARGUMENT"
+
+
+def test_failure_ends_with_1_and_its_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("nodes: {a: {module: x, needs: [b]}}")
+    assert cli.run(["graph", "check", str(bad)]) == 1
+    assert "CONFIG_INVALID" in capsys.readouterr().err
+
+
+def test_missing_module_is_named_by_graph_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("nodes: {a: {module: no_such_package.node}}")
+    assert cli.run(["graph", "check", str(bad)]) == 1
+    assert "there is no module no_such_package.node" in capsys.readouterr().err
+
+
+def test_every_graph_of_the_suite_is_sound() -> None:
+    """B-66: each step of the bring-up is a graph of its own."""
+    listed = graph_cli.list_().data["graphs"]
+    assert set(listed) >= {"sim", "sim_only", "perception", "motion"}
+    for name in listed:
+        assert graph_cli.check(name).success, name
+
+
+def test_draw_writes_json_to_a_file_and_text_to_stdout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sink = tmp_path / "deep" / "graph.json"
+    assert cli.run(["graph", "draw", "sim", "--form", "mermaid", "--json", str(sink)]) == 0
+    assert capsys.readouterr().out.startswith("flowchart LR")
+    answer = json.loads(sink.read_text())
+    assert answer["success"] is True
+    assert ["detector", "grasp", ["/detections_3d"]] in answer["edges"]
+
+
+def test_ps_and_logs_find_a_running_graph(capsys: pytest.CaptureFixture[str]) -> None:
+    import psutil
+
+    assert cli.run(["ps", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["graphs"] == []
+    me = psutil.Process()
+    folder = runs.new_run_dir()
+    (folder / "logs" / "arm.log").write_text("one\ntwo\nthree\n")
+    node = runs.NodeRecord(state="ready", pid=me.pid, restarts=1, log=str(folder / "logs" / "arm.log"))
+    record = runs.RunRecord(
+        graph="toy",
+        pid=me.pid,
+        pid_created=me.create_time(),
+        domain=5,
+        discovery="localhost",
+        run_dir=str(folder),
+        started="2026-01-01T00:00:00",
+        ready=True,
+        nodes={"arm": node},
+    )
+    runs.write_record(record)
+    assert cli.run(["ps", "--seconds", "0.05"]) == 0
+    text = capsys.readouterr().out
+    assert "toy: ready, domain 5" in text
+    assert str(me.pid) in text
+    assert cli.run(["logs", "arm", "-n", "2"]) == 0
+    assert capsys.readouterr().out == "two\nthree\n"
+    assert cli.run(["logs", "leg"]) == 2
+    assert "it has arm" in capsys.readouterr().err
+    assert runs.the_running().domain == 5
+    with pytest.raises(OpenArmError, match=r"no graph is running in domain 6; running: toy in domain 5"):
+        runs.the_running(6)
+
+
+def test_record_of_another_process_with_the_same_number_is_not_alive() -> None:
+    record = runs.RunRecord(
+        graph="toy", pid=os.getpid(), pid_created=1.0, domain=0, discovery="localhost", run_dir="", started="", nodes={}
+    )
+    path = runs.write_record(record)
+    assert runs.running() == []
+    assert not path.exists()
+
+
+def test_run_folders_never_collide(tmp_path: Path) -> None:
+    folders = [runs.new_run_dir(tmp_path) for _ in range(3)]
+    assert len(set(folders)) == 3
+    assert (tmp_path / "latest").resolve() == folders[-1]
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("0-3", (0, 1, 2, 3)), ("7", (7,)), ("1,4,7-9", (1, 4, 7, 8, 9)), ("5-5", (5,))]
+)
+def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "-3", "3-", "a", "3-1", "1,,2", "1.5"])
+def test_wrong_seeds_are_refused(text: str) -> None:
+    with pytest.raises(OpenArmError) as caught:
+        parse_seeds(text)
+    assert caught.value.code == Code.INVALID_ARGUMENT
+
+
+def test_tests_run_from_quick_to_slow() -> None:
+    paths = _in_order(ROOT / "tests")
+    assert paths[-1] == "tests/graph"
+    assert paths.index("tests/openarm_bringup") < paths.index("tests/graph")
+    assert "tests/conftest.py" not in paths
+
+
+def test_outcome_exit_codes() -> None:
+    assert Outcome(True).exit_code == 0
+    assert Outcome(False, "no", Code.NO_PLAN).exit_code == 1
+    assert Outcome(False, "no", Code.NO_PLAN, {"a": 1}).as_json() == {
+        "success": False,
+        "code": "NO_PLAN",
+        "message": "no",
+        "a": 1,
+    }
+
+
+def test_help_is_quick_and_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from openarm_bringup import cli\n"
+        "try: cli.run(['--help'])\n"
+        "finally: print([m for m in ('rclpy', 'mujoco', 'cv2', 'numba', 'scipy', 'numpy') if m in sys.modules])"
+    )
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done: subprocess.CompletedProcess[str] | None = None
+    best = 9.0
+    for _ in range(3):
+        began = time.monotonic()
+        done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
+        best = min(best, time.monotonic() - began)
+    assert done is not None
+    assert done.stdout.rstrip().endswith("[]")
+    # Idle, it takes 0.4 s; tests run beside other work.
+    assert best < 1.5

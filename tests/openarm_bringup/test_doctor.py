@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Doctor: each fault of a machine is found and has an advice."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from openarm_bringup import cli, doctor
+from openarm_bringup.environment import check_shm, shm_need_mib
+from openarm_bringup.graph import load_graph
+from openarm_common.errors import Code, OpenArmError
+
+GOOD = {
+    "mujoco": "4.0.0",
+    "opencv-python-headless": "4.14.0.94",
+    "numpy": "2.4.6",
+    "scipy": "1.17.1",
+    "numba": "0.68.1",
+    "pin": "4.1.0",
+    "ompl": "2.0.1",
+    "ruckig": "0.19.4",
+    "pydantic": "2.14.3",
+}
+PREFIX = "/home/me/suite/.venv"
+WHEEL = f"{PREFIX}/lib/python3.11/site-packages/rclpy/__init__.py"
+NATIVE = "/opt/ros/jazzy/lib/python3.12/site-packages/rclpy/__init__.py"
+
+
+def test_a08_the_simulators_version_is_the_first_check() -> None:
+    first = doctor.check_versions(GOOD)[0]
+    assert (first.name, first.level) == ("mujoco", "ok")
+    assert "4.0.0" in first.seen
+
+
+@pytest.mark.parametrize(
+    ("name", "version"), [("mujoco", "3.9.1"), ("opencv-python-headless", "5.0.1"), ("ompl", "1.7.0")]
+)
+def test_b08_wrong_versions_are_errors_with_the_wanted_range(name: str, version: str) -> None:
+    findings = {f.name: f for f in doctor.check_versions({**GOOD, name: version})}
+    assert findings[name].level == "error"
+    assert "needs >=" in findings[name].advice
+    assert all(f.level == "ok" for key, f in findings.items() if key != name)
+
+
+def test_missing_package_is_an_error() -> None:
+    findings = doctor.check_versions({k: v for k, v in GOOD.items() if k != "pin"})
+    assert [f.name for f in findings if f.level == "error"] == ["pin"]
+
+
+@pytest.mark.parametrize(
+    ("environ", "file", "words"),
+    [
+        (
+            {"AMENT_PREFIX_PATH": "/opt/ros/humble:/opt/ros/jazzy"},
+            NATIVE,
+            "several ROS distributions are sourced: humble, jazzy",
+        ),
+        ({"ROS_DISTRO": "humble", "PYTHONPATH": "/opt/ros/humble/lib"}, WHEEL, "ROS humble is sourced"),
+        ({"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": "/opt/ros/jazzy"}, WHEEL, "but rclpy comes from the wheels"),
+    ],
+)
+def test_b09_more_than_one_ros_is_an_error(environ: dict[str, str], file: str, words: str) -> None:
+    (finding,) = doctor.check_ros(environ, file, "7.1.6", PREFIX)
+    assert finding.level == "error"
+    assert words in finding.seen
+    assert finding.advice
+
+
+def test_wheels_alone_and_native_jazzy_alone_are_both_fine() -> None:
+    assert doctor.check_ros({}, WHEEL, "7.1.6", PREFIX)[0].level == "ok"
+    native = {"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": "/opt/ros/jazzy"}
+    assert doctor.check_ros(native, NATIVE, "7.1.2", "/usr")[0].level == "ok"
+
+
+def test_rclpy_of_another_distribution_and_none_at_all_are_errors() -> None:
+    assert doctor.check_ros({}, WHEEL, "3.3.13", PREFIX)[0].level == "error"
+    assert "cannot be imported" in doctor.check_ros({}, None, "", PREFIX)[0].seen
+
+
+def test_b11_opencv_with_a_window_system_is_an_error() -> None:
+    both = doctor.check_opencv({**GOOD, "opencv-python": "4.14.0"}, links_gl=False)
+    assert both.level == "error"
+    assert "uninstall opencv-python," in both.advice
+    assert doctor.check_opencv(GOOD, links_gl=True).level == "error"
+    assert doctor.check_opencv(GOOD, links_gl=False).level == "ok"
+
+
+def test_64_mb_of_shared_memory_are_enough_for_the_whole_graph() -> None:
+    """A container's default; the figure comes from the graph, not from a constant."""
+    need = shm_need_mib(load_graph("sim"), extra_participants=4)
+    assert 30 < need < 62
+    assert doctor.check_shm(64.0, 63.0, need, "sim").level == "ok"
+
+
+def test_too_little_shared_memory_is_an_error_with_what_to_do() -> None:
+    need = shm_need_mib(load_graph("sim"), extra_participants=4)
+    full = doctor.check_shm(64.0, 20.0, need, "sim")
+    assert full.level == "error"
+    assert "fastdds shm clean" in full.advice
+    small = doctor.check_shm(16.0, 16.0, need, "sim")
+    assert "--shm-size" in small.advice
+    with pytest.raises(OpenArmError) as caught:
+        check_shm(load_graph("sim"), free_mib=20.0)
+    assert caught.value.code == Code.ENVIRONMENT
+    assert "20 MiB are free" in caught.value.message
+
+
+def test_a10_no_display_is_fine_and_a_failing_renderer_names_one_that_works() -> None:
+    assert doctor.check_machine(2, 8.0, 0.3, display=False, wsl=True).level == "ok"
+    assert doctor.check_gl({"egl": 12.0, "osmesa": "failed"}, "egl").level == "ok"
+    other = doctor.check_gl({"egl": "failed", "osmesa": 30.0}, "egl")
+    assert (other.level, other.advice) == ("error", "set MUJOCO_GL=osmesa")
+    assert "apt-get install libegl1" in doctor.check_gl({"egl": "failed", "osmesa": "failed"}, "egl").advice
+
+
+@pytest.mark.parametrize(
+    ("text", "level"), [("0", "ok"), ("101", "ok"), ("102", "note"), ("250", "error"), ("x", "error")]
+)
+def test_domain(text: str, level: str) -> None:
+    assert doctor.check_domain(text, 32768).level == level
+
+
+@pytest.mark.parametrize(
+    ("version", "system", "machine", "level"),
+    [
+        ((3, 11), "Linux", "x86_64", "ok"),
+        ((3, 13), "Linux", "x86_64", "ok"),
+        ((3, 14), "Linux", "x86_64", "error"),
+        ((3, 12), "Linux", "aarch64", "error"),
+        ((3, 12), "Darwin", "arm64", "error"),
+    ],
+)
+def test_n17_python_and_machine(version: tuple[int, int], system: str, machine: str, level: str) -> None:
+    assert doctor.check_python(version, system, machine).level == level
+
+
+def test_environment_that_changes_discovery_is_noted() -> None:
+    notes = doctor.check_rmw({"ROS_LOCALHOST_ONLY": "1", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"})
+    assert [finding.level for finding in notes] == ["note", "note"]
+    assert [finding.level for finding in doctor.check_rmw({})] == ["ok", "ok"]
+
+
+@pytest.mark.slow
+def test_b10_doctor_of_this_machine_checks_ros_simulator_and_planner(capsys: pytest.CaptureFixture[str]) -> None:
+    code = cli.run(["doctor", "--json"])
+    answer = json.loads(capsys.readouterr().out)
+    names = [finding["name"] for finding in answer["findings"]]
+    assert names[0] == "mujoco"
+    assert {"ros", "simulator", "planner", "messages", "rendering", "/dev/shm", "domain", "ports"} <= set(names)
+    errors = [finding for finding in answer["findings"] if finding["level"] == "error"]
+    assert code == (1 if errors else 0)
+    assert errors == []
