@@ -78,33 +78,33 @@ class BaseNode(Node, Generic[ConfigT]):
         super().__init__(name, **kwargs)
         data = _declare(self, model, "")
         self.config: ConfigT = validate(model, data, f"parameters of {self.get_fully_qualified_name()}")
-        self._pool = ThreadPoolExecutor(max_workers=4, thread_name_prefix=name)
-        self._description: RobotDescription | None = None
-        self._status = DiagnosticStatus(level=DiagnosticStatus.STALE, name=f"{name}: status", hardware_id="openarm")
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+        self.__pool = ThreadPoolExecutor(max_workers=4, thread_name_prefix=name)
+        self.__description: RobotDescription | None = None
+        self.__status = DiagnosticStatus(level=DiagnosticStatus.STALE, name=f"{name}: status", hardware_id="openarm")
+        self.__diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
         self.wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0, self._publish_diagnostics, clock=self.wall_clock)
+        self.create_timer(1.0, self.__publish_diagnostics, clock=self.wall_clock)
 
     @property
     def default_callback_group(self) -> CallbackGroup:
         """Callbacks of a node may overlap at their awaits: a coroutine that waits must not keep the others from running."""
-        if not hasattr(self, "_reentrant_group"):
-            self._reentrant_group = ReentrantCallbackGroup()
-        return self._reentrant_group
+        if not hasattr(self, "_BaseNode__group"):  # asked for in the constructor of Node
+            self.__group = ReentrantCallbackGroup()
+        return self.__group
 
     @property
     def description(self) -> RobotDescription:
         """The robot, loaded at first use."""
-        if self._description is None:
-            self._description = RobotDescription.load()
-        return self._description
+        if self.__description is None:
+            self.__description = RobotDescription.load()
+        return self.__description
 
     def diagnose(self, ok: bool, message: str, **values: object) -> None:
         """Set what /diagnostics says of this node once a second."""
-        status = DiagnosticStatus(name=self._status.name, hardware_id=self._status.hardware_id, message=message)
+        status = DiagnosticStatus(name=self.__status.name, hardware_id=self.__status.hardware_id, message=message)
         status.level = DiagnosticStatus.OK if ok else DiagnosticStatus.ERROR
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        self._status = status
+        self.__status = status
 
     def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Future:
         """Run `fn` in a worker thread; await the returned future in a coroutine callback.
@@ -123,17 +123,17 @@ class BaseNode(Node, Generic[ConfigT]):
             if self.executor is not None:
                 self.executor.wake()
 
-        self._pool.submit(work)
+        self.__pool.submit(work)
         return future
 
     def close(self) -> None:
         """Stop what the node runs beside the executor; subclasses with threads extend this."""
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self.__pool.shutdown(wait=True, cancel_futures=True)
 
-    def _publish_diagnostics(self) -> None:
-        message = DiagnosticArray(status=[self._status])
+    def __publish_diagnostics(self) -> None:
+        message = DiagnosticArray(status=[self.__status])
         message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+        self.__diagnostics.publish(message)
 
 
 def _declare(node: Node, model: type[BaseModel], prefix: str) -> dict[str, Any]:
