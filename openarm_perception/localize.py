@@ -39,7 +39,6 @@ _MARGIN = 4
 class LocalizerConfig(Config):
     """What counts as the object in the depth image."""
 
-    depth: DepthLimits = Field(DepthLimits(near=0.07, far=2.0), description="depths that count")
     min_points: int = Field(40, ge=12, description="fewest pixels with depth on the object")
     table_margin: float = Field(0.008, gt=0.0, le=0.05, description="what is lower above the table is table, m")
     top_band: float = Field(0.003, gt=0.0, le=0.02, description="points within this of the top's height are top, m")
@@ -55,7 +54,7 @@ class Detection3D:
     """An object in the base frame.
 
     Attributes:
-        label: What it is.
+        source: The detection in the image.
         score: How certain, 0 to 1; less for what is partly hidden.
         T_base_object: (4, 4); origin in the middle of the object, x along the smaller horizontal extent, z up.
         size: Smaller and larger horizontal extent, height, m.
@@ -65,7 +64,7 @@ class Detection3D:
         method: `rectangle` or `circle` through the outline of the top; `bound`: rectangle around all points.
     """
 
-    label: str
+    source: Detection2D
     score: float
     T_base_object: Array
     size: tuple[float, float, float]
@@ -73,6 +72,11 @@ class Detection3D:
     points: int
     visible: float
     method: footprint.Kind
+
+    @property
+    def label(self) -> str:
+        """What it is."""
+        return self.source.label
 
     @property
     def position(self) -> Array:
@@ -101,11 +105,13 @@ class Localizer:
 
     Args:
         config: What counts as the object.
+        limits: Depths that the camera can be trusted with.
         table_height: Height of the table in the base frame, m.
     """
 
-    def __init__(self, config: LocalizerConfig, table_height: float) -> None:
+    def __init__(self, config: LocalizerConfig, limits: DepthLimits, table_height: float) -> None:
         self.config = config
+        self.limits = limits
         self.table_height = table_height
 
     def coarse(self, found: Detection2D, depth: DepthImage, intrinsics: Intrinsics, T_base_camera: Array) -> Array:
@@ -176,7 +182,7 @@ class Localizer:
         u0, u1 = max(u - _MARGIN, 0), min(u + w + _MARGIN, intrinsics.width)
         v0, v1 = max(v - _MARGIN, 0), min(v + h + _MARGIN, intrinsics.height)
         z = depth[v0:v1, u0:u1] * scale
-        z = np.where((z >= self.config.depth.near) & (z <= self.config.depth.far), z, np.nan)
+        z = np.where((z >= self.limits.near) & (z <= self.limits.far), z, np.nan)
         z, noise = _denoise(z)
         x = (np.arange(u0, u1) - intrinsics.cx) / intrinsics.fx
         y = (np.arange(v0, v1) - intrinsics.cy) / intrinsics.fy
@@ -194,7 +200,7 @@ class Localizer:
             raise OpenArmError(
                 Code.BAD_IMAGE,
                 f"{found.label} at pixel {_pixel(found)} has {count} of {found.area} pixels with a depth of"
-                f" {self.config.depth.near} to {self.config.depth.far} m, expected at least {self.config.min_points}",
+                f" {self.limits.near} to {self.limits.far} m, expected at least {self.config.min_points}",
             )
         gate = np.abs(patch.z - np.median(patch.z[valid])) <= self.config.depth_gate
         return valid & gate
@@ -250,7 +256,7 @@ class Localizer:
         covariance[:3, :3] = R @ np.diag(std**2) @ R.T
         covariance[5, 5] = shape.yaw_std**2
         size = (*shape.size, height)
-        return Detection3D(found.label, found.score * visible, T, size, covariance, count, visible, shape.kind)
+        return Detection3D(found, found.score * visible, T, size, covariance, count, visible, shape.kind)
 
 
 def _pixel(found: Detection2D) -> str:

@@ -14,6 +14,7 @@ import pytest
 from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
+from openarm_perception.depth import DepthLimits
 from openarm_perception.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.localize import Localizer, LocalizerConfig
 
@@ -38,7 +39,7 @@ def detector() -> ColorDetector:
 @pytest.fixture(scope="module")
 def localizer(tabletop) -> Localizer:
     """The localiser with its defaults."""
-    return Localizer(LocalizerConfig(), tabletop.table_height)
+    return Localizer(LocalizerConfig(), DepthLimits(near=0.07), tabletop.table_height)
 
 
 def locate(localizer: Localizer, detector: ColorDetector, view, label: str, depth=None):
@@ -226,7 +227,7 @@ def test_missing_depth_and_flat_things_are_refused_by_name(tabletop, detector, l
     sheet = tabletop.render([tabletop.Thing("red", "box", (0.06, 0.06, 0.002), 0.25, 0.2)])
     error = refusal(localizer, detector.detect(sheet.rgb)[0], sheet)
     assert (error.code, "above the table" in error.message) == (Code.NOTHING_DETECTED, True)
-    error = refusal(Localizer(LocalizerConfig(), 0.5), found, view)
+    error = refusal(Localizer(LocalizerConfig(), localizer.limits, 0.5), found, view)
     assert "table height wrong" in error.message
 
 

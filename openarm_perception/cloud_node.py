@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `cloud`: depth images to point clouds in the optical frame; each camera only while somebody wants its points."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, cast
+
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+from openarm_common.convert import cloud_from_points, image_to_array, intrinsics_from_info, stamp_to_ns
+from openarm_common.errors import OpenArmError
+from openarm_common.node import QOS_NEWEST, QOS_SENSOR, BaseNode, run
+from openarm_perception.config import CloudNodeConfig, camera_of
+from openarm_perception.convert import check_frames
+from openarm_perception.depth import Deprojector, DepthImage, DepthLimits
+from openarm_perception.matching import StampMatcher
+
+
+class _Camera:
+    """The streams of one camera."""
+
+    def __init__(self, node: CloudNode, name: str) -> None:
+        camera = camera_of(name)
+        self._node = node
+        self._name = name
+        self._frame_id = camera.optical_frame
+        self._deprojector = Deprojector(DepthLimits(near=camera.near, far=camera.far))
+        self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(("depth", "info"), self._on_frame)
+        self._inputs: list[Subscription] = []
+        topic = node.config.points_topic.format(camera=name)
+        self._points = node.create_publisher(PointCloud2, topic, QOS_SENSOR)
+        self.frames = 0
+        self.fault = ""
+        self.elapsed_ms = 0.0
+
+    @property
+    def active(self) -> bool:
+        return bool(self._inputs)
+
+    def follow_demand(self) -> None:
+        """Listen to the camera while somebody wants its points."""
+        wanted = self._points.get_subscription_count() > 0
+        if wanted and not self._inputs:
+            self._subscribe("depth", Image, self._node.config.depth_topic)
+            self._subscribe("info", CameraInfo, self._node.config.info_topic)
+        elif not wanted and self._inputs:
+            for subscription in self._inputs:
+                self._node.destroy_subscription(subscription)
+            self._inputs.clear()
+            self._matcher.clear()
+            self.fault = ""
+
+    def _subscribe(self, stream: str, kind: type[Image | CameraInfo], topic: str) -> None:
+        def add(message: Image | CameraInfo) -> None:
+            self._matcher.add(stream, stamp_to_ns(message.header.stamp), message)
+
+        name = topic.format(camera=self._name)
+        self._inputs.append(self._node.create_subscription(kind, name, add, QOS_NEWEST))
+
+    def _on_frame(self, t_ns: int, messages: dict[str, Image | CameraInfo]) -> None:
+        depth, info = cast(Image, messages["depth"]), cast(CameraInfo, messages["info"])
+        try:
+            check_frames(messages, self._frame_id)
+            started = time.perf_counter()
+            deproject = self._deprojector.organised if self._node.config.organised else self._deprojector.valid_points
+            points = deproject(cast(DepthImage, image_to_array(depth)), intrinsics_from_info(info))
+            self.elapsed_ms = (time.perf_counter() - started) * 1e3
+        except OpenArmError as error:
+            self.fault = f"{self._name}: frame refused: {error.message}"
+            self._node.get_logger().warning(self.fault, throttle_duration_sec=5.0)
+            return
+        self._points.publish(cloud_from_points(points, self._frame_id, t_ns))
+        self.fault = ""
+        self.frames += 1
+
+
+class CloudNode(BaseNode[CloudNodeConfig]):
+    """Publishes clouds while asked to."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("cloud", CloudNodeConfig, **kwargs)
+        self._cameras = {name: _Camera(self, name) for name in self.config.cameras}
+        self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
+
+    def _follow_demand(self) -> None:
+        for camera in self._cameras.values():
+            camera.follow_demand()
+        faults = [camera.fault for camera in self._cameras.values() if camera.fault]
+        active = [name for name, camera in self._cameras.items() if camera.active]
+        message = "; ".join(faults) or (f"clouds of {', '.join(active)}" if active else "idle: nobody listens")
+        values = {f"{name}_frames": camera.frames for name, camera in self._cameras.items()}
+        times = {f"{name}_ms": f"{camera.elapsed_ms:.2f}" for name, camera in self._cameras.items()}
+        self.diagnose(not faults, message, **values, **times)
+
+
+def main() -> None:
+    """Run the node."""
+    run(CloudNode)
+
+
+if __name__ == "__main__":
+    main()

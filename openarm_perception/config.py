@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the nodes of this package."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from openarm_common.cameras import CameraConfig, load_cameras
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+from openarm_perception.detector import Policy
+from openarm_perception.localize import LocalizerConfig
+
+
+class DetectNodeConfig(Config):
+    """Parameters of the node `detector`."""
+
+    camera: str = Field("overhead", description="camera of cameras.yaml; gives frame and depth limits")
+    color_topic: str = Field("/{camera}/color/image_raw", description="colour image; {camera} is filled in")
+    depth_topic: str = Field("/{camera}/depth/image_raw", description="aligned depth image; {camera} is filled in")
+    info_topic: str = Field("/{camera}/depth/camera_info", description="CameraInfo of both; {camera} is filled in")
+    colors: str = Field("", description="YAML of the colours; empty is config/params/detector.yaml")
+    table_height: float = Field(0.40, ge=-1.0, le=2.0, description="of the table in the base frame, m")
+    policy: Policy = Field("score", description="which detection comes first: most certain, or nearest to the centre")
+    label: str = Field("", description="only objects of this name; empty takes all")
+    max_rate: float = Field(10.0, gt=0.0, le=60.0, description="most frames processed a second of the stamps, Hz")
+    transform_wait: float = Field(0.5, ge=0.0, le=5.0, description="longest wait for the camera's pose, s")
+    localizer: LocalizerConfig = LocalizerConfig()
+
+
+class CloudNodeConfig(Config):
+    """Parameters of the node `cloud`."""
+
+    cameras: tuple[str, ...] = Field(("overhead", "wrist"), min_length=1, description="cameras of cameras.yaml")
+    depth_topic: str = Field("/{camera}/depth/image_raw", description="depth image; {camera} is filled in")
+    info_topic: str = Field("/{camera}/depth/camera_info", description="CameraInfo; {camera} is filled in")
+    points_topic: str = Field("/{camera}/depth/points", description="the cloud; {camera} is filled in")
+    organised: bool = Field(True, description="a point for every pixel, NaN where invalid; false: valid points only")
+
+
+def camera_of(name: str) -> CameraConfig:
+    """A camera of the suite.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, listing the cameras that there are.
+    """
+    cameras = load_cameras()
+    if name not in cameras:
+        raise OpenArmError(Code.CONFIG_INVALID, f"camera {name!r} is unknown; cameras: {', '.join(cameras)}")
+    if not cameras[name].depth:
+        raise OpenArmError(Code.CONFIG_INVALID, f"camera {name!r} has no depth, which this node needs")
+    return cameras[name]

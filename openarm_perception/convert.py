@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Detections as messages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from geometry_msgs.msg import Pose, PoseWithCovariance
+from rclpy.duration import Duration
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import ColorRGBA, Header
+from vision_msgs.msg import (
+    BoundingBox2D,
+    BoundingBox3D,
+    Detection2DArray,
+    Detection3DArray,
+    ObjectHypothesis,
+    ObjectHypothesisWithPose,
+)
+from vision_msgs.msg import Detection2D as Detection2DMsg
+from vision_msgs.msg import Detection3D as Detection3DMsg
+from visualization_msgs.msg import Marker, MarkerArray
+
+from openarm_common.convert import matrix_to_pose, ns_to_stamp, vector
+from openarm_common.errors import Code, OpenArmError
+from openarm_perception.detector import Detection2D
+from openarm_perception.localize import Detection3D
+
+#: Markers of objects vanish this long after the last frame that showed them, s.
+MARKER_LIFETIME = 2.0
+
+
+def header(frame_id: str, t_ns: int) -> Header:
+    """Header of a frame and a stamp."""
+    return Header(frame_id=frame_id, stamp=ns_to_stamp(t_ns))
+
+
+def check_frames(messages: Mapping[str, Image | CameraInfo], optical_frame: str) -> None:
+    """Refuse messages of another frame: a link frame (x forward), or depth that is not aligned with colour.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, naming the stream and both frames.
+    """
+    for stream, message in messages.items():
+        if message.header.frame_id != optical_frame:
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"{stream} is in frame {message.header.frame_id!r}, expected the optical frame {optical_frame!r}"
+                " (z forward, x right), shared by colour, depth and CameraInfo",
+            )
+
+
+def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Detection2DArray:
+    """Boxes by their centre, pixels; the pose of the hypothesis is left empty, a box in an image has none."""
+    message = Detection2DArray(header=header(frame_id, t_ns))
+    for name, detection in zip(_names(found), found, strict=True):
+        box = BoundingBox2D(size_x=float(detection.size[0]), size_y=float(detection.size[1]))
+        box.center.position.x, box.center.position.y = detection.centre
+        hypothesis = ObjectHypothesis(class_id=detection.label, score=detection.score)
+        results = [ObjectHypothesisWithPose(hypothesis=hypothesis)]
+        message.detections.append(Detection2DMsg(header=message.header, results=results, bbox=box, id=name))
+    return message
+
+
+def detections_3d(located: Sequence[Detection3D], frame_id: str, t_ns: int) -> Detection3DArray:
+    """Upright boxes: x along the smaller horizontal extent, z up, full edges, m."""
+    message = Detection3DArray(header=header(frame_id, t_ns))
+    for name, detection in zip(_names(located), located, strict=True):
+        pose = matrix_to_pose(detection.T_base_object)
+        hypothesis = ObjectHypothesis(class_id=detection.label, score=detection.score)
+        uncertain = PoseWithCovariance(pose=pose, covariance=detection.covariance.ravel())
+        results = [ObjectHypothesisWithPose(hypothesis=hypothesis, pose=uncertain)]
+        box = BoundingBox3D(center=pose, size=vector(detection.size))
+        message.detections.append(Detection3DMsg(header=message.header, results=results, bbox=box, id=name))
+    return message
+
+
+def markers(located: Sequence[Detection3D], frame_id: str, t_ns: int) -> MarkerArray:
+    """A transparent body and a text for each object."""
+    message = MarkerArray(markers=[Marker(header=header(frame_id, t_ns), action=Marker.DELETEALL)])
+    lifetime = Duration(seconds=MARKER_LIFETIME).to_msg()
+    for i, detection in enumerate(located):
+        body = Marker(header=header(frame_id, t_ns), ns="objects", id=i, lifetime=lifetime)
+        body.type = Marker.CYLINDER if detection.method == "circle" else Marker.CUBE
+        body.pose = matrix_to_pose(detection.T_base_object)
+        body.scale = vector(detection.size)
+        body.color = ColorRGBA(r=0.2, g=0.9, b=0.9, a=0.45)
+        text = Marker(header=header(frame_id, t_ns), ns="labels", id=i, lifetime=lifetime)
+        text.type = Marker.TEXT_VIEW_FACING
+        text.text = f"{detection.label} {detection.score:.2f}"
+        text.pose = Pose()
+        text.pose.position.x, text.pose.position.y = body.pose.position.x, body.pose.position.y
+        text.pose.position.z = body.pose.position.z + detection.size[2] / 2.0 + 0.03
+        text.scale.z = 0.025
+        text.color = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
+        message.markers += [body, text]
+    return message
+
+
+def _names(detections: Sequence[Detection2D] | Sequence[Detection3D]) -> list[str]:
+    """Ids: the label, with a number from the second of a label on."""
+    seen: dict[str, int] = {}
+    names: list[str] = []
+    for detection in detections:
+        count = seen[detection.label] = seen.get(detection.label, 0) + 1
+        names.append(detection.label if count == 1 else f"{detection.label}_{count}")
+    return names

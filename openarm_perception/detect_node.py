@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `detector`: colour and depth images to objects in the image and in the base frame.
+
+It listens to the camera only while somebody listens to it, and to /joint_states only while the camera rides on an arm.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, Image
+from vision_msgs.msg import Detection2DArray, Detection3DArray
+from visualization_msgs.msg import MarkerArray
+
+from openarm_common.cameras import Intrinsics
+from openarm_common.config import load_config
+from openarm_common.convert import array_to_image, image_to_array, intrinsics_from_info, stamp_to_ns
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.node import BASE_FRAME, QOS_NEWEST, QOS_SENSOR, BaseNode, reliable, run
+from openarm_common.resources import config_dir
+from openarm_common.tf import RobotStateListener
+from openarm_perception import convert
+from openarm_perception.config import DetectNodeConfig, camera_of
+from openarm_perception.depth import DepthImage, DepthLimits
+from openarm_perception.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.draw import annotate
+from openarm_perception.localize import Localizer
+from openarm_perception.matching import StampMatcher
+from openarm_perception.pipeline import Perceived, Pipeline
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A frame whose images fit together, waiting for the pose of its camera."""
+
+    t_ns: int
+    rgb: NDArray[np.uint8]
+    depth: DepthImage
+    intrinsics: Intrinsics
+    deadline: float  # wall clock, s
+
+
+class DetectNode(BaseNode[DetectNodeConfig]):
+    """Detects objects while asked to."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("detector", DetectNodeConfig, **kwargs)
+        config = self.config
+        camera = camera_of(config.camera)
+        self._optical_frame = camera.optical_frame
+        colors = Path(config.colors) if config.colors else config_dir() / "params" / "detector.yaml"
+        limits = DepthLimits(near=camera.near, far=camera.far)
+        self._pipeline = Pipeline(
+            ColorDetector(load_config(colors, ColorDetectorConfig)),
+            Localizer(config.localizer, limits, config.table_height),
+            config.policy,
+            config.label,
+        )
+        self._poses = RobotStateListener(self, self.description, joints=False)
+        self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(("color", "depth", "info"), self._on_frame)
+        self._inputs: list[Subscription] = []
+        self._waiting: _Frame | None = None
+        self._last_ns: int | None = None
+        self._counts = dict.fromkeys(("frames", "skipped", "refused_frames", "refused_objects"), 0)
+
+        self._boxes = self.create_publisher(Detection2DArray, "/detections_2d", reliable(5))
+        self._objects = self.create_publisher(Detection3DArray, "/detections_3d", reliable(5))
+        self._picture = self.create_publisher(Image, "/detection_image", QOS_SENSOR)
+        self._markers = self.create_publisher(MarkerArray, "/detection_markers", reliable(5))
+        self._retry = self.create_timer(0.02, self._try_waiting, clock=self.wall_clock)
+        self._retry.cancel()
+        self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
+        self.diagnose(True, "idle: nobody listens", **self._counts)
+
+    @property
+    def waiting_ns(self) -> int | None:
+        """Stamp of the frame that waits for the pose of its camera."""
+        return self._waiting.t_ns if self._waiting else None
+
+    def _follow_demand(self) -> None:
+        outputs = (self._boxes, self._objects, self._picture, self._markers)
+        wanted = any(output.get_subscription_count() for output in outputs)
+        if wanted and not self._inputs:
+            self._subscribe()
+        elif not wanted and self._inputs:
+            for subscription in self._inputs:
+                self.destroy_subscription(subscription)
+            self._inputs.clear()
+            self._matcher.clear()
+            self._waiting, self._last_ns = None, None
+            self._poses.enable(False)
+            self.diagnose(True, "idle: nobody listens", **self._counts)
+
+    def _subscribe(self) -> None:
+        topics: tuple[tuple[str, type[Image | CameraInfo], str], ...] = (
+            ("color", Image, self.config.color_topic),
+            ("depth", Image, self.config.depth_topic),
+            ("info", CameraInfo, self.config.info_topic),
+        )
+        for stream, kind, topic in topics:
+
+            def add(message: Image | CameraInfo, stream: str = stream) -> None:
+                self._matcher.add(stream, stamp_to_ns(message.header.stamp), message)
+
+            name = topic.format(camera=self.config.camera)
+            self._inputs.append(self.create_subscription(kind, name, add, QOS_NEWEST))
+        self.diagnose(True, f"waiting for images of {self.config.camera}", **self._counts)
+
+    def _on_frame(self, t_ns: int, messages: dict[str, Image | CameraInfo]) -> None:
+        last = self._last_ns
+        # a stamp before the last one is a restarted simulation, not a frame that came too early
+        if self._waiting or (last is not None and 0 <= t_ns - last < 0.999e9 / self.config.max_rate):
+            return
+        self._last_ns = t_ns
+        try:
+            self._waiting = self._check(t_ns, messages)
+        except OpenArmError as error:
+            self._complain("refused_frames", f"frame refused: {error.message}")
+            return
+        self._try_waiting()
+
+    def _check(self, t_ns: int, messages: dict[str, Image | CameraInfo]) -> _Frame:
+        color, depth = cast(Image, messages["color"]), cast(Image, messages["depth"])
+        info = cast(CameraInfo, messages["info"])
+        convert.check_frames(messages, self._optical_frame)
+        rgb = image_to_array(color)
+        if color.encoding not in ("rgb8", "bgr8"):
+            raise OpenArmError(Code.BAD_IMAGE, f"colour image is {color.encoding!r}; valid: rgb8, bgr8")
+        if color.encoding == "bgr8":
+            rgb = np.ascontiguousarray(rgb[..., ::-1])
+        return _Frame(
+            t_ns,
+            cast(NDArray[np.uint8], rgb),
+            cast(DepthImage, image_to_array(depth)),
+            intrinsics_from_info(info),
+            time.monotonic() + self.config.transform_wait,
+        )
+
+    def _try_waiting(self) -> None:
+        frame = self._waiting
+        if frame is None:
+            self._retry.cancel()
+            return
+        try:
+            T_base_camera = self._poses.buffer.lookup(BASE_FRAME, self._optical_frame, frame.t_ns)
+        except OpenArmError as error:
+            if error.code is Code.STALE_DATA:
+                self._poses.enable(True)  # the camera rides on an arm
+            if time.monotonic() < frame.deadline:
+                self._retry.reset()
+                return
+            self._waiting = None
+            self._complain("skipped", f"frame skipped: pose of the camera at its stamp: {error.message}")
+            return
+        self._waiting = None
+        try:
+            started = time.perf_counter()
+            perceived = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, T_base_camera)
+        except OpenArmError as error:
+            self._complain("refused_frames", f"frame refused: {error.message}")
+            return
+        self._publish(frame, perceived, (time.perf_counter() - started) * 1e3)
+
+    def _publish(self, frame: _Frame, perceived: Perceived, elapsed_ms: float) -> None:
+        self._boxes.publish(convert.detections_2d(perceived.found, self._optical_frame, frame.t_ns))
+        self._objects.publish(convert.detections_3d(perceived.located, BASE_FRAME, frame.t_ns))
+        if self._markers.get_subscription_count():
+            self._markers.publish(convert.markers(perceived.located, BASE_FRAME, frame.t_ns))
+        if self._picture.get_subscription_count():
+            picture = annotate(frame.rgb, perceived)
+            self._picture.publish(array_to_image(picture, "rgb8", self._optical_frame, frame.t_ns))
+        self._counts["frames"] += 1
+        self._counts["refused_objects"] += len(perceived.refused)
+        view = ", ".join(detection.label for detection in perceived.located) or "nothing"
+        refused = f"; not located: {'; '.join(perceived.refused)}" if perceived.refused else ""
+        self.diagnose(True, f"in view: {view}{refused}", processing_ms=f"{elapsed_ms:.1f}", **self._counts)
+
+    def _complain(self, count: str, message: str) -> None:
+        self._counts[count] += 1
+        self.get_logger().warning(message, throttle_duration_sec=5.0)
+        self.diagnose(False, message, **self._counts)
+
+
+def main() -> None:
+    """Run the node."""
+    run(DetectNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From one frame of a camera to objects in the base frame: detect, rank, locate. Usable without ROS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.cameras import Intrinsics
+from openarm_common.errors import OpenArmError
+from openarm_perception.depth import DepthImage, check_size, unit_scale
+from openarm_perception.detector import Detection2D, Detector, Policy, rank
+from openarm_perception.localize import Detection3D, Localizer
+
+
+@dataclass(frozen=True)
+class Perceived:
+    """What a frame shows, the object to take first at the front.
+
+    Attributes:
+        found: In the image.
+        located: In the base frame; those of `found` that could be.
+        refused: Why the others could not be, one sentence each.
+    """
+
+    found: tuple[Detection2D, ...]
+    located: tuple[Detection3D, ...]
+    refused: tuple[str, ...]
+
+
+class Pipeline:
+    """Finds objects in images and locates them.
+
+    Args:
+        detector: Finds them in the colour image.
+        localizer: Finds where they are.
+        policy: Which comes first.
+        label: Only objects of this name; empty takes all.
+    """
+
+    def __init__(self, detector: Detector, localizer: Localizer, policy: Policy = "score", label: str = "") -> None:
+        self.detector = detector
+        self.localizer = localizer
+        self.policy: Policy = policy
+        self.label = label
+
+    def run(
+        self,
+        rgb: NDArray[np.uint8],
+        depth: DepthImage,
+        intrinsics: Intrinsics,
+        T_base_camera: NDArray[np.float64],
+    ) -> Perceived:
+        """The objects of a frame.
+
+        Args:
+            rgb: (h, w, 3) uint8.
+            depth: (h, w) uint16 millimetres or float32 metres, aligned with `rgb`.
+            intrinsics: Of both, from the CameraInfo.
+            T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image.
+
+        Raises:
+            OpenArmError: BAD_IMAGE, when colour, depth and intrinsics do not belong together.
+        """
+        check_size("colour image", rgb.shape, intrinsics)
+        check_size("depth image", depth.shape, intrinsics)
+        unit_scale(depth)
+        size = (intrinsics.width, intrinsics.height)
+        found = rank(self.detector.detect(rgb), self.policy, size, self.label)
+        located: list[Detection3D] = []
+        refused: list[str] = []
+        for detection in found:
+            try:
+                located.append(self.localizer.locate(detection, depth, intrinsics, T_base_camera))
+            except OpenArmError as error:
+                refused.append(error.message)
+        return Perceived(found, tuple(located), tuple(refused))

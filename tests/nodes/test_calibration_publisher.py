@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `calibration_publisher`: mounts on /tf_static."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from tf2_msgs.msg import TFMessage
+
+from openarm_calibration.publisher import PublisherNode
+from openarm_common.cameras import load_cameras
+from openarm_common.convert import transform_to_matrix
+from openarm_common.description import RobotDescription
+from openarm_common.errors import OpenArmError
+from openarm_common.node import QOS_STATIC_TF
+from openarm_common.robot_state import RobotStateBuffer
+
+
+def edges(ros) -> dict[tuple[str, str], np.ndarray]:
+    """What a late listener gets."""
+    got: list[TFMessage] = []
+    ros.node.create_subscription(TFMessage, "/tf_static", got.append, QOS_STATIC_TF)
+    ros.spin_until(lambda: got, 10.0, "/tf_static")
+    assert len(got) == 1
+    return {(e.header.frame_id, e.child_frame_id): transform_to_matrix(e.transform) for e in got[0].transforms}
+
+
+def test_a73_b34_mounts_and_optical_frames_of_all_cameras(ros) -> None:
+    """Parent → link is the nominal mount, link → optical the turn of the axes; a late listener gets them (latched)."""
+    ros.add(PublisherNode())
+    published = edges(ros)
+    cameras = load_cameras()
+    assert len(published) == 2 * len(cameras)
+    assert ("openarm_body_link0", "overhead_link") in published
+    assert ("openarm_right_link7", "wrist_link") in published
+    for name, camera in cameras.items():
+        mount = published[camera.parent, f"{name}_link"]
+        turn = published[f"{name}_link", f"{name}_color_optical_frame"]
+        np.testing.assert_allclose(mount, camera.T_parent_link, atol=1e-9)
+        # optical z is the link's x (forward), optical x is the link's -y (right)
+        np.testing.assert_allclose(turn[:3, 2], (1.0, 0.0, 0.0), atol=1e-9)
+        np.testing.assert_allclose(turn[:3, 0], (0.0, -1.0, 0.0), atol=1e-9)
+
+
+def test_a34_b14_the_overhead_camera_looks_at_the_region_and_the_wrist_camera_moves_with_the_arm(ros) -> None:
+    """Through the tree: the object region projects into the overhead image; joint 1 moves the wrist camera alone."""
+    ros.add(PublisherNode())
+    description = RobotDescription.load()
+    buffer = RobotStateBuffer(description)
+    for (parent, child), T in edges(ros).items():
+        buffer.set_static(parent, child, T)
+    overhead = load_cameras()["overhead"]
+    T = buffer.lookup("overhead_color_optical_frame", "openarm_body_link0", 0)
+    corners = np.array([(x, y, 0.42) for x in (0.16, 0.36) for y in (-0.42, 0.42)])
+    pixels = overhead.intrinsics.project(corners @ T[:3, :3].T + T[:3, 3])
+    assert ((pixels > 10) & (pixels < (629, 469))).all()
+    names = [*description.arm_joints("left"), *description.arm_joints("right")]
+    for t_ns, q in ((0, 0.0), (50_000_000, 0.5)):
+        buffer.add_joint_state(t_ns, names, [q] * len(names))
+    wrist = [buffer.lookup("openarm_body_link0", "wrist_color_optical_frame", t) for t in (0, 50_000_000)]
+    assert np.linalg.norm(wrist[0][:3, 3] - wrist[1][:3, 3]) > 0.05
+
+
+def test_a_camera_on_an_unknown_link_is_refused(ros, tmp_path) -> None:
+    """The camera, its parent and the links that there are."""
+    path = tmp_path / "cameras.yaml"
+    path.write_text(
+        "cameras: [{name: a, parent: nowhere, position: [0, 0, 0], forward: [1, 0, 0], image_right: [0, -1, 0]}]"
+    )
+    with pytest.raises(OpenArmError, match=r"parent 'nowhere' is no link of the robot; links: .*openarm_body_link0"):
+        PublisherNode(parameter_overrides=[Parameter("cameras", value=str(path))])

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `cloud`: depth images to points."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+from openarm_common.cameras import load_cameras
+from openarm_common.convert import array_to_image, info_from_intrinsics, points_from_cloud, stamp_to_ns
+from openarm_common.errors import OpenArmError
+from openarm_common.node import QOS_SENSOR
+from openarm_perception.cloud_node import CloudNode
+
+CAMERAS = load_cameras()
+OVERHEAD = CAMERAS["overhead"]
+K, FRAME = OVERHEAD.intrinsics, OVERHEAD.optical_frame
+
+
+class Bench:
+    """A camera, the node and a watcher of its points."""
+
+    def __init__(self, ros, **params) -> None:
+        self.ros = ros
+        self.depth = ros.node.create_publisher(Image, "/overhead/depth/image_raw", QOS_SENSOR)
+        self.info = ros.node.create_publisher(CameraInfo, "/overhead/depth/camera_info", QOS_SENSOR)
+        self.node = ros.add(CloudNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()]))
+        self.clouds: list[PointCloud2] = []
+        self.said: list[str] = []
+        self.t_ns = 0
+
+    def watch(self):
+        return self.ros.node.create_subscription(PointCloud2, "/overhead/depth/points", self.clouds.append, QOS_SENSOR)
+
+    def pump(self, pixels, encoding: str, condition, what: str, frame: str = FRAME, K=K) -> None:
+        """Publish a frame each half second (best effort may lose one) until `condition` holds."""
+        due = 0.0
+
+        def step() -> bool:
+            nonlocal due
+            if time.monotonic() >= due:
+                due = time.monotonic() + 0.5
+                self.t_ns += 33_000_000
+                self.depth.publish(array_to_image(pixels, encoding, frame, self.t_ns))
+                self.info.publish(info_from_intrinsics(K, frame, self.t_ns))
+            return condition()
+
+        self.ros.spin_until(step, 10.0, what)
+
+
+def flat(millimetres: int = 700):
+    """A wall with one pixel too near and one without depth."""
+    depth = np.full((480, 640), millimetres, np.uint16)
+    depth[10, 20], depth[30, 40] = 100, 0
+    return depth
+
+
+def test_b29_a47_a48_organised_points_of_every_pixel(ros) -> None:
+    """Frame and stamp of the image; x = (u - cx) z / fx; what is invalid or nearer than the camera can is NaN."""
+    bench = Bench(ros)
+    bench.watch()
+    bench.pump(flat(), "16UC1", lambda: bench.clouds, "a cloud")
+    cloud = bench.clouds[0]
+    assert cloud.header.frame_id == FRAME
+    assert stamp_to_ns(cloud.header.stamp) % 33_000_000 == 0
+    assert not cloud.is_dense
+    points = points_from_cloud(cloud)
+    assert points.shape == (480, 640, 3)
+    np.testing.assert_allclose(points[200, 600], ((600 - K.cx) * 0.7 / K.fx, (200 - K.cy) * 0.7 / K.fy, 0.7), atol=1e-6)
+    invalid = np.isnan(points[..., 2])
+    assert sorted(map(tuple, np.argwhere(invalid).tolist())) == [(10, 20), (30, 40)]
+
+
+def test_a47_a48_filtered_points_from_metres(ros) -> None:
+    """32FC1, valid points only."""
+    bench = Bench(ros, organised=False)
+    bench.watch()
+    bench.pump((flat() * 1e-3).astype(np.float32), "32FC1", lambda: bench.clouds, "a cloud")
+    points = points_from_cloud(bench.clouds[0])
+    assert points.shape == (480 * 640 - 2, 3)
+    assert bench.clouds[0].is_dense
+
+
+def test_a58_images_are_listened_to_only_while_somebody_wants_points(ros) -> None:
+    """Of that camera alone."""
+    bench = Bench(ros)
+    wrist = ros.node.create_publisher(Image, "/wrist/depth/image_raw", QOS_SENSOR)
+    ros.spin_until(lambda: ros.node.count_publishers("/wrist/depth/points"), 10.0, "the node is up")
+    assert bench.depth.get_subscription_count() == 0
+    watcher = bench.watch()
+    ros.spin_until(lambda: bench.depth.get_subscription_count(), 10.0, "the camera is listened to")
+    assert wrist.get_subscription_count() == 0
+    ros.node.destroy_subscription(watcher)
+    ros.spin_until(lambda: not bench.depth.get_subscription_count(), 10.0, "the camera is let go")
+
+
+@pytest.mark.parametrize(
+    ("pixels", "encoding", "frame", "text"),
+    [
+        (np.zeros((480, 640), np.uint8), "mono8", FRAME, "16UC1"),
+        (np.zeros((240, 320), np.uint16), "16UC1", FRAME, "320x240"),
+        (np.zeros((480, 640), np.uint16), "16UC1", "overhead_link", "expected the optical frame"),
+    ],
+)
+def test_b28_b30_b34_what_does_not_fit_is_named_and_dropped(ros, pixels, encoding, frame, text) -> None:
+    """On /diagnostics; no cloud comes of it."""
+    bench = Bench(ros)
+    bench.watch()
+    said: list[DiagnosticArray] = []
+    ros.node.create_subscription(DiagnosticArray, "/diagnostics", said.append, 10)
+    heard = lambda: any(text in s.message and s.level == b"\x02" for m in said for s in m.status)  # noqa: E731
+    bench.pump(pixels, encoding, heard, f"diagnostics with {text!r}", frame=frame)
+    assert bench.clouds == []
+
+
+def test_an_unknown_camera_is_named(ros) -> None:
+    """With those that there are."""
+    with pytest.raises(OpenArmError, match="'rear' is unknown; cameras: overhead, wrist"):
+        CloudNode(parameter_overrides=[Parameter("cameras", value=["rear"])])

@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `detector` against a camera made of rectangles: flat images, exact depth."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from tf2_msgs.msg import TFMessage
+from vision_msgs.msg import Detection2DArray, Detection3DArray
+from visualization_msgs.msg import Marker, MarkerArray
+
+from openarm_common import se3
+from openarm_common.cameras import T_LINK_OPTICAL, load_cameras
+from openarm_common.convert import (
+    array_to_image,
+    image_to_array,
+    info_from_intrinsics,
+    matrix_to_transform,
+    ns_to_stamp,
+    pose_to_matrix,
+    stamp_to_ns,
+)
+from openarm_common.description import RobotDescription
+from openarm_common.errors import OpenArmError
+from openarm_common.node import BASE_FRAME, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, reliable
+from openarm_perception.detect_node import DetectNode
+
+TABLE, TOP = 0.40, 0.45
+MS = 1_000_000
+
+
+class FakeCamera:
+    """Publishes what a camera straight above the table sees of one red box, and the fixed edges of its mount.
+
+    The camera `name` hangs 0.5 m above the box, image up = base x. The box is 6 cm along x, 4 cm along y and 5 cm high.
+    """
+
+    def __init__(self, ros, name: str = "overhead", parent: str = BASE_FRAME, T_base_parent=None) -> None:
+        self.node = ros.node
+        self.config = load_cameras()[name]
+        self.frame = self.config.optical_frame
+        self.K = self.config.intrinsics
+        self.pubs = {
+            "color": self.node.create_publisher(Image, f"/{name}/color/image_raw", QOS_SENSOR),
+            "depth": self.node.create_publisher(Image, f"/{name}/depth/image_raw", QOS_SENSOR),
+            "info": self.node.create_publisher(CameraInfo, f"/{name}/depth/camera_info", QOS_SENSOR),
+        }
+        self.static = self.node.create_publisher(TFMessage, "/tf_static", QOS_LATCHED)
+        self.joints = self.node.create_publisher(JointState, "/joint_states", QOS_COMMAND)
+        R = se3.rotation_from_z_y((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))
+        self.T_base_optical = se3.make(R, (0.30, -0.20, TOP + 0.5))
+        T_parent_optical = se3.inverse(np.eye(4) if T_base_parent is None else T_base_parent) @ self.T_base_optical
+        self.mount = TFMessage(
+            transforms=[
+                matrix_to_transform(parent, f"{name}_link", T_parent_optical @ se3.inverse(T_LINK_OPTICAL), 0),
+                matrix_to_transform(f"{name}_link", self.frame, T_LINK_OPTICAL, 0),
+            ]
+        )
+        depth = np.full((480, 640), 0.55, np.float32)
+        rgb = np.full((480, 640, 3), (180, 176, 170), np.uint8)
+        across, along = (round(edge * self.K.fx / 0.5 / 2.0) for edge in (0.04, 0.06))
+        self.patch = (slice(240 - along, 240 + along), slice(320 - across, 320 + across))
+        depth[self.patch], rgb[self.patch] = 0.5, (205, 25, 25)
+        self.rgb, self.depth = rgb, depth
+
+    def publish_mount(self) -> None:
+        self.static.publish(self.mount)
+
+    def publish(self, t_ns: int, **replace) -> None:
+        """One frame; `replace` gives other messages for a stream."""
+        messages = {
+            "color": array_to_image(self.rgb, "rgb8", self.frame, t_ns),
+            "depth": array_to_image(np.round(self.depth * 1e3).astype(np.uint16), "16UC1", self.frame, t_ns),
+            "info": info_from_intrinsics(self.K, self.frame, t_ns),
+        }
+        for stream, message in (messages | replace).items():
+            self.pubs[stream].publish(message)
+
+    def watched(self) -> bool:
+        return all(pub.get_subscription_count() for pub in self.pubs.values())
+
+    def unwatched(self) -> bool:
+        return not any(pub.get_subscription_count() for pub in self.pubs.values())
+
+
+class Watch:
+    """Collects what a topic says."""
+
+    def __init__(self, ros, kind, topic: str, qos=None) -> None:
+        self.got: list = []
+        self.subscription = ros.node.create_subscription(kind, topic, self.got.append, qos or reliable(10))
+
+
+class Bench:
+    """A camera, a detector and a watcher of /detections_3d."""
+
+    def __init__(self, ros, *, camera: FakeCamera, mounted: bool = True, **params) -> None:
+        self.ros, self.camera = ros, camera
+        if mounted:
+            camera.publish_mount()
+        values = {"camera": camera.config.name, **params}
+        self.node = ros.add(DetectNode(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()]))
+        self.watch = Watch(ros, Detection3DArray, "/detections_3d")
+        self.diagnostics = Watch(ros, DiagnosticArray, "/diagnostics")
+        self.t_ns = 1_000 * MS
+        ros.spin_until(camera.watched, 10.0, "the detector listens to the camera")
+
+    def frame(self, **replace) -> None:
+        self.t_ns += 200 * MS
+        self.camera.publish(self.t_ns, **replace)
+
+    def pump(self, condition, what: str, **make) -> None:
+        """Publish a frame, and another every half second (best effort may lose one), until `condition` holds.
+
+        `make` gives functions of the stamp that replace the message of a stream.
+        """
+        due = 0.0
+
+        def step() -> bool:
+            nonlocal due
+            if time.monotonic() >= due:
+                due = time.monotonic() + 0.5
+                t_ns = self.t_ns + 200 * MS
+                self.frame(**{stream: message(t_ns) for stream, message in make.items()})
+            return condition()
+
+        self.ros.spin_until(step, 10.0, what)
+
+    def detect(self, what: str = "a detection") -> Detection3DArray:
+        """The answer to a new frame."""
+        before = len(self.watch.got)
+        self.pump(lambda: len(self.watch.got) > before, what)
+        return self.watch.got[-1]
+
+    def said(self, text: str, **make) -> None:
+        """Publish frames until the diagnostics say `text`."""
+
+        def heard() -> bool:
+            statuses = [s for m in self.diagnostics.got for s in m.status if s.name.startswith("detector")]
+            return any(text in s.message for s in statuses)
+
+        self.pump(heard, f"diagnostics with {text!r}", **make)
+
+
+@pytest.fixture
+def bench(ros) -> Bench:
+    """A detector on the overhead camera."""
+    return Bench(ros, camera=FakeCamera(ros))
+
+
+def test_a63_b01_b29_a_box_is_found_where_it_stands(bench) -> None:
+    """Position, size and yaw in the base frame, at the stamp of the image, through the pinhole and the mount."""
+    message = bench.detect()
+    assert message.header.frame_id == BASE_FRAME
+    assert stamp_to_ns(message.header.stamp) % (200 * MS) == 0
+    (found,) = message.detections
+    assert found.id == "red"
+    assert found.results[0].hypothesis.class_id == "red"
+    assert 0.5 < found.results[0].hypothesis.score <= 1.0
+    T = pose_to_matrix(found.bbox.center)
+    np.testing.assert_allclose(T[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.001)
+    np.testing.assert_allclose(np.abs(T[:3, 0]), (0.0, 1.0, 0.0), atol=0.02)  # x along the smaller extent
+    np.testing.assert_allclose(T[:3, 2], (0.0, 0.0, 1.0), atol=1e-9)
+    size = found.bbox.size
+    np.testing.assert_allclose((size.x, size.y, size.z), (0.04, 0.06, 0.05), atol=0.0015)
+    assert found.results[0].pose.covariance[0] > 0.0
+
+
+def test_b04_a61_boxes_in_the_image_by_their_centre(ros, bench) -> None:
+    """Class, score, and the middle of the box in pixels, in the optical frame."""
+    boxes = Watch(ros, Detection2DArray, "/detections_2d")
+    bench.pump(lambda: boxes.got, "a detection in the image")
+    message = boxes.got[-1]
+    assert message.header.frame_id == "overhead_color_optical_frame"
+    (box,) = message.detections
+    assert (box.bbox.center.position.x, box.bbox.center.position.y) == (319.5, 239.5)
+    rows, columns = bench.camera.patch
+    assert (box.bbox.size_x, box.bbox.size_y) == (columns.stop - columns.start, rows.stop - rows.start)
+    assert box.results[0].hypothesis.class_id == "red"
+
+
+def test_a61_an_empty_table_is_an_answer(bench) -> None:
+    """An empty array with the stamp of the image."""
+    bench.camera.rgb[:] = (180, 176, 170)
+    assert bench.detect("an empty answer").detections == []
+
+
+def test_pictures_and_markers_for_people(ros, bench) -> None:
+    """The image has the size of the camera's; markers come as a body and a text for each object."""
+    pictures = Watch(ros, Image, "/detection_image", QOS_SENSOR)
+    markers = Watch(ros, MarkerArray, "/detection_markers")
+    bench.pump(lambda: pictures.got and markers.got, "a picture and markers")
+    picture = image_to_array(pictures.got[-1])
+    assert picture.shape == (480, 640, 3)
+    assert (picture != bench.camera.rgb).any()
+    wiped, body, text = markers.got[-1].markers
+    assert (wiped.action, body.type, text.type) == (Marker.DELETEALL, Marker.CUBE, Marker.TEXT_VIEW_FACING)
+    assert text.text.startswith("red")
+
+
+def test_b69_images_are_listened_to_only_while_somebody_listens(ros) -> None:
+    """No subscription without demand; demand by any output starts it, its end ends it."""
+    camera = FakeCamera(ros)
+    ros.add(DetectNode())
+    ros.spin_until(lambda: ros.node.count_subscribers("/tf_static") == 1, 10.0, "the detector is up")
+    assert camera.unwatched()
+    watch = Watch(ros, MarkerArray, "/detection_markers")
+    ros.spin_until(camera.watched, 10.0, "the camera is listened to")
+    ros.node.destroy_subscription(watch.subscription)
+    ros.spin_until(camera.unwatched, 10.0, "the camera is let go")
+
+
+def test_a04_old_frames_are_dropped_not_queued(ros, bench) -> None:
+    """Frames that come faster than `max_rate` by their stamps are passed over."""
+    bench.detect()
+    count = len(bench.watch.got)
+    bench.t_ns += 1000 * MS
+    for i in range(20):
+        bench.camera.publish(bench.t_ns + 10 * i * MS)
+        ros.executor.spin_once(timeout_sec=0.02)
+    ros.spin_until(lambda: len(bench.watch.got) > count, 5.0, "an answer")
+    assert len(bench.watch.got) - count <= 2
+
+
+@pytest.mark.parametrize(
+    ("text", "stream", "make"),
+    [
+        ("encoding 'yuv422'", "color", lambda cam, t: _relabel(cam, t, "yuv422")),
+        ("valid: rgb8, bgr8", "color", lambda cam, t: array_to_image(cam.rgb[..., 0], "mono8", cam.frame, t)),
+        (
+            "depth image is 320x240",
+            "depth",
+            lambda cam, t: array_to_image(np.ascontiguousarray(cam.depth[::2, ::2]), "32FC1", cam.frame, t),
+        ),
+        ("colour image is 320x240", "color", lambda cam, t: array_to_image(cam.rgb[::2, ::2], "rgb8", cam.frame, t)),
+        (
+            "expected (h, w) of uint16",
+            "depth",
+            lambda cam, t: array_to_image(np.zeros((480, 640), np.uint8), "mono8", cam.frame, t),
+        ),
+        ("not calibrated", "info", lambda cam, t: _info(cam, t)),
+        ("'overhead_link', expected the optical frame", "info", lambda cam, t: _info(cam, t, frame="overhead_link")),
+        ("depth is in frame", "depth", lambda cam, t: array_to_image(cam.depth, "32FC1", "other_optical_frame", t)),
+    ],
+)
+def test_b28_b30_b34_a31_what_does_not_fit_is_named_and_dropped(bench, text, stream, make) -> None:
+    """Encodings, sizes, frames, a CameraInfo without calibration; the next good frame is answered."""
+    bench.said(text, **{stream: lambda t: make(bench.camera, t)})
+    assert bench.watch.got == []
+    assert bench.detect().detections
+
+
+def _relabel(camera: FakeCamera, t_ns: int, encoding: str) -> Image:
+    message = array_to_image(camera.rgb, "rgb8", camera.frame, t_ns)
+    message.encoding = encoding
+    return message
+
+
+def _info(camera: FakeCamera, t_ns: int, frame: str = "") -> CameraInfo:
+    info = info_from_intrinsics(camera.K, frame or camera.frame, t_ns)
+    if not frame:
+        info.k = [0.0] * 9
+    return info
+
+
+def test_a31_positions_follow_the_camera_info(bench) -> None:
+    """Twice the focal length in the CameraInfo, half the size: the node has no other source."""
+    whole = bench.detect().detections[0].bbox.size.y
+    K = bench.camera.K
+    bench.camera.K = type(K)(K.width, K.height, 2.0 * K.fx, 2.0 * K.fy, K.cx, K.cy)
+    assert bench.detect().detections[0].bbox.size.y == pytest.approx(whole / 2.0, rel=0.05)
+
+
+def test_b33_b60_without_a_mount_the_frame_is_skipped_with_a_warning(ros) -> None:
+    """No transform, no detection: the frame is named on /diagnostics; with the mount there, detections come."""
+    bench = Bench(ros, camera=FakeCamera(ros), mounted=False, transform_wait=0.1)
+    bench.said("frame skipped: pose of the camera at its stamp: frame 'overhead_color_optical_frame'")
+    assert bench.watch.got == []
+    bench.camera.publish_mount()
+    assert bench.detect().detections
+
+
+def arm(t_ns: int, q: float) -> JointState:
+    """A joint state of the right arm with joint 1 at `q`."""
+    state = JointState(
+        name=[f"openarm_right_joint{i}" for i in range(1, 8)], position=[q, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    )
+    state.header.stamp = ns_to_stamp(t_ns)
+    return state
+
+
+def on_arm(ros, **params) -> Bench:
+    """A detector on the wrist camera, which sees the same as the overhead one when joint 1 is at 0.5 rad."""
+    state = arm(0, 0.5)
+    q = dict(zip(state.name, state.position, strict=True))
+    T_base_link7 = RobotDescription.load().link_pose("openarm_right_link7", q)
+    return Bench(ros, camera=FakeCamera(ros, "wrist", "openarm_right_link7", T_base_link7), **params)
+
+
+def test_b14_b32_b61_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) -> None:
+    """The frame comes first, joint states 8 ms before and 12 ms after it later: the pose is interpolated.
+
+    The newest joint state, with the arm elsewhere, is not used. The wait is long here, so that a busy machine passes.
+    """
+    bench = on_arm(ros, transform_wait=5.0)
+    bench.pump(lambda: ros.node.count_subscribers("/joint_states"), "joint states are listened to")
+    t = bench.node.waiting_ns
+    for offset, q in ((-8, 0.46), (12, 0.56), (400, 1.2)):
+        bench.camera.joints.publish(arm(t + offset * MS, q))
+    ros.spin_until(lambda: bench.watch.got, 5.0, "the detection of the frame that waited")
+    assert stamp_to_ns(bench.watch.got[0].header.stamp) == t
+    (found,) = bench.watch.got[0].detections
+    np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.0015)
+
+
+def test_b32_b60_a72_a_frame_20_ms_from_any_joint_state_is_skipped(ros) -> None:
+    """Nothing within 5 ms and nothing that brackets: skipped and named, no detection, and the node goes on."""
+    bench = on_arm(ros, transform_wait=0.1)
+
+    def with_joints(offset_ms: int):
+        def make(t_ns: int) -> CameraInfo:
+            bench.camera.joints.publish(arm(t_ns + offset_ms * MS, 0.5))
+            return info_from_intrinsics(bench.camera.K, bench.camera.frame, t_ns)
+
+        return make
+
+    bench.said("frame skipped: pose of the camera at its stamp: no joint state", info=with_joints(-20))
+    assert bench.watch.got == []
+    bench.pump(lambda: bench.watch.got, "a detection with joints at the stamp", info=with_joints(0))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "fault"),
+    [
+        ("camera", "rear", "cameras: overhead, wrist"),
+        ("camera", "spectator", "no depth"),
+        ("policy", "largest", "score"),
+        ("max_rate", 0.0, "greater than 0"),
+    ],
+)
+def test_wrong_parameters_are_named(ros, key, value, fault) -> None:
+    """The valid choices are listed."""
+    with pytest.raises(OpenArmError, match=fault):
+        DetectNode(parameter_overrides=[Parameter(key, value=value)])
