@@ -18,9 +18,16 @@ from openarm_sim_bridge.cameras import RenderThread, SnapshotRenderer, create_gl
 from openarm_sim_bridge.world import Snapshot
 
 CAMERA = CameraConfig(
-    name="eye", parent="world", position=(0, 0, 1), forward=(0, 0, -1), image_right=(0, -1, 0), width=320, height=240,
-    near=0.1, far=3.0,
-)  # fmt: skip
+    name="eye",
+    parent="world",
+    position=(0, 0, 1),
+    forward=(0, 0, -1),
+    image_right=(0, -1, 0),
+    width=320,
+    height=240,
+    near=0.1,
+    far=3.0,
+)
 #: A camera 1 m above a plane, tilted by 30 degrees about its image's horizontal axis; MuJoCo looks along -z with y up.
 MODEL = """
 <mujoco><compiler angle="radian"/><statistic extent="1"/><visual><map znear="0.02" zfar="20"/><quality offsamples="0"/>
@@ -138,7 +145,7 @@ def test_a26_a27_the_two_cameras_are_640_by_480_with_60_degrees() -> None:
 
 def test_the_backend_must_be_off_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "glfw")
-    with pytest.raises(OpenArmError, match="MUJOCO_GL is 'glfw'.*egl or osmesa") as caught:
+    with pytest.raises(OpenArmError, match=r"MUJOCO_GL is 'glfw'.*egl or osmesa") as caught:
         create_gl_context(64, 64)
     assert caught.value.code is Code.ENVIRONMENT
 

@@ -38,23 +38,83 @@ def test_columns_are_put_in_the_order_of_the_joints() -> None:
 @pytest.mark.parametrize(
     ("changes", "code", "result", "message"),
     [
-        ({"names": ("j1", "j9")}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_JOINTS, "unknown joint 'j9'.*expected each of j1, j2"),
+        (
+            {"names": ("j1", "j9")},
+            Code.INVALID_ARGUMENT,
+            TrajectoryResult.INVALID_JOINTS,
+            "unknown joint 'j9'.*expected each of j1, j2",
+        ),
         ({"names": ("j1", "j1")}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_JOINTS, "duplicate joint 'j1'"),
-        ({"names": ("j1",), "q": Q2[:, :1]}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_JOINTS, "missing joint 'j2'"),
+        (
+            {"names": ("j1",), "q": Q2[:, :1]},
+            Code.INVALID_ARGUMENT,
+            TrajectoryResult.INVALID_JOINTS,
+            "missing joint 'j2'",
+        ),
         ({"t": np.zeros(0), "q": np.zeros((0, 2))}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_GOAL, "no points"),
-        ({"q": np.array([[0.1, 0.2], [np.nan, 0.4]])}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_GOAL, "position of j1 at point 1 is nan"),
-        ({"q": np.array([[0.1, 0.2], [0.3, np.inf]])}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_GOAL, "position of j2 at point 1 is inf"),
-        ({"v": np.array([[np.nan, 0.0], [0.0, 0.0]])}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_GOAL, "velocity of j1 at point 0 is nan"),
-        ({"q": np.array([[0.1, 0.2], [1.5, 0.4]])}, Code.LIMITS, TrajectoryResult.INVALID_GOAL, r"position of j1 at point 1 is 1\.5000, out of its limits -1\.0000 to 1\.0000"),
-        ({"t": np.array([1.0, 1.0])}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_GOAL, "time of point 1 .* strictly increasing"),
+        (
+            {"q": np.array([[0.1, 0.2], [np.nan, 0.4]])},
+            Code.INVALID_ARGUMENT,
+            TrajectoryResult.INVALID_GOAL,
+            "position of j1 at point 1 is nan",
+        ),
+        (
+            {"q": np.array([[0.1, 0.2], [0.3, np.inf]])},
+            Code.INVALID_ARGUMENT,
+            TrajectoryResult.INVALID_GOAL,
+            "position of j2 at point 1 is inf",
+        ),
+        (
+            {"v": np.array([[np.nan, 0.0], [0.0, 0.0]])},
+            Code.INVALID_ARGUMENT,
+            TrajectoryResult.INVALID_GOAL,
+            "velocity of j1 at point 0 is nan",
+        ),
+        (
+            {"q": np.array([[0.1, 0.2], [1.5, 0.4]])},
+            Code.LIMITS,
+            TrajectoryResult.INVALID_GOAL,
+            r"position of j1 at point 1 is 1\.5000, out of its limits -1\.0000 to 1\.0000",
+        ),
+        (
+            {"t": np.array([1.0, 1.0])},
+            Code.INVALID_ARGUMENT,
+            TrajectoryResult.INVALID_GOAL,
+            "time of point 1 .* strictly increasing",
+        ),
         ({"t": np.array([-0.1, 1.0])}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_GOAL, "time of point 0 is -0.1"),
-        ({"t": np.array([0.5, 0.51])}, Code.LIMITS, TrajectoryResult.INVALID_GOAL, r"j1 would have to move at 20\.00 rad/s between point 0 and the next"),
-        ({"v": np.array([[0.0, 9.0], [0.0, 0.0]])}, Code.LIMITS, TrajectoryResult.INVALID_GOAL, r"j2 would have to move at 9\.00 rad/s at point 0"),
-        ({"v": np.array([[0.0, 0.0], [0.5, 0.0]])}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_GOAL, "velocity of j1 at the last point is 0.500"),
-        ({"path_tolerance": (JointTolerance("j7", 0.1),)}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_GOAL, "path tolerance 0.1 of joint 'j7'"),
-        ({"q": np.zeros((3, 2))}, Code.INVALID_ARGUMENT, TrajectoryResult.INVALID_GOAL, r"position array of shape \(3, 2\)"),
+        (
+            {"t": np.array([0.5, 0.51])},
+            Code.LIMITS,
+            TrajectoryResult.INVALID_GOAL,
+            r"j1 would have to move at 20\.00 rad/s between point 0 and the next",
+        ),
+        (
+            {"v": np.array([[0.0, 9.0], [0.0, 0.0]])},
+            Code.LIMITS,
+            TrajectoryResult.INVALID_GOAL,
+            r"j2 would have to move at 9\.00 rad/s at point 0",
+        ),
+        (
+            {"v": np.array([[0.0, 0.0], [0.5, 0.0]])},
+            Code.INVALID_ARGUMENT,
+            TrajectoryResult.INVALID_GOAL,
+            "velocity of j1 at the last point is 0.500",
+        ),
+        (
+            {"path_tolerance": (JointTolerance("j7", 0.1),)},
+            Code.INVALID_ARGUMENT,
+            TrajectoryResult.INVALID_GOAL,
+            "path tolerance 0.1 of joint 'j7'",
+        ),
+        (
+            {"q": np.zeros((3, 2))},
+            Code.INVALID_ARGUMENT,
+            TrajectoryResult.INVALID_GOAL,
+            r"position array of shape \(3, 2\)",
+        ),
     ],
-)  # fmt: skip
+)
 def test_p21_bad_trajectories_are_refused_with_joint_and_value(
     changes: dict, code: Code, result: TrajectoryResult, message: str
 ) -> None:

@@ -15,7 +15,11 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_sim_bridge.compiled import TrackedObject
 from openarm_sim_bridge.world import World
 
-BALL = '<body name="ball" pos="0.5 0 {z}"><freejoint name="ball"/><geom name="ball" type="sphere" size="0.05" mass="0.1"/></body>'
+BALL = """<body name="ball" pos="0.5 0 {z}"><freejoint name="ball"/>
+<geom name="ball" type="sphere" size="0.05" mass="0.1"/></body>"""
+CUBE = (
+    """<body name="cube" pos="{pos}"><freejoint name="cube"/><geom type="box" size=".03 .03 .03" mass=".1"/></body>"""
+)
 MODEL = """
 <mujoco><compiler angle="radian"/><option timestep="{timestep}" integrator="implicitfast"/><worldbody>
 <geom name="floor" type="plane" size="2 2 .1"/>{extra}
@@ -23,14 +27,16 @@ MODEL = """
 <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".5"/>
 <body name="lower" pos=".2 0 0"><joint name="elbow" axis="0 1 0" damping=".5" range="-2 2" limited="true"/>
 <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".3"/>
-<body name="left" pos=".2 0 0"><joint name="finger" type="slide" axis="0 1 0" range="0 .04" limited="true"/><geom type="box" size=".01 .01 .01" mass=".02"/></body>
-<body name="right" pos=".2 0 0"><joint name="mimic" type="slide" axis="0 -1 0"/><geom type="box" size=".01 .01 .01" mass=".02"/></body>
-</body></body></worldbody>
-<contact><exclude body1="left" body2="right"/><exclude body1="lower" body2="left"/><exclude body1="lower" body2="right"/></contact>
+<body name="left" pos=".2 0 0"><joint name="finger" type="slide" axis="0 1 0" range="0 .04" limited="true"/>
+<geom type="box" size=".01 .01 .01" mass=".02"/></body>
+<body name="right" pos=".2 0 0"><joint name="mimic" type="slide" axis="0 -1 0"/>
+<geom type="box" size=".01 .01 .01" mass=".02"/></body></body></body></worldbody>
+<contact><exclude body1="left" body2="right"/><exclude body1="lower" body2="left"/>
+<exclude body1="lower" body2="right"/></contact>
 <equality><joint joint1="mimic" joint2="finger" polycoef="0 1 0 0 0"/></equality>
 <actuator><position name="c" joint="finger" kp="2000" kv="40" forcerange="-30 30" ctrlrange="0 .04"/>
-<position name="b" joint="elbow" kp="100" kv="2" forcerange="-7 7"/><position name="a" joint="shoulder" kp="200" kv="3" forcerange="-40 40"/></actuator>
-</mujoco>"""
+<position name="b" joint="elbow" kp="100" kv="2" forcerange="-7 7"/>
+<position name="a" joint="shoulder" kp="200" kv="3" forcerange="-40 40"/></actuator></mujoco>"""
 JOINTS = ("shoulder", "elbow", "finger")
 HOME = {"shoulder": -0.3, "elbow": 0.8, "finger": 0.02}
 BALL_OBJECT = TrackedObject("ball", "red", (0.1, 0.1, 0.1))
@@ -178,9 +184,7 @@ def test_extend_keeps_the_state_of_everything_that_was_there() -> None:
     for _ in range(30):
         world.step_tick()
     before, pose, t_ns = world.read_joints(), world.objects()[0].T_world_object, world.t_ns
-    cube = (
-        '<body name="cube" pos="0 1 .05"><freejoint name="cube"/><geom type="box" size=".03 .03 .03" mass=".1"/></body>'
-    )
+    cube = CUBE.format(pos="0 1 .05")
     world.extend(
         world.compile(spec(extra=cube + BALL.format(z=0.05)), (TrackedObject("cube", "blue", (0.06,) * 3), BALL_OBJECT))
     )
@@ -197,7 +201,7 @@ def test_extend_refuses_what_overlaps_and_leaves_the_world_as_it_was() -> None:
     world = make()
     world.step_tick()
     model, position = world.model, world.read_joints().position
-    cube = '<body name="cube" pos="0.5 0.06 .05"><freejoint name="cube"/><geom type="box" size=".03 .03 .03" mass=".1"/></body>'
+    cube = CUBE.format(pos="0.5 0.06 .05")
     with pytest.raises(OpenArmError, match=r"'cube' would overlap 'ball' by \d+ mm at \(0\.5") as caught:
         world.extend(world.compile(spec(extra=cube + BALL.format(z=0.05)), ()))
     assert caught.value.code is Code.SCENE_INVALID
@@ -211,7 +215,7 @@ def test_a_diverged_simulation_is_reported_and_a_reset_mends_it(
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a file there
     world = make()
     world.data.qvel[8] = np.nan
-    with pytest.raises(OpenArmError, match="diverged at 0.010 s") as caught:
+    with pytest.raises(OpenArmError, match=r"diverged at 0\.010 s") as caught:
         world.step_tick()
     assert caught.value.code is Code.INTERNAL
     world.reset()

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The physics thread and the controller on a small model: pace, pause, steps, faults, commands."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_sim_bridge.actuation import End, TrajectoryConfig, TrajectoryOutcome
+from openarm_sim_bridge.controller import RobotController
+from openarm_sim_bridge.gripper import GripperConfig
+from openarm_sim_bridge.simulation import Simulation
+from openarm_sim_bridge.trajectory import JointGroup, Trajectory
+from openarm_sim_bridge.world import JointReadout, World
+
+MODEL = """
+<mujoco><compiler angle="radian"/><option timestep="0.002" gravity="0 0 0" integrator="implicitfast"/><worldbody>
+<body name="arm"><joint name="j1" axis="0 1 0" damping="1" armature=".05"/>
+<geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
+<body name="tip" pos=".3 0 0"><joint name="f1" type="slide" axis="0 1 0" range="0 .044" limited="true"/>
+<geom type="box" size=".01 .01 .01"/></body></body></worldbody>
+<actuator><position name="f1" joint="f1" kp="2000" kv="40" forcerange="-30 30" ctrlrange="0 .044"/>
+<position name="j1" joint="j1" kp="200" kv="3" forcerange="-40 40"/></actuator></mujoco>"""
+ARM = JointGroup(("j1",), np.array([-1.0]), np.array([1.0]), np.array([5.0]))
+GRIPPER = JointGroup(("f1",), np.array([0.0]), np.array([0.044]), np.array([1.0]))
+
+
+def make_controller() -> tuple[World, RobotController]:
+    world = World(mujoco.MjSpec.from_string(MODEL), joint_names=("j1", "f1"), home={"f1": 0.01})
+    return world, RobotController({"right": ARM}, {"right": GRIPPER}, world, TrajectoryConfig(), GripperConfig())
+
+
+class Bench:
+    """A simulation and the states that it told."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        self.world, self.controller = make_controller()
+        self.states: list[tuple[float, JointReadout]] = []
+        self._told = threading.Condition()
+        self.simulation = Simulation(self.world, self.controller, self._observe, speed=speed)
+
+    def _observe(self, state: JointReadout) -> None:
+        with self._told:
+            self.states.append((time.monotonic(), state))
+            self._told.notify_all()
+
+    def wait(self, condition: Callable[[], object], timeout: float = 10.0) -> None:
+        with self._told:
+            assert self._told.wait_for(condition, timeout), "not in time"
+
+    @property
+    def t_ns(self) -> int:
+        return self.states[-1][1].t_ns if self.states else 0
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    out = Bench()
+    out.simulation.start()
+    yield out
+    out.simulation.stop()
+
+
+def test_a18_a19_ticks_keep_pace_with_the_wall_clock(bench: Bench) -> None:
+    bench.wait(lambda: len(bench.states) > 200)
+    (wall_0, first), (wall_1, last) = bench.states[50], bench.states[200]
+    assert last.t_ns - first.t_ns == 1_500_000_000
+    assert wall_1 - wall_0 == pytest.approx(1.5, abs=0.05)
+    assert bench.simulation.real_time_factor.value == pytest.approx(1.0, abs=0.05)
+    figures = bench.simulation.periods.figures()
+    assert figures.n > 150
+    assert figures.p50_ms == pytest.approx(10.0, abs=1.0)
+
+
+@pytest.mark.parametrize("speed", [5.0, 0.0])
+def test_a20_a_faster_world_is_still_told_at_a_hundred_hertz(speed: float) -> None:
+    bench = Bench(speed)
+    bench.simulation.start()
+    try:
+        bench.wait(lambda: len(bench.states) > 100)
+    finally:
+        bench.simulation.stop()
+    (wall_0, first), (wall_1, last) = bench.states[0], bench.states[-1]
+    assert len(bench.states) / (wall_1 - wall_0) < 120.0
+    ratio = (last.t_ns - first.t_ns) * 1e-9 / (wall_1 - wall_0)
+    assert ratio > 6.0 if speed == 0.0 else ratio == pytest.approx(speed, rel=0.1)
+
+
+def test_p25_a_paused_world_stands_shows_life_and_steps(bench: Bench) -> None:
+    bench.wait(lambda: len(bench.states) > 5)
+    bench.simulation.call(lambda: bench.simulation.set_paused(True)).result(1.0)
+    t_ns, n = bench.world.t_ns, len(bench.states)
+    bench.wait(lambda: len(bench.states) > n + 2)
+    assert bench.t_ns == t_ns
+    stepping = bench.simulation.call(lambda: bench.simulation.advance(13)).result(1.0)
+    assert stepping.result(2.0) == t_ns + 13 * 2_000_000
+    bench.wait(lambda: bench.t_ns == t_ns + 26_000_000)
+    bench.simulation.call(lambda: bench.simulation.set_paused(False)).result(1.0)
+    bench.wait(lambda: bench.t_ns > t_ns + 500_000_000)
+    gaps = np.diff([wall for wall, _ in bench.states[-30:]])
+    assert np.median(gaps) == pytest.approx(0.01, abs=0.002)  # the pause was not made up
+
+
+def test_steps_are_refused_where_they_make_no_sense(bench: Bench) -> None:
+    for steps, code in ((5, Code.NOT_READY), (0, Code.INVALID_ARGUMENT)):
+        with pytest.raises(OpenArmError) as caught:
+            bench.simulation.call(lambda n=steps: bench.simulation.advance(n)).result(1.0)
+        assert caught.value.code is code
+
+
+def test_an_error_in_a_call_reaches_the_caller_and_not_the_thread(bench: Bench) -> None:
+    def fail() -> None:
+        raise ValueError("wrong")
+
+    with pytest.raises(ValueError, match="wrong"):
+        bench.simulation.call(fail).result(1.0)
+    n = len(bench.states)
+    bench.wait(lambda: len(bench.states) > n + 3)
+
+
+def test_a_diverged_world_stands_until_it_is_reset(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a file there
+    bench.wait(lambda: len(bench.states) > 3)
+    bench.simulation.call(lambda: bench.world.data.qvel.fill(np.nan)).result(1.0)
+    deadline = time.monotonic() + 5.0
+    while not bench.simulation.fault:
+        assert time.monotonic() < deadline
+        bench.simulation.call(lambda: None).result(1.0)
+    assert "diverged" in bench.simulation.fault
+
+    def reset() -> None:
+        bench.world.reset()
+        bench.simulation.restart()
+
+    bench.simulation.call(reset).result(1.0)
+    t_ns = bench.world.t_ns
+    bench.wait(lambda: bench.t_ns > t_ns + 50_000_000)
+    assert np.all(np.isfinite(bench.states[-1][1].position))
+
+
+def test_stop_ends_the_thread_and_cancels_what_waits() -> None:
+    bench = Bench()
+    bench.simulation.start()
+    bench.wait(lambda: bench.states)
+    bench.simulation.stop()
+    n = len(bench.states)
+    left = bench.simulation.call(lambda: 1)
+    bench.simulation.stop()
+    assert left.cancelled()
+    assert len(bench.states) == n
+    assert "physics" not in [thread.name for thread in threading.enumerate()]
+
+
+def test_a_trajectory_moves_the_physical_joint(bench: Bench) -> None:
+    outcomes: list[TrajectoryOutcome] = []
+    arm = bench.controller.arms["right"]
+    goal = arm.check(Trajectory(("j1",), np.array([0.5]), np.array([[0.6]]), np.zeros((1, 1))))
+    position = bench.world.read_joints().position[:1]
+    bench.simulation.call(lambda: arm.start(goal, bench.world.t_ns, position, outcomes.append)).result(1.0)
+    bench.wait(lambda: outcomes)
+    assert outcomes[0].end is End.SUCCEEDED
+    assert bench.states[-1][1].position[0] == pytest.approx(0.6, abs=0.02)
+
+
+# --- the controller alone
+def test_a23_commands_may_be_partial_permuted_and_hold_unknown_names() -> None:
+    _, controller = make_controller()
+    command = controller.check_command(["f1", "tail", "j1"], [0.02, 1.0, 0.3])
+    assert dict(command.positions) == {"f1": 0.02, "j1": 0.3}
+    assert command.unknown == ("tail",)
+    assert controller.check_command(["j1"], [0.1]).unknown == ()
+
+
+@pytest.mark.parametrize(
+    ("names", "positions", "code", "message"),
+    [
+        (["j1"], [2.0], Code.LIMITS, r"position of j1 is 2\.0000, out of its limits -1\.0000 to 1\.0000"),
+        (["j1"], [float("nan")], Code.INVALID_ARGUMENT, "position of j1 is nan"),
+        (["j1", "f1"], [0.1], Code.INVALID_ARGUMENT, "2 names and 1 positions"),
+    ],
+)
+def test_bad_commands_are_refused_with_joint_and_value(
+    names: list[str], positions: list[float], code: Code, message: str
+) -> None:
+    _, controller = make_controller()
+    with pytest.raises(OpenArmError, match=message) as caught:
+        controller.check_command(names, positions)
+    assert caught.value.code is code
+
+
+def test_commands_for_a_joint_that_follows_a_goal_are_told() -> None:
+    world, controller = make_controller()
+    arm = controller.arms["right"]
+    arm.start(
+        arm.check(Trajectory(("j1",), np.array([0.5]), np.array([[0.6]]))), world.t_ns, np.zeros(1), lambda _o: None
+    )
+    command = controller.check_command(["f1", "j1"], [0.02, -0.3])
+    assert controller.busy(command) == ("j1",)
+    controller.command(command)
+    for _ in range(150):
+        world.set_targets(controller.update(world.read_joints(), world.period_ns))
+        world.step_tick()
+    np.testing.assert_allclose(world.read_joints().position, [0.6, 0.02], atol=0.01)
+
+
+def test_targets_stand_in_the_order_of_the_world_and_reset_holds() -> None:
+    world, controller = make_controller()
+    targets = controller.update(world.read_joints(), world.period_ns)
+    np.testing.assert_allclose(targets, [0.0, 0.01])
+    controller.command(controller.check_command(["f1"], [0.04]))
+    for _ in range(100):
+        controller.update(world.read_joints(), world.period_ns)
+    world.reset()
+    controller.reset(world.read_joints())
+    np.testing.assert_allclose(controller.update(world.read_joints(), world.period_ns), [0.0, 0.01])
+    assert controller.effort_limits() == {1: 30.0}
