@@ -130,7 +130,7 @@ class CollisionScene:
 
     def collides(self, q: ArrayLike) -> bool:
         """Whether some pair is nearer than it may be at the arm's configuration (n,)."""
-        self._q[self._robot.columns] = q
+        self._robot.put(self._q, q)
         return bool(pin.computeCollisions(self._robot.model, self._data, self._manager, self._q, True))
 
     def contacts(self, q: ArrayLike) -> list[Contact]:
@@ -192,7 +192,7 @@ class CollisionScene:
         self._q = self._robot.configuration(state)
 
     def _colliding(self, q: ArrayLike) -> list[int]:
-        self._q[self._robot.columns] = q
+        self._robot.put(self._q, q)
         pin.computeCollisions(self._robot.model, self._data, self._geometry, self._geometry_data, self._q, False)
         results = self._geometry_data.collisionResults
         return [k for k in range(len(self._pair_index)) if results[k].isCollision()]

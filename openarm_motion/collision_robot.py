@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.description import Primitive, RobotDescription
 from openarm_common.errors import Code, OpenArmError
@@ -42,22 +42,36 @@ class CollisionRobot:
         if not self.moving:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no link moved by {kinematics.names} has a collision shape")
         self.pairs: tuple[tuple[int, int], ...] = tuple(self._enabled(description))
-        names = list(self.model.names)
-        self._columns = {name: self.model.joints[i].idx_q for i, name in enumerate(names) if i > 0}
-        self._single = {name for i, name in enumerate(names) if i > 0 and self.model.joints[i].nq == 1}
+        self._joint_of = {name: self.model.joints[i] for i, name in enumerate(self.model.names) if i > 0}
         self.joints: tuple[int, ...] = tuple(self.model.getJointId(name) for name in kinematics.names)
-        self.columns = np.array([self._columns[name] for name in kinematics.names])
+        self._columns = np.array([self._joint_of[name].idx_q for name in kinematics.names])
+        self._endless = any(self._joint_of[name].nq != 1 for name in kinematics.names)
         self.levers: Array = np.zeros(kinematics.n)
         for shape in self.geometry.geometryObjects:
             self.levers = np.maximum(self.levers, self.levers_of(shape))
 
     def configuration(self, state: Mapping[str, float]) -> Array:
-        """Full configuration of the model; joints that `state` does not name are at 0."""
-        q = np.zeros(self.model.nq)
+        """Full configuration of the model; joints that `state` does not name are at 0, followers follow."""
+        q: Array = np.array(pin.neutral(self.model))
         for name, value in state.items():
-            if name in self._single:
-                q[self._columns[name]] = value
+            if name in self._joint_of:
+                self._set(q, name, value)
         return q
+
+    def put(self, full: Array, q: ArrayLike) -> None:
+        """Write the arm's joints (n,) into a full configuration."""
+        if not self._endless:
+            full[self._columns] = q
+            return
+        for name, value in zip(self.kinematics.names, np.asarray(q, dtype=np.float64), strict=True):
+            self._set(full, name, float(value))
+
+    def _set(self, full: Array, name: str, value: float) -> None:
+        joint = self._joint_of[name]
+        if joint.nq == 1:
+            full[joint.idx_q] = value
+        elif joint.nq == 2:  # pinocchio keeps a continuous joint as cosine and sine
+            full[joint.idx_q : joint.idx_q + 2] = np.cos(value), np.sin(value)
 
     def levers_of(self, shape: pin.GeometryObject) -> Array:
         """(n,) bounds of how far a point of a shape can be from each joint's axis, m; 1 m/m for a prismatic joint."""

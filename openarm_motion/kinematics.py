@@ -75,7 +75,7 @@ class ArmKinematics:
         self.tool_link = tool_link
         self.names: tuple[str, ...] = tuple(names)
         lower, upper = description.limits(self.names)
-        unlimited = ~(upper > lower)
+        unlimited = ~(np.isfinite(lower) & np.isfinite(upper))
         self.lower: Array = np.where(unlimited, -_CONTINUOUS, lower)
         self.upper: Array = np.where(unlimited, _CONTINUOUS, upper)
         self.placements: Array = np.array(placements)

@@ -13,7 +13,6 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_motion.arm import Arm, Situation, first_contact, segment_time
 from openarm_motion.cartesian import line_contact, solve_line
 from openarm_motion.collision import Box, CollisionScene
-from openarm_motion.inverse import Solution
 from openarm_motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -110,18 +109,6 @@ def to_pose_on_line(arm: Arm, now: Situation, pose: Array, around: Around) -> Tr
         faults.append(OpenArmError(Code.IN_COLLISION, f"on the straight line {contact}"))
     worst = next((fault for fault in faults if fault.code == Code.IN_COLLISION), faults[0])
     raise OpenArmError(worst.code, f"{arm.name} arm: {worst.message}")
-
-
-def solve_ik(arm: Arm, pose: Array, seed: Array, *, free_orientation: bool = False) -> tuple[Solution, float, float]:
-    """Configuration at a pose, near to `seed` where there are several; with its position and orientation error.
-
-    Raises:
-        OpenArmError: UNREACHABLE, with the nearest reachable pose.
-    """
-    result = arm.inverse.nearest(pose, seed, position_only=free_orientation)
-    if not result.success:
-        raise unreachable(arm, pose, free_orientation=free_orientation, margin=0.0)
-    return arm.inverse.classify(result.q), result.position_error, result.orientation_error
 
 
 def unreachable(arm: Arm, pose: Array, *, free_orientation: bool, margin: float | None = None) -> OpenArmError:

@@ -163,7 +163,7 @@ def time_polyline(names: Sequence[str], waypoints: Array, limits: JointLimits, p
         s, ds, dds, _ = way.at(t)
         q = start + s[:, None] * difference
         q[-1] = end
-        parts.append(Trajectory(tuple(names), t, q, ds[:, None] * difference, dds[:, None] * difference))
+        parts.append(_at_rest(tuple(names), t, q, ds[:, None] * difference, dds[:, None] * difference))
     return _joined(tuple(names), parts, waypoints[0], period)
 
 
@@ -205,7 +205,7 @@ def time_path(
     q1, q2 = d1(x[:, 0]), d2(x[:, 0])
     q = np.asarray(curve(x[:, 0]))
     q[0], q[-1] = path[0], path[-1]
-    return Trajectory(tuple(names), t, q, q1 * dx, q2 * dx**2 + q1 * ddx)
+    return _at_rest(tuple(names), t, q, q1 * dx, q2 * dx**2 + q1 * ddx)
 
 
 def _sample_times(way: Profile, period: float) -> Array:
@@ -216,6 +216,13 @@ def _sample_times(way: Profile, period: float) -> Array:
     borders[-1] = way.duration
     far = np.min(np.abs(grid[:, None] - borders[None, :]), axis=1) > _SPACING
     return np.sort(np.concatenate([grid[far], borders]))
+
+
+def _at_rest(names: tuple[str, ...], t: Array, q: Array, v: Array, a: Array) -> Trajectory:
+    """A trajectory whose ends are at rest to the last bit: controllers refuse one that ends with a velocity."""
+    v[[0, -1]] = 0.0
+    a[[0, -1]] = 0.0
+    return Trajectory(names, t, q, v, a)
 
 
 def _joined(names: tuple[str, ...], parts: list[Trajectory], q: Array, period: float) -> Trajectory:

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Follows trajectories of one arm: sends them to its FollowJointTrajectory controller, watches, and checks the end.
+
+Time of the robot is the stamp of the joint states, so a slow or paused simulation does not count as a stuck arm; time
+without any joint state is wall clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from control_msgs.action import FollowJointTrajectory
+from rclpy.action import ActionClient
+from rclpy.task import Future
+from trajectory_msgs.msg import JointTrajectory
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.node import BaseNode
+from openarm_common.tf import RobotStateListener
+from openarm_motion.arm import Arm
+from openarm_motion.checks import Motion
+
+#: Between two looks at a running motion, s of wall clock.
+_WATCH = 0.05
+#: A controller has this long to accept, to refuse, or to end a cancelled motion, s of wall clock.
+_ANSWER = 2.0
+#: Controllers that are not seen in the graph in so many looks one after the other are gone.
+_GONE = 6
+
+_RESULT = FollowJointTrajectory.Result
+_FAULTS = {
+    _RESULT.INVALID_GOAL: "INVALID_GOAL",
+    _RESULT.INVALID_JOINTS: "INVALID_JOINTS",
+    _RESULT.OLD_HEADER_TIMESTAMP: "OLD_HEADER_TIMESTAMP",
+    _RESULT.PATH_TOLERANCE_VIOLATED: "PATH_TOLERANCE_VIOLATED",
+    _RESULT.GOAL_TOLERANCE_VIOLATED: "GOAL_TOLERANCE_VIOLATED",
+}
+
+
+@dataclass(frozen=True)
+class Running:
+    """A motion on its way, and the robot time of its beginning."""
+
+    motion: Motion
+    since_ns: int
+
+    def rest(self, now_ns: int) -> Motion:
+        """What is left of it, beginning now."""
+        return Motion(self.motion.names, self.motion.t - (now_ns - self.since_ns) * 1e-9, self.motion.q)
+
+
+class Follower:
+    """Executes one motion of one arm at a time.
+
+    Args:
+        node: The node that owns client and timers.
+        arm: The arm.
+        states: The robot's joint states.
+    """
+
+    def __init__(self, node: BaseNode[Any], arm: Arm, states: RobotStateListener) -> None:
+        self._node, self._arm, self._states = node, arm, states
+        self._topic = arm.config.controller.format(arm=arm.name)
+        self._client = ActionClient(node, FollowJointTrajectory, self._topic)
+        self.running: Running | None = None
+
+    async def follow(
+        self,
+        message: JointTrajectory,
+        motion: Motion,
+        cancelled: Callable[[], bool],
+        progress: Callable[[float], None],
+    ) -> None:
+        """Send a trajectory and return when the arm has arrived.
+
+        Args:
+            message: The trajectory, as it goes to the controller.
+            motion: The same for the checks.
+            cancelled: Whether to stop; the controller then holds.
+            progress: Called with 0 to 1 while the arm moves.
+
+        Raises:
+            OpenArmError: NOT_READY, without controller or joint states; ROBOT_LOST, when either vanishes on the way;
+                EXECUTION_FAILED, with the controller's reason or the joint that did not arrive; TIMEOUT; CANCELLED.
+        """
+        self._require_ready()
+        watch = _Watch(self._node)
+        try:
+            self.running = Running(motion, self._states.buffer.latest()[0])
+            await self._send(watch, message, motion, cancelled, progress)
+            await self._arrive(watch, motion, cancelled)
+        finally:
+            self.running = None
+            watch.close()
+        progress(1.0)
+
+    def _require_ready(self) -> None:
+        age = self._states.age_s()
+        if age > self._arm.config.execution.stale_after:
+            when = "none yet" if math.isinf(age) else f"the last is {age:.1f} s old"
+            raise OpenArmError(Code.NOT_READY, f"no fresh /joint_states ({when}); is the bridge or driver running?")
+        if not self._client.server_is_ready():
+            raise OpenArmError(Code.NOT_READY, f"no controller offers {self._topic}; is the bridge or driver running?")
+
+    async def _send(
+        self,
+        watch: _Watch,
+        message: JointTrajectory,
+        motion: Motion,
+        cancelled: Callable[[], bool],
+        progress: Callable[[float], None],
+    ) -> None:
+        goal = FollowJointTrajectory.Goal(trajectory=message)
+        sent = self._client.send_goal_async(goal)
+        try:
+            if not await watch.until(sent.done, lambda: self._raise_if_lost(watch), _ANSWER):
+                raise OpenArmError(Code.ROBOT_LOST, f"{self._topic} did not answer a goal within {_ANSWER:g} s")
+        except OpenArmError:
+            # should it be accepted yet, it is withdrawn
+            sent.add_done_callback(lambda f: f.result().cancel_goal_async() if f.result().accepted else None)
+            raise
+        handle = sent.result()
+        if not handle.accepted:
+            raise OpenArmError(Code.EXECUTION_FAILED, f"{self._topic} rejected the trajectory")
+        result = handle.get_result_async()
+        limit_ns = (motion.duration + self._arm.config.execution.overtime) * 1e9
+        cancelling: Future | None = None
+
+        def look() -> None:
+            nonlocal cancelling
+            self._raise_if_lost(watch)
+            elapsed = self._elapsed_ns()
+            progress(min(1.0, elapsed * 1e-9 / max(motion.duration, 1e-3)))
+            if elapsed > limit_ns:
+                raise OpenArmError(
+                    Code.TIMEOUT,
+                    f"{self._topic} has not ended {elapsed * 1e-9:.1f} s after a start of {motion.duration:.1f} s",
+                )
+            if cancelling is None and cancelled():
+                cancelling = handle.cancel_goal_async()
+                watch.restart()
+            if cancelling is not None and watch.elapsed() > _ANSWER:
+                raise OpenArmError(Code.CANCELLED, f"cancelled, but {self._topic} did not confirm that it holds")
+
+        try:
+            await watch.until(result.done, look, math.inf)
+        except OpenArmError:
+            handle.cancel_goal_async()
+            raise
+        answer = result.result().result
+        if cancelling is not None and answer.error_code != _RESULT.SUCCESSFUL:
+            raise OpenArmError(Code.CANCELLED, f"cancelled; the {self._arm.name} arm holds where it is")
+        if answer.error_code != _RESULT.SUCCESSFUL:
+            fault = _FAULTS.get(answer.error_code, str(answer.error_code))
+            reason = f": {answer.error_string}" if answer.error_string else ""
+            raise OpenArmError(Code.EXECUTION_FAILED, f"controller of the {self._arm.name} arm: {fault}{reason}")
+        if cancelling is not None and cancelled():
+            raise OpenArmError(Code.CANCELLED, f"cancelled as the {self._arm.name} arm arrived; it holds there")
+
+    async def _arrive(self, watch: _Watch, motion: Motion, cancelled: Callable[[], bool]) -> None:
+        """Wait until the joints are where the motion ends; what a controller says is not evidence."""
+        config = self._arm.config.execution
+        arrived_ns = self._states.buffer.latest()[0]
+
+        def ended() -> bool:
+            late = self._states.buffer.latest()[0] - arrived_ns > config.settle * 1e9
+            return late or cancelled() or self._worst(motion)[1] <= config.goal_tolerance
+
+        await watch.until(ended, lambda: self._raise_if_lost(watch), math.inf)
+        name, error = self._worst(motion)
+        if error > config.goal_tolerance:
+            if cancelled():
+                raise OpenArmError(Code.CANCELLED, f"cancelled; the {self._arm.name} arm holds where it is")
+            raise OpenArmError(
+                Code.EXECUTION_FAILED,
+                f"{name} ended {error:.3f} rad from its goal, expected within {config.goal_tolerance:g}; blocked?",
+            )
+
+    def _worst(self, motion: Motion) -> tuple[str, float]:
+        now = self._states.buffer.latest()[1]
+        errors = {name: abs(now[name] - float(motion.q[-1, i])) for i, name in enumerate(motion.names)}
+        name = max(errors, key=lambda key: errors[key])
+        return name, errors[name]
+
+    def _elapsed_ns(self) -> int:
+        return self._states.buffer.latest()[0] - self.running.since_ns if self.running else 0
+
+    def _raise_if_lost(self, watch: _Watch) -> None:
+        age, limit = self._states.age_s(), self._arm.config.execution.stale_after
+        if age > limit and not watch.starved:
+            raise OpenArmError(Code.ROBOT_LOST, f"no /joint_states for {age:.1f} s, expected one within {limit:g} s")
+        watch.missing = 0 if self._client.server_is_ready() else watch.missing + 1
+        if watch.missing >= _GONE:
+            raise OpenArmError(Code.ROBOT_LOST, f"controller {self._topic} is gone")
+
+
+class _Watch:
+    """Wakes a coroutine at a steady pace until something holds."""
+
+    def __init__(self, node: BaseNode[Any]) -> None:
+        self._node = node
+        self._next = Future(executor=node.executor)
+        self._timer = node.create_timer(_WATCH, self._tick, clock=node.wall_clock)
+        self._last_ns = self._start_ns = node.wall_clock.now().nanoseconds
+        #: Looks in a row at which the controller was not in the graph.
+        self.missing = 0
+        #: The last pause was this process's own: messages may be waiting unread.
+        self.starved = False
+
+    def restart(self) -> None:
+        """Count `elapsed` from now."""
+        self._start_ns = self._node.wall_clock.now().nanoseconds
+
+    def elapsed(self) -> float:
+        """Wall clock since the beginning or the last `restart`, s."""
+        return (self._node.wall_clock.now().nanoseconds - self._start_ns) * 1e-9
+
+    async def until(self, done: Callable[[], bool], look: Callable[[], None], limit: float) -> bool:
+        """Call `look` at each wake until `done` or for `limit` seconds; returns whether it is done."""
+        self.restart()
+        while not done():
+            if self.elapsed() > limit:
+                return False
+            await self._next
+            if done():
+                break
+            look()
+        return True
+
+    def close(self) -> None:
+        """Stop waking."""
+        self._node.destroy_timer(self._timer)
+
+    def _tick(self) -> None:
+        now = self._node.wall_clock.now().nanoseconds
+        self.starved = (now - self._last_ns) * 1e-9 > 4.0 * _WATCH
+        self._last_ns = now
+        current, self._next = self._next, Future(executor=self._node.executor)
+        current.set_result(None)

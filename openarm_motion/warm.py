@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiles every numba kernel of this package, so that the first plan of a process does not wait for that."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from openarm_common.description import SIDES, RobotDescription
+from openarm_motion.cartesian import solve_line
+from openarm_motion.inverse import InverseKinematics
+from openarm_motion.kinematics import ArmKinematics
+
+
+def warm() -> None:
+    """Run each kernel once with the types that the package uses; the compiled code is cached beside the sources."""
+    description = RobotDescription.load()
+    kinematics = ArmKinematics(description, description.tcp_link(SIDES[0]))
+    inverse = InverseKinematics(kinematics)
+    q = 0.5 * (kinematics.lower + kinematics.upper)
+    pose = kinematics.fk_many(np.stack([q, q]))[0]
+    kinematics.jacobian(q)
+    inverse.nearest(pose, q)
+    inverse.position_solutions(pose, near=q)
+    inverse.solutions(pose, near=q)
+    away = pose.copy()
+    away[2, 3] += 0.01
+    solve_line(inverse, inverse.classify(q), pose, away, margin=0.0)
+
+
+if __name__ == "__main__":
+    warm()
