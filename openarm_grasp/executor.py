@@ -68,7 +68,7 @@ class GraspExecutor:
         self._timer.cancel()
         self._silence = Silence(_STARVED_S)
         self._hands = {arm: HandReader(node.description, self._robot.buffer, arm) for arm in ARMS}
-        self._cancelled = False
+        self._cancelled = self._active = False
 
     # --- begin, end, cancel
     async def begin(self, *, moves: bool) -> None:
@@ -79,6 +79,7 @@ class GraspExecutor:
         """
         self._cancelled = False
         self._silence = Silence(_STARVED_S)
+        self._active = True
         self._robot.enable(True)
         self._timer.reset()
         deadline = time.monotonic() + self._config.limits.ready_timeout
@@ -90,9 +91,18 @@ class GraspExecutor:
 
     def end(self) -> None:
         """Stop listening."""
+        if not self._active:
+            return
+        self._active = False
         self._stop_looking()
         self._timer.cancel()
         self._robot.enable(False)
+
+    def close(self) -> None:
+        """Take the clients down."""
+        self.end()
+        for client in (self._plan, self._execute, self._move, *self._grippers.values()):
+            client.destroy()
 
     def cancel(self) -> None:
         """Let the running recipe end with CANCELLED and the arm hold."""
@@ -172,12 +182,21 @@ class GraspExecutor:
         executor = self._node.executor
         if executor is None:
             raise OpenArmError(Code.INTERNAL, "the grasp node is not in an executor")
-        tasks: list[Future] = [executor.create_task(self._one, part) for part in effect.effects]
+        faults: list[OpenArmError] = []
+
+        async def carry_out(part: Effect) -> None:
+            # An exception that leaves a task would stop the whole executor.
+            try:
+                await self._one(part)
+            except OpenArmError as error:
+                faults.append(error)
+
+        tasks: list[Future] = [executor.create_task(carry_out, part) for part in effect.effects]
         # All end, also those beside one that failed: they watch the same cancel, robot and deadlines.
         while not all(task.done() for task in tasks):
             await self._tick()
-        for task in tasks:
-            task.result()
+        if faults:
+            raise faults[0]
 
     # --- waiting
     def _on_tick(self) -> None:
@@ -338,10 +357,13 @@ class GraspExecutor:
         goal.command.position = [effect.position]
         result = await self._goal(self._grippers[effect.arm], goal, self._config.limits.gripper_timeout, what)
         if effect.position > 0.0:
-            reached = hand.finger()
-            if reached < effect.position - self._config.hand.open_tolerance:
-                text = f"{what}: the fingers stopped at {reached * 1e3:.1f} mm of {effect.position * 1e3:.0f} mm"
-                raise OpenArmError(Code.EXECUTION_FAILED, text)
+            # The result may be here before the joint state that shows it.
+            least, end_ns = effect.position - self._config.hand.open_tolerance, self.now_ns + SPEED_WINDOW_NS
+            limit = self._config.limits.answer_timeout
+            await self._until(lambda: hand.finger() >= least or self.now_ns > end_ns, limit, what)
+            if hand.finger() < least:
+                reached = f"{hand.finger() * 1e3:.1f} mm of {effect.position * 1e3:.0f} mm"
+                raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers stopped at {reached}")
         elif not (result.stalled or result.reached_goal):
             raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers neither arrived nor met anything")
 

@@ -12,6 +12,7 @@ from openarm_interfaces.msg import GraspStatus
 from openarm_interfaces.srv import Grasp
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
+from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
@@ -28,6 +29,9 @@ from openarm_grasp.states import State
 
 OnStatus = Callable[[GraspStatus], None]
 
+#: Latched, and deep enough that two transitions in a row both arrive.
+_QOS_STATUS = QoSProfile(depth=20, reliability=QOS_LATCHED.reliability, durability=QOS_LATCHED.durability)
+
 
 class GraspNode(BaseNode[GraspConfig]):
     """Serves one grasp at a time; asking for another while one runs is answered at once with BUSY."""
@@ -39,8 +43,8 @@ class GraspNode(BaseNode[GraspConfig]):
         self._executor = GraspExecutor(self, self.config)
         self._running = False
         self._goal: ServerGoalHandle | None = None
-        self._status = self.create_publisher(GraspStatus, "/grasp/status", QOS_LATCHED)
-        self._markers = self.create_publisher(MarkerArray, "/grasp/markers", QOS_LATCHED)
+        self._status_topic = self.create_publisher(GraspStatus, "/grasp/status", _QOS_STATUS)
+        self._marker_topic = self.create_publisher(MarkerArray, "/grasp/markers", QOS_LATCHED)
         self.create_service(Grasp, "/grasp", self._on_grasp)
         self._pick = ActionServer(
             self, Pick, "/grasp/pick", execute_callback=self._on_pick, cancel_callback=self._on_cancel
@@ -49,7 +53,7 @@ class GraspNode(BaseNode[GraspConfig]):
 
     def close(self) -> None:
         """Stop listening and take the action down."""
-        self._executor.end()
+        self._executor.close()
         self._pick.destroy()
         super().close()
 
@@ -106,8 +110,8 @@ class GraspNode(BaseNode[GraspConfig]):
     async def _run(self, request: GraspRequest, on_status: OnStatus | None) -> GraspOutcome:
         recipe = self._machine.step(request, self._executor.now_ns)
         while recipe:
-            self._tell(on_status)
             try:
+                self._tell(on_status)
                 outcome = await self._executor.perform(recipe)
             except Exception as error:
                 # A fault of this program: the request must still be answered, and the next one served.
@@ -144,7 +148,7 @@ class GraspNode(BaseNode[GraspConfig]):
     def _tell(self, on_status: OnStatus | None) -> None:
         machine, t_ns = self._machine, self._executor.now_ns
         status = convert.status_msg(machine, t_ns)
-        self._status.publish(status)
+        self._status_topic.publish(status)
         if on_status is not None:
             on_status(status)
         if machine.memory is None and machine.outcome is None:
@@ -155,7 +159,7 @@ class GraspNode(BaseNode[GraspConfig]):
         memory = machine.memory
         if memory is not None and machine.state in (State.PLAN, State.MOVE_TO_PREGRASP):
             chosen = memory.candidate.id if memory.candidate else ""
-            self._markers.publish(convert.candidate_markers(memory.offered, chosen, t_ns))
+            self._marker_topic.publish(convert.candidate_markers(memory.offered, chosen, t_ns))
 
     def _shoulder(self, arm: str) -> tuple[float, float]:
         """(x, y) of the arm's first joint, base frame, m."""
