@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of detections."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from openarm_common.config import load_config
+from openarm_common.errors import OpenArmError
+from openarm_common.resources import config_dir
+from openarm_perception.depth import DepthLimits
+from openarm_perception.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.draw import annotate
+from openarm_perception.localize import Localizer, LocalizerConfig
+from openarm_perception.pipeline import Pipeline
+
+
+@pytest.fixture(scope="module")
+def pipeline(tabletop) -> Pipeline:
+    """Detector and localiser with their defaults."""
+    colors = load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig)
+    return Pipeline(ColorDetector(colors), Localizer(LocalizerConfig(), DepthLimits(near=0.07), tabletop.table_height))
+
+
+def run(pipeline: Pipeline, view):
+    """What a view shows."""
+    return pipeline.run(view.rgb, view.depth, view.intrinsics, view.T_base_camera)
+
+
+def test_located_and_refused_objects_look_different_and_the_input_stays(tabletop, pipeline) -> None:
+    whole = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.25, -0.2, 0.3)
+    cut = tabletop.Thing("blue", "box", (0.06, 0.06, 0.06), 0.25, 0.51)
+    view = tabletop.render([whole, cut])
+    before = view.rgb.copy()
+    perceived = run(pipeline, view)
+    assert ([p.label for p in perceived.located], len(perceived.refused)) == (["red"], 1)
+    picture = annotate(view.rgb, perceived)
+    np.testing.assert_array_equal(view.rgb, before)
+    drawn = (picture != view.rgb).any(axis=-1)
+    colors = {tuple(color) for color in picture[drawn].tolist()}
+    assert {(0, 120, 140), (190, 40, 40)} <= colors
+    red = next(d for d in perceived.found if d.label == "red")
+    u, v = (round(c) for c in red.centre)
+    np.testing.assert_array_equal(picture[v, u], view.rgb[v, u])  # no tag lies on the object
+
+
+def test_b30_colour_of_another_size_is_refused(tabletop, pipeline) -> None:
+    view = tabletop.render([])
+    with pytest.raises(OpenArmError, match="colour image is 320x240"):
+        pipeline.run(view.rgb[::2, ::2], view.depth, view.intrinsics, view.T_base_camera)
+
+
+def test_b27_the_pipeline_ranks_and_filters(tabletop, pipeline) -> None:
+    """By policy, and by label."""
+    near = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.27, 0.0)
+    far = tabletop.Thing("blue", "cylinder", (0.05, 0.05, 0.06), 0.2, 0.3)
+    view = tabletop.render([near, far])
+    central = Pipeline(pipeline.detector, pipeline.localizer, "centre")
+    assert [p.label for p in run(central, view).located] == ["red", "blue"]
+    only = Pipeline(pipeline.detector, pipeline.localizer, label="blue")
+    assert [p.label for p in run(only, view).located] == ["blue"]
