@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 
 #: Depth with less noise than this is used as it is, m; 16UC1 alone rounds by 0.3 mm (1 sigma).
 _CLEAN = 0.0006
+#: As many points of the sides as this are enough; tall objects show thousands.
+_SIDE_POINTS = 150
 #: Pixels around a detection that are looked at.
 _MARGIN = 4
 
@@ -164,6 +166,7 @@ class Localizer:
         face = self._top_face(patch, top)
         pixel = float(np.median(patch.z[solid])) / intrinsics.fx
         sides = patch.points[solid & (patch.points[..., 2] < top - patch.band), :2]
+        sides = sides[:: max(1, len(sides) // _SIDE_POINTS)]
         edges, visible = self._edges(patch, face, top, T_base_camera[:3, 3])
         try:
             shape = footprint.fit(np.concatenate([edges, sides]), pixel)

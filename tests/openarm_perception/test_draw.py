@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from openarm_common.config import load_config
-from openarm_common.errors import OpenArmError
 from openarm_common.resources import config_dir
 from openarm_perception.depth import DepthLimits
 from openarm_perception.detector import ColorDetector, ColorDetectorConfig
@@ -43,20 +42,3 @@ def test_located_and_refused_objects_look_different_and_the_input_stays(tabletop
     red = next(d for d in perceived.found if d.label == "red")
     u, v = (round(c) for c in red.centre)
     np.testing.assert_array_equal(picture[v, u], view.rgb[v, u])  # no tag lies on the object
-
-
-def test_b30_colour_of_another_size_is_refused(tabletop, pipeline) -> None:
-    view = tabletop.render([])
-    with pytest.raises(OpenArmError, match="colour image is 320x240"):
-        pipeline.run(view.rgb[::2, ::2], view.depth, view.intrinsics, view.T_base_camera)
-
-
-def test_b27_the_pipeline_ranks_and_filters(tabletop, pipeline) -> None:
-    """By policy, and by label."""
-    near = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.27, 0.0)
-    far = tabletop.Thing("blue", "cylinder", (0.05, 0.05, 0.06), 0.2, 0.3)
-    view = tabletop.render([near, far])
-    central = Pipeline(pipeline.detector, pipeline.localizer, "centre")
-    assert [p.label for p in run(central, view).located] == ["red", "blue"]
-    only = Pipeline(pipeline.detector, pipeline.localizer, label="blue")
-    assert [p.label for p in run(only, view).located] == ["blue"]

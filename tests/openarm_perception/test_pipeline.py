@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From frames to objects."""
+
+from __future__ import annotations
+
+import pytest
+
+from openarm_common.config import load_config
+from openarm_common.errors import OpenArmError
+from openarm_common.resources import config_dir
+from openarm_perception.depth import DepthLimits
+from openarm_perception.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.localize import Localizer, LocalizerConfig
+from openarm_perception.pipeline import Pipeline
+
+
+@pytest.fixture(scope="module")
+def pipeline(tabletop) -> Pipeline:
+    """Detector and localiser with their defaults."""
+    colors = load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig)
+    return Pipeline(ColorDetector(colors), Localizer(LocalizerConfig(), DepthLimits(near=0.07), tabletop.table_height))
+
+
+def run(pipeline: Pipeline, view):
+    """What a view shows."""
+    return pipeline.run(view.rgb, view.depth, view.intrinsics, view.T_base_camera)
+
+
+def test_b30_colour_of_another_size_is_refused(tabletop, pipeline) -> None:
+    view = tabletop.render([])
+    with pytest.raises(OpenArmError, match="colour image is 320x240"):
+        pipeline.run(view.rgb[::2, ::2], view.depth, view.intrinsics, view.T_base_camera)
+
+
+def test_b27_the_pipeline_ranks_and_filters(tabletop, pipeline) -> None:
+    """By policy, and by label."""
+    near = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.27, 0.0)
+    far = tabletop.Thing("blue", "cylinder", (0.05, 0.05, 0.06), 0.2, 0.3)
+    view = tabletop.render([near, far])
+    central = Pipeline(pipeline.detector, pipeline.localizer, "centre")
+    assert [p.label for p in run(central, view).located] == ["red", "blue"]
+    only = Pipeline(pipeline.detector, pipeline.localizer, label="blue")
+    assert [p.label for p in run(only, view).located] == ["blue"]
