@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Choosing and planning approaches."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.approach import ApproachFailedError, ApproachRequest, Target, plan_approach
+from openarm_motion.arm import Arm
+from openarm_motion.collision import Box, box_from
+
+TABLE_Z = 0.40
+UP = np.array([0.0, 0.0, 0.12])
+
+
+def grasp(name: str, x: float, y: float, height: float, yaw: float, tilt: float = 0.0, score: float = 1.0) -> Target:
+    """Grasp from above, leaning by `tilt` across the opening axis, tips 12 mm over the table at least."""
+    opening = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    z = np.array([0.0, 0.0, -np.cos(tilt)]) + np.sin(tilt) * np.cross([0.0, 0.0, 1.0], opening)
+    tool = max(0.012 + 0.018 * np.sin(tilt), height / 2 - 0.017, height - 0.045 + 0.03 * np.sin(tilt))
+    pose = se3.make(se3.rotation_from_z_y(z, opening), (x, y, TABLE_Z + tool))
+    return Target(name, pose, -0.08 * z, UP, score)
+
+
+def targets(x: float, y: float, height: float, yaw: float) -> tuple[Target, ...]:
+    """24 targets: four tilts, both faces, both leans (the tool turned by half), two nudged."""
+    found = []
+    for tilt in (0.0, 15.0, 30.0, 45.0):
+        for k in range(4):
+            name = f"tilt{tilt:g}/{k}"
+            found.append(grasp(name, x, y, height, yaw + k * np.pi / 2, np.radians(tilt), 1.0 - tilt / 90.0))
+        for k in range(2):
+            found.append(grasp(f"tilt{tilt:g}/high{k}", x, y, height + 0.01, yaw + k * np.pi, np.radians(tilt), 0.4))
+    return tuple(found)
+
+
+def cube(x: float, y: float, height: float = 0.05, yaw: float = 0.0, width: float = 0.05) -> Box:
+    return box_from("cube", (x, y, TABLE_Z + height / 2), (width, width, height), se3.rot_z(yaw))
+
+
+def assert_tool_straight(arm: Arm, q: np.ndarray, T_a: np.ndarray, T_b: np.ndarray) -> None:
+    poses = arm.kinematics.fk_many(q)
+    np.testing.assert_allclose(poses[0], T_a, atol=1e-6)
+    np.testing.assert_allclose(poses[-1], T_b, atol=1e-6)
+    d = (T_b - T_a)[:3, 3] / np.linalg.norm((T_b - T_a)[:3, 3])
+    offset = poses[:, :3, 3] - T_a[:3, 3]
+    assert np.abs(offset - np.outer(offset @ d, d)).max() < 1e-4
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_b47_a_grasp_is_approached_and_lifted_on_straight_lines(
+    arms: dict[str, Arm], home: dict[str, float], side: str
+) -> None:
+    arm = arms[side]
+    y = 0.22 if side == "left" else -0.22
+    request = ApproachRequest(
+        targets=targets(0.26, y, 0.05, 0.3),
+        obstacles=(cube(0.26, y, 0.05, 0.3),),
+        touchable=frozenset({"cube"}),
+        attached_after=True,
+    )
+    plan = plan_approach(arm, arm.situation(home), request)
+    target = request.targets[plan.chosen]
+    assert target.score == 1.0
+    before, after = target.pose.copy(), target.pose.copy()
+    before[:3, 3] += target.approach_offset
+    after[:3, 3] += target.retreat_offset
+    times = np.linspace(0.0, 10.0, 500)
+    assert_tool_straight(arm, plan.approach.at(times)[0], before, target.pose)
+    assert_tool_straight(arm, plan.retreat.at(times)[0], target.pose, after)
+    np.testing.assert_allclose(plan.transfer.q[0], [home[name] for name in arm.names], atol=1e-9)
+    np.testing.assert_allclose(plan.transfer.q[-1], plan.approach.q[0], atol=1e-9)
+    np.testing.assert_allclose(plan.approach.q[-1], plan.retreat.q[0], atol=1e-9)
+    assert arm.kinematics.margin(plan.approach.q[-1]) >= 0.05
+    # one branch all the way
+    branches = {arm.inverse.classify(q).branch for q in (*plan.approach.q, *plan.retreat.q)}
+    assert len(branches) == 1
+    # what is held afterwards is the cube, seen from the tool
+    np.testing.assert_allclose(target.pose @ plan.held_after[0].T, request.obstacles[0].T, atol=1e-12)
+
+
+def test_every_moment_of_a_plan_is_free_of_what_it_must_not_touch(right: Arm, home: dict[str, float]) -> None:
+    obstacles = (cube(0.27, -0.2), box_from("can", (0.27, -0.34, TABLE_Z + 0.055), (0.066, 0.066, 0.11)))
+    request = ApproachRequest(targets(0.27, -0.2, 0.05, 0.0), obstacles, (), frozenset({"cube"}), attached_after=True)
+    plan = plan_approach(right, right.situation(home), request)
+    opened = right.with_gripper(home, 0.044)
+    free = right.scene(opened, obstacles)
+    for q in plan.transfer.at(np.linspace(0, plan.transfer.duration, 200))[0]:
+        assert not free.collides(q)
+    near = right.scene(opened, obstacles, touchable=frozenset({"cube"}), straight=True)
+    for q in plan.approach.at(np.linspace(0, plan.approach.duration, 100))[0]:
+        assert not near.collides(q)
+    held = right.scene(right.with_gripper(home, 0.025), obstacles[1:], plan.held_after, straight=True)
+    for q in plan.retreat.at(np.linspace(0, plan.retreat.duration, 100))[0]:
+        assert not held.collides(q)
+
+
+def test_a_place_leaves_the_object_and_draws_back_with_open_fingers(right: Arm, home: dict[str, float]) -> None:
+    state = right.with_gripper(home, 0.025)
+    held = Box("cube", np.eye(4), np.array([0.05, 0.05, 0.05]))
+    place = tuple(
+        replace(
+            t,
+            pose=se3.make(t.pose[:3, :3], (0.24, -0.30, TABLE_Z + 0.026)),
+            approach_offset=np.array([0, 0, 0.1]),
+            retreat_offset=-0.08 * t.pose[:3, 2],
+        )
+        for t in targets(0.24, -0.30, 0.05, 0.0)[:4]
+    )
+    plan = plan_approach(right, right.situation(state), ApproachRequest(place, (), (held,), detached_after=True))
+    assert plan.held_after == ()
+    standing = Box("cube", place[plan.chosen].pose, held.size)
+    near = right.scene(right.with_gripper(home, 0.044), [standing], touchable=frozenset({"cube"}), straight=True)
+    for q in plan.retreat.at(np.linspace(0, plan.retreat.duration, 100))[0]:
+        assert not near.collides(q)
+    carried = right.scene(state, (), (held,), straight=True)
+    for q in plan.approach.at(np.linspace(0, plan.approach.duration, 100))[0]:
+        assert not carried.collides(q)
+    assert all(not right.scene(state, (), (held,)).collides(q) for q in plan.transfer.q)
+
+
+def test_the_higher_score_is_chosen_where_it_can_be_reached(right: Arm, home: dict[str, float]) -> None:
+    steep = grasp("steep", 0.26, -0.22, 0.05, 0.0, np.radians(30.0), score=0.9)
+    upright = grasp("upright", 0.26, -0.22, 0.05, 0.0, 0.0, score=0.2)
+    for order in ((steep, upright), (upright, steep)):
+        plan = plan_approach(right, right.situation(home), ApproachRequest(order))
+        assert order[plan.chosen].id == "steep"
+    wall = box_from("wall", (0.26, -0.05, TABLE_Z + 0.1), (0.3, 0.02, 0.2))
+    leaning = grasp("leaning", 0.26, -0.12, 0.05, 0.0, np.radians(-45.0), score=0.9)
+    straight = grasp("straight", 0.26, -0.20, 0.05, np.pi / 2, 0.0, score=0.1)
+    plan = plan_approach(right, right.situation(home), ApproachRequest((leaning, straight), (wall,)))
+    if plan.chosen == 1:
+        assert plan.refusals[0].id == "leaning"
+
+
+def test_refusals_say_why(right: Arm, home: dict[str, float]) -> None:
+    far = grasp("far", 0.60, -0.22, 0.05, 0.0)
+    buried = grasp("buried", 0.26, -0.22, 0.05, 0.0)
+    buried.pose[2, 3] = TABLE_Z - 0.03
+    with pytest.raises(ApproachFailedError) as caught:
+        plan_approach(right, right.situation(home), ApproachRequest((far, buried)))
+    by_id = {refusal.id: refusal for refusal in caught.value.refusals}
+    assert by_id["far"].code == Code.UNREACHABLE
+    assert "mm short" in by_id["far"].message
+    assert "nearest reachable pose" in by_id["far"].message
+    assert by_id["buried"].code == Code.IN_COLLISION
+    assert "table" in by_id["buried"].message
+    assert caught.value.code == Code.IN_COLLISION
+    assert caught.value.message.startswith("right arm: buried: ")
+    assert "1 other targets refused" in caught.value.message
+
+
+def test_an_object_in_the_way_refuses_only_the_targets_that_it_blocks(right: Arm, home: dict[str, float]) -> None:
+    across = grasp("across", 0.27, -0.22, 0.06, 0.0)  # opens along x
+    along = grasp("along", 0.27, -0.22, 0.06, np.pi / 2)  # opens along y
+    neighbour = box_from("neighbour", (0.355, -0.22, TABLE_Z + 0.04), (0.05, 0.05, 0.08))
+    request = ApproachRequest((across, along), (cube(0.27, -0.22, 0.06), neighbour), (), frozenset({"cube"}))
+    plan = plan_approach(right, right.situation(home), request)
+    assert request.targets[plan.chosen].id == "along"
+    assert plan.refusals[0].id == "across"
+    assert "neighbour" in plan.refusals[0].message
+
+
+def test_other_arm_in_the_way_is_an_obstacle_a68(arms: dict[str, Arm], home: dict[str, float]) -> None:
+    left, right = arms["left"], arms["right"]
+    # the left hand stands where the right one could grasp
+    taken = plan_approach(left, left.situation(home), ApproachRequest(targets(0.25, 0.0, 0.05, 0.0))).approach.q[-1]
+    there = {**home, **dict(zip(left.names, taken.tolist(), strict=True))}
+    request = ApproachRequest(targets(0.25, -0.01, 0.05, 0.0))
+    plan_approach(right, right.situation(home), request)
+    with pytest.raises(ApproachFailedError) as caught:
+        plan_approach(right, right.situation(there), request)
+    assert caught.value.code == Code.IN_COLLISION
+    assert "openarm_left_" in caught.value.message
+
+
+def test_24_targets_are_planned_quickly(right: Arm, home: dict[str, float]) -> None:
+    rng = np.random.default_rng(24)
+    took = []
+    for _ in range(15):
+        x, y, yaw = rng.uniform(0.18, 0.32), -rng.uniform(0.10, 0.38), rng.uniform(-np.pi, np.pi)
+        request = ApproachRequest(
+            targets(x, y, 0.05, yaw), (cube(x, y, 0.05, yaw),), (), frozenset({"cube"}), attached_after=True
+        )
+        assert len(request.targets) == 24
+        begin = time.thread_time()
+        plan_approach(right, right.situation(home), request)
+        took.append(time.thread_time() - begin)
+    assert np.median(took) < 0.3
+
+
+def test_progress_is_reported_and_a_plan_can_be_cancelled(right: Arm, home: dict[str, float]) -> None:
+    reports: list[tuple[str, int]] = []
+    request = ApproachRequest(targets(0.26, -0.22, 0.05, 0.0))
+    plan_approach(right, right.situation(home), request, lambda stage, tried: reports.append((stage, tried)))
+    assert reports[0] == ("checking", 1)
+    assert reports[-1][0] == "planning"
+    with pytest.raises(OpenArmError) as caught:
+        plan_approach(right, right.situation(home, stopped=lambda: True), request)
+    assert caught.value.code == Code.CANCELLED
+
+
+def test_bad_requests_are_refused(right: Arm, home: dict[str, float]) -> None:
+    now = right.situation(home)
+    good = grasp("g", 0.26, -0.22, 0.05, 0.0)
+    with pytest.raises(OpenArmError, match="no targets"):
+        plan_approach(right, now, ApproachRequest(()))
+    with pytest.raises(OpenArmError, match="touchable cup not among the obstacles: cube"):
+        plan_approach(right, now, ApproachRequest((good,), (cube(0.3, -0.2),), (), frozenset({"cup"})))
+    with pytest.raises(OpenArmError, match="exclude each other"):
+        plan_approach(right, now, ApproachRequest((good,), attached_after=True, detached_after=True))
+    with pytest.raises(OpenArmError, match="target 'g' has numbers that are not finite"):
+        plan_approach(right, now, ApproachRequest((replace(good, score=float("nan")),)))
