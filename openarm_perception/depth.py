@@ -105,6 +105,13 @@ def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> Non
         )
 
 
+def _frozen(depth: DepthImage) -> DepthImage:
+    """The same image as a contiguous read-only array: what a message gives, so that kernels are compiled once."""
+    view = np.ascontiguousarray(depth).view()
+    view.flags.writeable = False
+    return view
+
+
 class Deprojector:
     """Turns depth images into points; keeps the ray of every row and column until the intrinsics change.
 
@@ -133,6 +140,7 @@ class Deprojector:
             OpenArmError: BAD_IMAGE, for an unknown encoding or a size other than the intrinsics'.
         """
         scale = self._prepare(depth, intrinsics)
+        depth = _frozen(depth)
         if out is None:
             out = np.empty((*depth.shape, 3), np.float32)
         near, far = np.float32(self.limits.near), np.float32(self.limits.far)
@@ -142,6 +150,7 @@ class Deprojector:
     def valid_points(self, depth: DepthImage, intrinsics: Intrinsics) -> Points:
         """Points (n, 3) float32 of the pixels with a valid depth, in row order; arguments and errors as `organised`."""
         scale = self._prepare(depth, intrinsics)
+        depth = _frozen(depth)
         near, far = np.float32(self.limits.near), np.float32(self.limits.far)
         # counting first costs 0.1 ms; a buffer for all pixels and a copy of its head cost up to 3 ms in page faults
         out = np.empty((_count(depth, scale, near, far), 3), np.float32)

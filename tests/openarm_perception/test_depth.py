@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from openarm_common.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_perception import depth as depth_module
 from openarm_perception.depth import Deprojector, DepthLimits
 
 K = Intrinsics.from_fovy(16, 12, 60.0)
@@ -98,6 +99,17 @@ def test_b30_an_image_of_another_size_than_its_info_is_refused() -> None:
     """The message names both sizes."""
     with pytest.raises(OpenArmError, match=r"8x6 pixels.*16x12"):
         Deprojector(LIMITS).valid_points(np.ones((6, 8), np.float32), K)
+
+
+def test_images_of_messages_and_of_arrays_share_a_compiled_kernel() -> None:
+    """A read-only view is another type to numba; it would be compiled again, in a callback, at the first frame."""
+    depth = np.ones((12, 16), np.float32)
+    message = np.frombuffer(depth.tobytes(), np.float32).reshape(12, 16)
+    deprojector = Deprojector(LIMITS)
+    for image in (depth, message, np.ones((12, 32), np.float32)[:, ::2]):
+        np.testing.assert_array_equal(deprojector.organised(image, K), deprojector.organised(depth, K))
+        assert len(deprojector.valid_points(image, K)) == depth.size
+    assert all(len(kernel.signatures) <= 2 for kernel in (depth_module._organise, depth_module._filter))
 
 
 def test_writes_into_a_given_array() -> None:
