@@ -37,19 +37,19 @@ class MovingEdges:
         self._scale = np.array([joint.multiplier if joint.mimic else 1.0 for joint in joints])
         self._offset = np.array([joint.offset if joint.mimic else 0.0 for joint in joints])
         self._slides = np.array([joint.type == "prismatic" for joint in joints])
-        self._axis = np.stack([joint.axis / np.linalg.norm(joint.axis) for joint in joints])
         self._origin = np.stack([joint.T_parent_joint[:3, 3] for joint in joints])
-        self._quat = np.stack([se3.quat_xyzw_from_matrix(joint.T_parent_joint[:3, :3]) for joint in joints])
-        rotated = [joint.T_parent_joint[:3, :3] @ axis for joint, axis in zip(joints, self._axis, strict=True)]
-        self._slide_direction = np.stack(rotated) * self._slides[:, None]
+        axes = [joint.axis / np.linalg.norm(joint.axis) for joint in joints]
+        turns = [joint.T_parent_joint[:3, :3] @ axis for joint, axis in zip(joints, axes, strict=True)]
+        self._direction = np.stack(turns) * self._slides[:, None]
+        # The fixed rotation times the half turn (axis sin, cos) is linear in sine and cosine.
+        self._cosine = np.stack([se3.quat_xyzw_from_matrix(joint.T_parent_joint[:3, :3]) for joint in joints])
+        v0, w0 = self._cosine[:, :3], self._cosine[:, 3:]
+        v1 = np.stack(axes)
+        self._sine = np.hstack([w0 * v1 + np.cross(v0, v1), -np.sum(v0 * v1, axis=1, keepdims=True)])
 
     def poses(self, positions: Array) -> tuple[Array, Array]:
         """Translations (m, 3) and quaternions (m, 4) of all edges at joint positions (n,)."""
         q = self._scale * positions[self._column] + self._offset
-        half = np.where(self._slides, 0.0, 0.5 * q)
-        v, w = self._axis * np.sin(half)[:, None], np.cos(half)
-        v0, w0 = self._quat[:, :3], self._quat[:, 3]
-        quat = np.empty_like(self._quat)
-        quat[:, :3] = w0[:, None] * v + w[:, None] * v0 + np.cross(v0, v)
-        quat[:, 3] = w0 * w - np.einsum("ij,ij->i", v0, v)
-        return self._origin + self._slide_direction * q[:, None], quat
+        half = np.where(self._slides, 0.0, 0.5 * q)[:, None]
+        quaternions = self._cosine * np.cos(half) + self._sine * np.sin(half)
+        return self._origin + self._direction * q[:, None], quaternions
