@@ -34,7 +34,9 @@ class _Example(Config):
 
 def test_b62_parameters_come_from_the_model_and_take_overrides(ros) -> None:
     node = ros.add(
-        BaseNode("example", _Example, parameter_overrides=[Parameter("rate", value=50), Parameter("limits.force", value=5.0)])
+        BaseNode(
+            "example", _Example, parameter_overrides=[Parameter("rate", value=50), Parameter("limits.force", value=5.0)]
+        )
     )
     assert node.config == _Example(rate=50.0, limits=_Limits(force=5.0))
     descriptor = node.describe_parameter("rate")
@@ -115,7 +117,9 @@ _SCRIPT = textwrap.dedent(
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_p34_a_signal_ends_the_process_in_order_with_exit_code_0(stop: signal.Signals) -> None:
-    with subprocess.Popen([sys.executable, "-c", _SCRIPT], stdout=subprocess.PIPE, text=True, env=os.environ) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", _SCRIPT], stdout=subprocess.PIPE, text=True, env=os.environ
+    ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(stop)

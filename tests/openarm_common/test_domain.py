@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Domains of one's own."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from openarm_common import domain as domains
+from openarm_common.domain import release_domain, reserve_domain
+from openarm_common.errors import OpenArmError
+
+
+@pytest.fixture
+def three(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Only three domains exist."""
+    monkeypatch.setattr(domains, "DOMAINS", [95, 96, 97])
+    return [95, 96, 97]
+
+
+def test_no_domain_is_given_twice_until_it_is_given_back(three: list[int]) -> None:
+    got = [reserve_domain() for _ in three]
+    try:
+        assert sorted(got) == three
+        with pytest.raises(OpenArmError, match="in use"):
+            reserve_domain()
+        release_domain(got[1])
+        assert reserve_domain() == got[1]
+    finally:
+        for domain in got:
+            release_domain(domain)
+
+
+def test_another_process_gets_another_domain_until_this_one_ends(three: list[int]) -> None:
+    script = (
+        "from openarm_common import domain as d; d.DOMAINS = [95, 96, 97]\n"
+        "print(d.reserve_domain(), flush=True); input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        theirs = int(other.stdout.readline())
+        ours = [reserve_domain(), reserve_domain()]
+        assert sorted([*ours, theirs]) == three
+        other.communicate("\n", timeout=10.0)
+    ours.append(reserve_domain())
+    assert sorted(ours) == three
+    for domain in ours:
+        release_domain(domain)
+
+
+def test_a_domain_whose_discovery_port_is_held_is_not_given(three: list[int]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
+        held.bind(("0.0.0.0", 7400 + 250 * 96))
+        ours = [reserve_domain(), reserve_domain()]
+        assert sorted(ours) == [95, 97]
+    for domain in ours:
+        release_domain(domain)
