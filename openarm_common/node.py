@@ -87,7 +87,7 @@ class BaseNode(Node, Generic[ConfigT]):
 
     @property
     def default_callback_group(self) -> CallbackGroup:
-        """Callbacks of a node may overlap at their awaits: a coroutine that waits must not keep the others from running."""
+        """Callbacks may overlap at their awaits: a coroutine that waits must not keep the others from running."""
         if not hasattr(self, "_BaseNode__group"):  # asked for in the constructor of Node
             self.__group = ReentrantCallbackGroup()
         return self.__group

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixtures that all tests share.
 
-Nodes are tested in process: the node and its probes run in one executor, in a ROS domain of their own, and wait for conditions
-with a deadline, never for a time to pass.
+Nodes are tested in process: the node and its probes run in one executor, in a ROS domain of their own, and wait for
+conditions with a deadline, never for a time to pass.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class RosProbe:
         return self.result(client.call_async(request), timeout, f"an answer of {client.srv_name}")
 
     def send_goal(self, client, goal, timeout: float = 10.0, feedback_callback=None):
-        """Send an action goal and return (goal handle, result future); the future is None when the goal was rejected."""
+        """Send an action goal and return (goal handle, result future or, when it was rejected, None)."""
         self.spin_until(client.server_is_ready, timeout, "the action server is there")
         handle = self.result(client.send_goal_async(goal, feedback_callback=feedback_callback), timeout, "goal answer")
         return handle, handle.get_result_async() if handle.accepted else None
