@@ -103,11 +103,11 @@ def _table(findings: list[Finding]) -> str:
 def _graph_findings(name: str) -> list[Finding]:
     import shutil
 
-    from openarm_bringup import environment, runs
+    from openarm_bringup import runs, shm
     from openarm_bringup.graph import load_graph
 
-    usage = shutil.disk_usage(environment.SHM)
-    need = environment.shm_need_mib(load_graph(name), extra_participants=4)
+    usage = shutil.disk_usage(shm.SHM)
+    need = shm.shm_need_mib(load_graph(name), extra_participants=4)
     findings = [checks.check_shm(usage.total / 2**20, usage.free / 2**20, need, name)]
     running = runs.running()
     if running:

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node process is started with: environment, arguments, Fast DDS profile, shared memory."""
+"""What a node process is started with: environment, arguments, Fast DDS profile."""
 
 from __future__ import annotations
 
 import os
 import re
-import shutil
-import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,15 +15,6 @@ import yaml
 from openarm_bringup.graph import Graph, NodeSpec
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-
-SHM = Path("/dev/shm")
-
-#: MiB of /dev/shm that a participant takes beside its large segment, measured.
-_PLAIN_MIB = 0.65
-_LARGE_EXTRA_MIB = 2.2
-
-#: The names that Fast DDS gives to its segments, ports, their locks and semaphores.
-_SEGMENT = re.compile(r"^(sem\.)?(fastrtps|fastdds|fast_datasharing)_")
 
 
 def domain_id(graph: Graph, environ: Mapping[str, str] = os.environ) -> int:
@@ -95,55 +84,3 @@ def node_arguments(graph: Graph, name: str, run_dir: Path) -> list[str]:
         path.write_text(yaml.safe_dump({name: {"ros__parameters": params}}, sort_keys=False), encoding="utf-8")
         ros += ["--params-file", str(path)]
     return [*argv, "--ros-args", *ros]
-
-
-def shm_need_mib(graph: Graph, extra_participants: int = 1) -> float:
-    """Return how much of /dev/shm the graph takes, MiB, with `extra_participants` beside its nodes (probe, clients)."""
-    need = extra_participants * _PLAIN_MIB
-    for spec in graph.nodes.values():
-        need += spec.segment_mib + _LARGE_EXTRA_MIB if spec.large_messages else _PLAIN_MIB
-    return need
-
-
-def shm_free_mib(path: Path = SHM) -> float:
-    """Return the free space of /dev/shm, MiB."""
-    return shutil.disk_usage(path).free / 2**20
-
-
-def check_shm(graph: Graph, free_mib: float | None = None) -> None:
-    """Refuse to start a graph whose images would be lost for lack of shared memory.
-
-    Raises:
-        OpenArmError: ENVIRONMENT, with both figures and what to do.
-    """
-    need, free = shm_need_mib(graph, extra_participants=4), shm_free_mib() if free_mib is None else free_mib
-    if free >= need:
-        return
-    raise OpenArmError(
-        Code.ENVIRONMENT,
-        f"graph {graph.name} needs {need:.0f} MiB of {SHM}, {free:.0f} MiB are free; stop other graphs, remove what "
-        "dead processes left (`fastdds shm clean`), give a container more (`--shm-size=256m`), or lower `segment_mib` "
-        "in the graph",
-    )
-
-
-def segments(path: Path = SHM) -> set[str]:
-    """Return the names of all Fast DDS files in /dev/shm."""
-    return {entry.name for entry in path.iterdir() if _SEGMENT.match(entry.name)}
-
-
-def clean_command() -> list[str] | None:
-    """Return the command that removes what killed processes left in /dev/shm, or None where Fast DDS has no tool."""
-    beside = Path(sys.executable).parent / "fastdds"
-    tool = str(beside) if beside.exists() else shutil.which("fastdds")
-    return [tool, "shm", "clean"] if tool else None
-
-
-def clean_shm() -> str:
-    """Remove the segments of dead processes (those in use are locked and stay); return what the tool said."""
-    command = clean_command()
-    if command is None:
-        return "fastdds is not installed; segments of killed processes stay in /dev/shm"
-    env = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}"}
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=20, check=False)
-    return " ".join((done.stdout + done.stderr).split())

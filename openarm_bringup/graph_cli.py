@@ -9,9 +9,10 @@ from typing import Literal
 from cyclopts import App
 
 from openarm_bringup.draw import edges, mermaid, text
-from openarm_bringup.environment import domain_id, shm_free_mib, shm_need_mib
+from openarm_bringup.environment import domain_id
 from openarm_bringup.graph import Graph, graph_names, load_graph
 from openarm_bringup.outcome import Outcome
+from openarm_bringup.shm import shm_free_mib, shm_need_mib
 from openarm_common.errors import Code
 
 app = App(name="graph", help="Check and draw graphs; `openarm graph list` names them.")

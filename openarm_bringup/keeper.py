@@ -11,7 +11,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from openarm_bringup import environment
+from openarm_bringup import environment, shm
 from openarm_bringup.graph import Graph, NodeSpec, Ready
 from openarm_bringup.process import Haste, Ladder, NodeProcess
 from openarm_common.errors import Code, OpenArmError
@@ -87,7 +87,8 @@ class Keeper:
         self.restarts = 0
         self.ready = asyncio.Event()
         self.log = shared.run_dir / "logs" / f"{name}.log"
-        self.unclean = False
+        #: Names in /dev/shm that its processes have used.
+        self.mapped: set[str] = set()
         self._shared = shared
         self._was_ready = False
 
@@ -130,8 +131,8 @@ class Keeper:
             return
         code = self.process.returncode
         if code is None:
+            self.mapped |= shm.mapped_by(self.process.pid)
             code = await self.process.stop(self._shared.haste, self._shared.ladder)
-        self.unclean |= self.process.killed or code < 0
         self._shared.tell_guard(f"-{self.process.pid}")
         if self.state not in (NodeState.FAILED, NodeState.EXITED):
             self._enter(NodeState.STOPPED, f"killed ({code})" if self.process.killed else f"code {code}")
@@ -165,6 +166,7 @@ class Keeper:
                 getting_ready.result()
                 self._was_ready = True
                 self.ready.set()
+                self.mapped |= shm.mapped_by(process.pid)
                 self._enter(NodeState.READY, f"after {ready_at - began:.1f} s")
             code = await ended
         finally:
@@ -175,7 +177,7 @@ class Keeper:
         shared.tell_guard(f"-{process.pid}")
         if code < 0 or process.killed:
             # Killed processes leave their segments behind; free them before the next start needs the space.
-            shared.say(await asyncio.to_thread(environment.clean_shm))
+            shared.say(await asyncio.to_thread(shm.clean_shm))
         return code, f"ended by signal {-code}" if code < 0 else f"ended with code {code}", ready_s
 
     async def _get_ready(self, old: frozenset[str]) -> None:

@@ -21,7 +21,7 @@ from typing import TypeVar
 
 import psutil
 
-from openarm_bringup import environment, guard, runs
+from openarm_bringup import environment, guard, runs, shm
 from openarm_bringup.graph import Graph
 from openarm_bringup.keeper import Keeper, NodeState, Probe, Shared
 from openarm_bringup.process import Haste, Ladder
@@ -94,14 +94,14 @@ class Supervisor:
         Raises:
             OpenArmError: ENVIRONMENT, when /dev/shm is too small for the graph.
         """
-        environment.check_shm(self.graph)
+        shm.check_shm(self.graph)
         (self.run_dir / "logs").mkdir(parents=True, exist_ok=True)
         self._guard = await asyncio.create_subprocess_exec(
             sys.executable,
             "-I",
             "-S",
             guard.__file__,
-            *(environment.clean_command() or []),
+            *(shm.clean_command() or []),
             stdin=asyncio.subprocess.PIPE,
             start_new_session=True,
         )
@@ -166,8 +166,9 @@ class Supervisor:
         if self._probe is not None and (await asyncio.wait([self._probe])) and self._probe.exception() is None:
             await self._ask(lambda probe: probe.close())
         self._threads.shutdown()
-        if any(keeper.unclean for keeper in self._keepers.values()):
-            self._say(await asyncio.to_thread(environment.clean_shm))
+        mapped = set().union(*(keeper.mapped for keeper in self._keepers.values()))
+        swept = await asyncio.to_thread(lambda: shm.sweep(mapped | shm.ports_of(environment.domain_id(self.graph))))
+        self._say(f"removed from /dev/shm: {', '.join(swept) or 'nothing'}")
         await self._dismiss_guard()
         runs.remove_record(os.getpid())
 

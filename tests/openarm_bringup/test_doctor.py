@@ -8,8 +8,8 @@ import json
 import pytest
 
 from openarm_bringup import cli, doctor
-from openarm_bringup.environment import check_shm, shm_need_mib
 from openarm_bringup.graph import load_graph
+from openarm_bringup.shm import check_shm, shm_need_mib
 from openarm_common.errors import Code, OpenArmError
 
 GOOD = {
