@@ -31,6 +31,9 @@ from openarm_sim_bridge.trajectory import (
 
 Array = NDArray[np.float64]
 
+#: A trajectory that starts later than this has most likely a stamp of another clock.
+_MAX_DELAY_NS = 600_000_000_000
+
 
 class TrajectoryConfig(Config):
     """How arms follow trajectories and position commands."""
@@ -146,7 +149,7 @@ class TrajectoryFollower:
 
         Raises:
             TrajectoryError: OLD_HEADER_TIMESTAMP, when it would have ended already; PATH_TOLERANCE_VIOLATED, when it
-                starts elsewhere; INVALID_GOAL, when its first point can't be reached in time.
+                starts elsewhere; INVALID_GOAL, when its first point can't be reached in time, or it would start far in the future.
         """
         goal = self._goal_of(trajectory, t_ns, measured, done)
         self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, "a newer trajectory took its place")
@@ -234,6 +237,12 @@ class TrajectoryFollower:
                 f"the trajectory ended {elapsed - t[-1]:.2f} s ago (stamp {start_ns * 1e-9:.2f} s, now"
                 f" {t_ns * 1e-9:.2f} s); leave the stamp zero to start at once",
                 TrajectoryResult.OLD_HEADER_TIMESTAMP,
+            )
+        if start_ns - t_ns > _MAX_DELAY_NS:
+            raise TrajectoryError(
+                Code.INVALID_ARGUMENT,
+                f"the trajectory would start in {(start_ns - t_ns) * 1e-9:.0f} s (stamp {start_ns * 1e-9:.2f} s, now"
+                f" {t_ns * 1e-9:.2f} s); leave the stamp zero, or set use_sim_time so that the stamp is simulated time",
             )
         ahead = t >= elapsed
         t, q = t[ahead], q[ahead]

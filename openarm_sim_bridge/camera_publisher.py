@@ -19,7 +19,11 @@ from openarm_common.errors import OpenArmError
 from openarm_common.node import QOS_SENSOR
 from openarm_sim_bridge.cameras import Colour, Depth, RenderThread
 from openarm_sim_bridge.pacing import RateDivider
-from openarm_sim_bridge.world import World
+from openarm_sim_bridge.state_publisher import until_shutdown
+from openarm_sim_bridge.world import Snapshot, World
+
+#: The simulation begins after this long at the latest, images or not, s.
+_WARM_UP_S = 20.0
 
 
 @dataclass
@@ -82,6 +86,7 @@ class CameraPublisher:
     Args:
         node: Owner of the publishers.
         cameras: By name.
+        first: A state of the world to warm up with; the constructor returns when that is done.
         depth_encoding: 16UC1 (mm) or 32FC1 (m).
         failed: Called (in the thread that draws) when it can't draw at all.
     """
@@ -90,9 +95,11 @@ class CameraPublisher:
         self,
         node: Node,
         cameras: Mapping[str, CameraConfig],
+        first: Snapshot,
         depth_encoding: str,
         failed: Callable[[OpenArmError], None],
     ) -> None:
+        self._context = node.context
         self._cameras = {
             name: _Camera(
                 _Stream.make(node, camera, "color", "rgb8"),
@@ -101,8 +108,9 @@ class CameraPublisher:
             )
             for name, camera in cameras.items()
         }
-        self._thread = RenderThread(cameras, self._buffers, self._deliver, failed)
+        self._thread = RenderThread(cameras, first, self._buffers, self._deliver, failed)
         self._thread.start()
+        self._thread.warm.wait(_WARM_UP_S)
 
     @property
     def rendered(self) -> dict[str, int]:
@@ -141,5 +149,6 @@ class CameraPublisher:
         return camera.colour.pixels, camera.depth.pixels if camera.depth is not None and wants_depth else None
 
     def _deliver(self, name: str, t_ns: int) -> None:
-        for stream in self._cameras[name].streams:
-            stream.publish(t_ns, image=True)
+        with until_shutdown(self._context):
+            for stream in self._cameras[name].streams:
+                stream.publish(t_ns, image=True)

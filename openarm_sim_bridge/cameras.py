@@ -214,8 +214,12 @@ class _Drawn:
 class RenderThread:
     """Draws the newest snapshot for the cameras that are due; a snapshot that comes too fast replaces the one before.
 
+    Setting up OpenGL takes a third of a second and keeps the interpreter from other threads meanwhile, so it is done at
+    the start, with a frame of every camera: `warm` says when that is over.
+
     Args:
         cameras: All cameras, by name.
+        first: Drawn for nobody, to warm up.
         buffers: Asked for the arrays (colour, depth or None) to fill before each frame.
         deliver: Called with the camera's name and the stamp when they are filled; in this thread.
         failed: Called once when the thread ends because it can't draw; in this thread.
@@ -224,6 +228,7 @@ class RenderThread:
     def __init__(
         self,
         cameras: Mapping[str, CameraConfig],
+        first: Snapshot,
         buffers: Callable[[str], tuple[Colour, Depth | None]],
         deliver: Callable[[str, int], None],
         failed: Callable[[OpenArmError], None],
@@ -232,15 +237,17 @@ class RenderThread:
         self._buffers = buffers
         self._deliver = deliver
         self._failed = failed
+        self._first = first
         self._waiting: tuple[Snapshot, frozenset[str]] | None = None
         self._changed = threading.Condition()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="render", daemon=True)
+        self.warm = threading.Event()
         self.rendered = dict.fromkeys(cameras, 0)
         self.dropped = 0
 
     def start(self) -> None:
-        """Start the thread; OpenGL is set up at the first snapshot."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -264,21 +271,30 @@ class RenderThread:
     def _run(self) -> None:
         renderer: SnapshotRenderer | None = None
         try:
-            while True:
-                with self._changed:
-                    self._changed.wait_for(lambda: self._stopping or self._waiting is not None)
-                    if self._stopping or self._waiting is None:
-                        break
-                    (snapshot, due), self._waiting = self._waiting, None
-                renderer = renderer or SnapshotRenderer(self._cameras)
+            renderer = SnapshotRenderer(self._cameras)
+            renderer.load(self._first)
+            for name in self._cameras:
+                renderer.draw(name, *self._buffers(name))
+            self.warm.set()
+            while (work := self._next()) is not None:
+                snapshot, due = work
                 renderer.load(snapshot)
                 for name in sorted(due):
-                    colour, depth = self._buffers(name)
-                    renderer.draw(name, colour, depth)
+                    renderer.draw(name, *self._buffers(name))
                     self.rendered[name] += 1
                     self._deliver(name, snapshot.t_ns)
         except OpenArmError as error:
             self._failed(error)
+        except Exception as error:  # a dead thread must not go unnoticed
+            self._failed(OpenArmError(Code.INTERNAL, f"drawing failed: {error!r}"))
         finally:
+            self.warm.set()
             if renderer is not None:
                 renderer.close()
+
+    def _next(self) -> tuple[Snapshot, frozenset[str]] | None:
+        """Wait for a snapshot; None when the thread shall end."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._stopping or self._waiting is not None)
+            work, self._waiting = self._waiting, None
+            return None if self._stopping else work

@@ -66,6 +66,12 @@ class RobotController:
             self._fingers[side] = int(finger)
             self.grippers[side] = GripperFollower(group, gripper, float(self._targets[finger]), float(limits[finger]))
 
+        self._limits = {
+            name: (float(lower), float(upper))
+            for group in (*arms.values(), *grippers.values())
+            for name, lower, upper in zip(group.names, group.lower, group.upper, strict=True)
+        }
+
     def check_command(self, names: Sequence[str], positions: Sequence[float]) -> PositionCommand:
         """Check a position command; names may be a part of the joints, in any order. May run in any thread.
 
@@ -77,16 +83,11 @@ class RobotController:
                 Code.INVALID_ARGUMENT,
                 f"a command has {len(names)} names and {len(positions)} positions, expected as many",
             )
-        limits = {
-            name: (float(lower), float(upper))
-            for follower in (*self.arms.values(), *self.grippers.values())
-            for name, lower, upper in zip(follower.group.names, follower.group.lower, follower.group.upper, strict=True)
-        }
         known: dict[str, float] = {}
         for name, position in zip(names, positions, strict=True):
-            if name not in limits:
+            if name not in self._limits:
                 continue
-            lower, upper = limits[name]
+            lower, upper = self._limits[name]
             if not np.isfinite(position):
                 raise OpenArmError(
                     Code.INVALID_ARGUMENT, f"commanded position of {name} is {position}, expected a finite number"
@@ -97,7 +98,7 @@ class RobotController:
                     f"commanded position of {name} is {position:.4f}, out of its limits {lower:.4f} to {upper:.4f}",
                 )
             known[name] = float(position)
-        return PositionCommand(known, tuple(name for name in names if name not in limits))
+        return PositionCommand(known, tuple(name for name in names if name not in self._limits))
 
     def busy(self, command: PositionCommand) -> tuple[str, ...]:
         """Joints of a command that are ignored because their arm or gripper follows a goal."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from openarm_sim_bridge.controller import RobotController
 from openarm_sim_bridge.service_executor import SimulationServices
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.stage import Stage
-from openarm_sim_bridge.state_publisher import StatePublisher
+from openarm_sim_bridge.state_publisher import StatePublisher, until_shutdown
 from openarm_sim_bridge.world import JointReadout
 
 WATCH_PERIOD_S = 0.2
@@ -52,13 +53,14 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         world = stage.world(scene)
         controller = RobotController(stage.arms(), stage.grippers(), world, config.trajectory, config.gripper)
         self._controller = controller
-        self._simulation = Simulation(world, controller, self._observe, speed=config.speed)
+        self._simulation = Simulation(world, controller, self._observe, speed=config.speed, crashed=self._on_crash)
         self._simulation.set_paused(config.paused)
 
         self._states = StatePublisher(
             self, self.description, world.joint_names, config.tf_rate, config.ground_truth_rate
         )
-        self._images = CameraPublisher(self, cameras, config.depth_encoding, self._on_render_failure)
+        self._render_fault = ""
+        self._images = CameraPublisher(self, cameras, world.snapshot(), config.depth_encoding, self._on_render_failure)
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
 
         self.create_subscription(JointState, "/joint_commands", self._on_command, QOS_COMMAND)
@@ -68,7 +70,6 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         ]
         self._sim_services = SimulationServices(self, stage, scene, self._simulation, self._on_scene)
 
-        self._render_fault = ""
         self._warned: set[str] = set()
         self._drawn: dict[str, int] = self._images.rendered
         self.create_timer(WATCH_PERIOD_S, self._images.poll, clock=self.wall_clock)
@@ -88,8 +89,9 @@ class MujocoBridge(BaseNode[BridgeConfig]):
 
     def _observe(self, state: JointReadout) -> None:
         """End of a tick, in the thread of the simulation."""
-        self._states.publish(state, self._simulation.world)
-        self._images.tick(self._simulation.world)
+        with until_shutdown(self.context):
+            self._states.publish(state, self._simulation.world)
+            self._images.tick(self._simulation.world)
 
     def _on_command(self, message: JointState) -> None:
         """Position targets; a part of the joints will do."""
@@ -115,6 +117,11 @@ class MujocoBridge(BaseNode[BridgeConfig]):
     def _on_render_failure(self, error: OpenArmError) -> None:
         self._render_fault = str(error)
         self.get_logger().error(f"no images: {error}")
+
+    def _on_crash(self, error: Exception) -> None:
+        """The physics ended by a fault of the program: end the process, so that it is started again."""
+        self.get_logger().fatal(f"the physics thread ended: {error!r}\n{''.join(traceback.format_exception(error))}")
+        self.context.try_shutdown()
 
     def _report(self) -> None:
         """Once a second: how well the simulation keeps up."""

@@ -56,6 +56,7 @@ class Simulation:
         observe: Called at the end of every tick that is told of.
         speed: Simulated seconds a wall second; 0 is as fast as it can. Faster than real time, `observe` is still called
             about once a period of wall time.
+        crashed: Called when the thread ends by an error that nobody expected.
         clock: Monotonic wall clock, ns.
     """
 
@@ -69,6 +70,7 @@ class Simulation:
         observe: Observer,
         *,
         speed: float = 1.0,
+        crashed: Callable[[Exception], None] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.world = world
@@ -77,6 +79,7 @@ class Simulation:
         self.periods = PeriodMeter()
         self.fault = ""
         self._observe = observe
+        self._crashed = crashed
         self._clock = clock
         self._pacer = Pacer(world.period_ns, speed)
         self._throttled = speed == 0.0 or speed > 1.0
@@ -152,6 +155,15 @@ class Simulation:
 
     # --- the thread
     def _run(self) -> None:
+        try:
+            self._loop()
+        except Exception as error:  # a dead thread must not go unnoticed: the robot would just stop answering
+            self.fault = f"the physics thread ended: {error!r}"
+            if self._crashed is None:
+                raise
+            self._crashed(error)
+
+    def _loop(self) -> None:
         while not self._stopping:
             while self._calls:
                 self._calls.popleft().run()

@@ -6,10 +6,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 from openarm_interfaces.msg import ObjectState, ObjectStateArray
+from rclpy.context import Context
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -25,6 +28,16 @@ from openarm_sim_bridge.pacing import RateDivider
 from openarm_sim_bridge.world import JointReadout, ObjectReadout, World
 
 WORLD_FRAME = "world"
+
+
+@contextmanager
+def until_shutdown(context: Context) -> Iterator[None]:
+    """Let publishing in a thread fail when a signal has shut the context down in the meantime."""
+    try:
+        yield
+    except rclpy_implementation.RCLError:
+        if context.ok():
+            raise
 
 
 class StatePublisher:

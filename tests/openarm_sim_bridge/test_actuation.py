@@ -140,6 +140,11 @@ def test_a_trajectory_that_is_over_already_is_refused() -> None:
     assert caught.value.result is TrajectoryResult.OLD_HEADER_TIMESTAMP
 
 
+def test_a_stamp_of_another_clock_is_refused() -> None:
+    with pytest.raises(TrajectoryError, match="use_sim_time"):
+        Arm().start(start_ns=1_700_000_000 * 1000 * MS)
+
+
 def test_a_joint_that_is_held_back_ends_the_goal_and_the_arm_holds_there() -> None:
     arm = Arm(plant=lambda q, target: np.minimum(target, 0.2))
     arm.start(**(CUBIC | {"q": np.array([[0.0, 0.0], [0.5, 0.0]])}))

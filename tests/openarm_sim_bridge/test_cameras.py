@@ -37,6 +37,12 @@ MODEL = """
 <camera name="eye" pos="0 0 1" euler="{tilt} 0 0" fovy="60"/></worldbody></mujoco>"""
 
 
+FRAMES = {
+    "eye": (np.empty((240, 320, 3), np.uint8), np.empty((240, 320), np.uint16)),
+    "other": (np.empty((240, 320, 3), np.uint8), None),
+}
+
+
 def snapshot(
     tilt: float = 0.0, ball: tuple[float, float, float] = (50.0, 0.0, 1.0), radius: float = 0.01, t_ns: int = 0
 ) -> Snapshot:
@@ -157,18 +163,15 @@ def test_without_opengl_the_error_says_what_to_install(monkeypatch: pytest.Monke
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr("openarm_sim_bridge.cameras._context_class", broken)
     failures: list[OpenArmError] = []
-    ended = threading.Event()
-    thread = RenderThread(
-        {"eye": CAMERA}, lambda _n: (None, None), lambda _n, _t: None, lambda e: (failures.append(e), ended.set())
-    )
+    thread = RenderThread({"eye": CAMERA}, snapshot(), lambda _n: FRAMES["eye"], lambda _n, _t: None, failures.append)
     thread.start()
+    assert thread.warm.wait(10.0)
     thread.offer(snapshot(), ["eye"])
-    assert ended.wait(10.0)
     thread.stop()
-    assert failures[0].code is Code.ENVIRONMENT
-    assert "libEGL.so.1" in failures[0].message
-    assert "osmesa" in failures[0].message
-    assert "libosmesa6" in failures[0].message
+    (failure,) = failures
+    assert failure.code is Code.ENVIRONMENT
+    for part in ("libEGL.so.1", "osmesa", "libosmesa6"):
+        assert part in failure.message
 
 
 def test_the_thread_draws_the_newest_snapshot_and_forgets_no_camera() -> None:
@@ -181,10 +184,6 @@ def test_the_thread_draws_the_newest_snapshot_and_forgets_no_camera() -> None:
     )
     busy, go, done = threading.Event(), threading.Event(), threading.Event()
     delivered: list[tuple[str, int]] = []
-    frames = {
-        "eye": (np.empty((240, 320, 3), np.uint8), np.empty((240, 320), np.uint16)),
-        "other": (np.empty((240, 320, 3), np.uint8), None),
-    }
 
     def deliver(name: str, t_ns: int) -> None:
         delivered.append((name, t_ns))
@@ -193,7 +192,9 @@ def test_the_thread_draws_the_newest_snapshot_and_forgets_no_camera() -> None:
         if t_ns == 30 and name == "other":
             done.set()
 
-    thread = RenderThread({"eye": CAMERA, "other": other}, frames.__getitem__, deliver, pytest.fail)
+    thread = RenderThread(
+        {"eye": CAMERA, "other": other}, Snapshot(model, 0, state.qpos), FRAMES.__getitem__, deliver, pytest.fail
+    )
     thread.start()
     try:
         thread.offer(Snapshot(model, 10, state.qpos), ["eye"])

@@ -223,3 +223,23 @@ def test_targets_stand_in_the_order_of_the_world_and_reset_holds() -> None:
     controller.reset(world.read_joints())
     np.testing.assert_allclose(controller.update(world.read_joints(), world.period_ns), [0.0, 0.01])
     assert controller.effort_limits() == {1: 30.0}
+
+
+def test_a_fault_of_the_program_in_the_thread_is_told() -> None:
+    world, controller = make_controller()
+    errors: list[Exception] = []
+    ended = threading.Event()
+
+    def crashed(error: Exception) -> None:
+        errors.append(error)
+        ended.set()
+
+    def observe(_state: JointReadout) -> None:
+        raise ZeroDivisionError("a fault")
+
+    simulation = Simulation(world, controller, observe, crashed=crashed)
+    simulation.start()
+    assert ended.wait(5.0)
+    simulation.stop()
+    assert isinstance(errors[0], ZeroDivisionError)
+    assert "a fault" in simulation.fault
