@@ -6,6 +6,7 @@ It listens to the camera only while somebody listens to it, and to /joint_states
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,6 +55,8 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         config = self.config
         camera = camera_of(config.camera)
         self._optical_frame = camera.optical_frame
+        #: Whether the camera rides on an arm, so that its pose needs joint states.
+        self._rides = any(joint.type != "fixed" for joint in self.description.chain(camera.parent))
         colors = Path(config.colors) if config.colors else config_dir() / "params" / "detector.yaml"
         limits = DepthLimits(near=camera.near, far=camera.far)
         self._pipeline = Pipeline(
@@ -98,6 +101,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             self.diagnose(True, "idle: nobody listens", **self._counts)
 
     def _subscribe(self) -> None:
+        self._poses.enable(self._rides)
         topics: tuple[tuple[str, type[Image | CameraInfo], str], ...] = (
             ("color", Image, self.config.color_topic),
             ("depth", Image, self.config.depth_topic),
@@ -150,9 +154,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         try:
             T_base_camera = self._poses.buffer.lookup(BASE_FRAME, self._optical_frame, frame.t_ns)
         except OpenArmError as error:
-            if error.code is Code.STALE_DATA:
-                self._poses.enable(True)  # the camera rides on an arm
-            if time.monotonic() < frame.deadline:
+            if time.monotonic() < frame.deadline and not self._too_old(frame, error):
                 self._retry.reset()
                 return
             self._waiting = None
@@ -166,6 +168,11 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             self._complain("refused_frames", f"frame refused: {error.message}")
             return
         self._publish(frame, perceived, (time.perf_counter() - started) * 1e3)
+
+    def _too_old(self, frame: _Frame, error: OpenArmError) -> bool:
+        """Whether waiting is in vain: joint states have passed the stamp without one that answers for it."""
+        heard = self._poses.age_s() < math.inf
+        return error.code is Code.STALE_DATA and heard and self._poses.buffer.latest()[0] > frame.t_ns
 
     def _publish(self, frame: _Frame, perceived: Perceived, elapsed_ms: float) -> None:
         self._boxes.publish(convert.detections_2d(perceived.found, self._optical_frame, frame.t_ns))

@@ -308,7 +308,7 @@ def test_b14_b32_b61_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) 
     The newest joint state, with the arm elsewhere, is not used. The wait is long here, so that a busy machine passes.
     """
     bench = on_arm(ros, transform_wait=5.0)
-    bench.pump(lambda: ros.node.count_subscribers("/joint_states"), "joint states are listened to")
+    bench.pump(lambda: bench.node.waiting_ns, "a frame waits")
     t = bench.node.waiting_ns
     for offset, q in ((-8, 0.46), (12, 0.56), (400, 1.2)):
         bench.camera.joints.publish(arm(t + offset * MS, q))
@@ -321,6 +321,7 @@ def test_b14_b32_b61_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) 
 def test_b32_b60_a72_a_frame_20_ms_from_any_joint_state_is_skipped(ros) -> None:
     """Nothing within 5 ms and nothing that brackets: skipped and named, no detection, and the node goes on."""
     bench = on_arm(ros, transform_wait=0.1)
+    ros.spin_until(lambda: ros.node.count_subscribers("/joint_states"), 5.0, "joint states are listened to")
 
     def with_joints(offset_ms: int):
         def make(t_ns: int) -> CameraInfo:
@@ -332,6 +333,15 @@ def test_b32_b60_a72_a_frame_20_ms_from_any_joint_state_is_skipped(ros) -> None:
     bench.said("frame skipped: pose of the camera at its stamp: no joint state", info=with_joints(-20))
     assert bench.watch.got == []
     bench.pump(lambda: bench.watch.got, "a detection with joints at the stamp", info=with_joints(0))
+
+
+def test_a_frame_from_before_the_first_joint_state_does_not_hold_up_the_next(ros) -> None:
+    """Once a joint state has passed its stamp it can never be answered: skipped at once, not after the whole wait."""
+    bench = on_arm(ros, transform_wait=5.0)
+    bench.pump(lambda: bench.node.waiting_ns, "a frame waits")
+    bench.camera.joints.publish(arm(bench.t_ns + 180 * MS, 0.5))
+    ros.spin_until(lambda: bench.node.waiting_ns is None, 3.0, "the frame is given up")
+    assert bench.watch.got == []
 
 
 @pytest.mark.parametrize(
