@@ -149,7 +149,7 @@ class TrajectoryFollower:
 
         Raises:
             TrajectoryError: OLD_HEADER_TIMESTAMP, when it would have ended already; PATH_TOLERANCE_VIOLATED, when it
-                starts elsewhere; INVALID_GOAL, when its first point can't be reached in time, or it would start far in the future.
+                starts elsewhere; INVALID_GOAL, when its first point can't be reached in time or its start is far away.
         """
         goal = self._goal_of(trajectory, t_ns, measured, done)
         self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, "a newer trajectory took its place")
