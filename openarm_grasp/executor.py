@@ -213,7 +213,13 @@ class GraspExecutor:
             T_base_tcp = self._hands[arm].T_base_tcp()
             if T_base_tcp[2, 3] < effect.back_off_below:
                 T_back = T_base_tcp @ se3.make(p=(0.0, 0.0, -config.approach.pregrasp_distance))
-                await self._one(effects.MoveLinear(arm, T_back, "back off"))
+                try:
+                    await self._one(effects.MoveLinear(arm, T_back, "back off"))
+                except OpenArmError as error:
+                    if error.code in (Code.CANCELLED, Code.ROBOT_LOST):
+                        raise
+                    # A kindness to what stands around the hand; the free path home may still be there.
+                    self._node.get_logger().warning(error.message)
             goal = convert.home_goal(arm, config.home_state, effect, config.velocity_scale)
             await self._moved(self._move, goal, f"{arm} arm: go {config.home_state}")
 

@@ -121,7 +121,7 @@ def _next_arm(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
     reason = outcome.message
     if m.grasp_plan is not None:
         m.place_refused = True
-        reason = f"it could grasp, but not place: {reason}"
+        reason = f"it could grasp, but not place: {reason.removeprefix(f'{m.arm} arm: ')}"
     m.refusals[m.arm] = Verdict(outcome.code, reason)
     m.candidate = m.grasp_plan = m.place_target = None
     m.arms = m.arms[1:]
@@ -139,7 +139,7 @@ def _no_plan(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
     m.plans_failed += 1
     final = m.plans_failed >= around.config.limits.plan_attempts
     codes = {v.code for v in m.refusals.values()}
-    reason = "; ".join(f"{arm} arm: {v.reason}" for arm, v in m.refusals.items())
+    reason = "; ".join(f"{arm} arm: {v.reason.removeprefix(f'{arm} arm: ')}" for arm, v in m.refusals.items())
     if m.probed:
         distances = outcome.last(Reach).distances if outcome.ok else {}
         x, y, z = m.need_sighting().target.p_base
@@ -161,7 +161,8 @@ def _offer_places(m: Memory, around: Surroundings, *, origin: bool = False) -> N
         spots = (check_position(m.request.place, s.target, s.others, around.table.x, around.table.y),)
     else:
         spots = free_spots(m.arm, s.target, s.others, around.config)
-    m.place_offered = place_targets(s.target, m.need_candidate(), spots, around.config)
+    used = () if origin else m.used_places
+    m.place_offered = place_targets(s.target, m.need_candidate(), spots, around.config, used)
 
 
 # --- grasping
@@ -246,7 +247,10 @@ def _put_back(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
         text = f"{outcome.message}; the {m.arm} hand still holds {m.label!r}: open it over a safe place"
         return fail(m, Code.PLACE_FAILED, text, final=True)
     fail(m, Code.PLACE_FAILED, f"{m.label!r} could not be placed ({outcome.code}): {outcome.message}")
+    if m.place_plan is not None and m.place_target is not None:
+        m.used_places = (*m.used_places, m.place_target)
     m.hand.putting_back, m.hand.carried, m.place_plan = True, False, None
+    m.hand.try_again = outcome.code in (Code.EXECUTION_FAILED, Code.TIMEOUT)
     _offer_places(m, around, origin=True)
     return Event.MORE, f"{outcome.message}; putting it back"
 
@@ -271,7 +275,7 @@ def reset(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judge
             return Event.DONE, f"{verdict.reason}, placed by the {m.arm} arm"
         m.failure = verdict
     failure = m.failure or Verdict(Code.INTERNAL, "RESET without a failure")
-    last = m.attempt >= around.config.limits.max_attempts or hand.putting_back
+    last = m.attempt >= around.config.limits.max_attempts or (hand.putting_back and not hand.try_again)
     return (Event.END if last else Event.AGAIN), failure.reason
 
 

@@ -92,7 +92,7 @@ class RobotLink:
     @property
     def now_ns(self) -> int:
         """Robot time; 0 before the first joint state."""
-        return max(self._silence.newest_ns, 0)
+        return self.robot.buffer.latest()[0] if self.hears_joints else 0
 
     @property
     def hears_joints(self) -> bool:
@@ -106,7 +106,7 @@ class RobotLink:
 
     # --- waiting
     def _on_tick(self) -> None:
-        self._silence.look(time.monotonic(), self.robot.buffer.latest()[0] if self.hears_joints else -1)
+        self._silence.look(time.monotonic(), self.now_ns if self.hears_joints else -1)
         done, self._next_tick = self._next_tick, Future()
         done.set_result(None)
 

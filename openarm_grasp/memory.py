@@ -44,6 +44,7 @@ class Hand:
         carried: The object is above its place.
         released: The object was put down and let go.
         putting_back: The place is where the object came from, because no other could be reached.
+        try_again: What kept it from its place may not do so at the next attempt.
         homed: The arm is home again.
         retreats: Ways home that failed.
     """
@@ -53,6 +54,7 @@ class Hand:
     carried: bool = False
     released: bool = False
     putting_back: bool = False
+    try_again: bool = False
     homed: bool = False
     retreats: int = 0
 
@@ -69,6 +71,7 @@ class Memory:
         detect_rounds: Rounds of frames without a trusted object, this attempt.
         plans_failed: Detections planned for in vain, this attempt.
         used: Ids of the grasps that have failed.
+        used_places: Places that could not be reached with the object in the hand.
         failure: The newest failure; None while nothing has failed.
         seen: Frames of the running attempt.
         sighting: The object and its neighbours, base frame.
@@ -93,6 +96,7 @@ class Memory:
     detect_rounds: int = 0
     plans_failed: int = 0
     used: frozenset[str] = frozenset()
+    used_places: tuple[PlaceTarget, ...] = ()
     failure: Verdict | None = None
     seen: Frames | None = None
     sighting: Sighting | None = None

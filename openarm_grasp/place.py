@@ -22,6 +22,9 @@ from openarm_grasp.observation import Detection
 
 Array = NDArray[np.float64]
 
+#: Spots nearer to each other than this are one, m.
+_SAME_SPOT = 0.02
+
 
 @dataclass(frozen=True)
 class PlaceTarget:
@@ -47,7 +50,11 @@ class PlaceTarget:
 
 
 def place_targets(
-    target: Detection, candidate: GraspCandidate, spots: Sequence[Array], config: GraspConfig
+    target: Detection,
+    candidate: GraspCandidate,
+    spots: Sequence[Array],
+    config: GraspConfig,
+    used: Sequence[PlaceTarget] = (),
 ) -> tuple[PlaceTarget, ...]:
     """Hand poses that put the object on each of the spots, best first: earlier spots, then smaller turns.
 
@@ -56,13 +63,19 @@ def place_targets(
         candidate: How it is held.
         spots: (2,) or (3,) footprint centres, base frame, m, best first; z is not read.
         config: Parameters.
+        used: Targets that have failed before: their spots (where there are others) or turns come last.
     """
     T_object_tcp = se3.inverse(target.T_base_object) @ candidate.T_base_tcp
     yaws = yaw_offsets(config.place.yaw_step_deg)
     # Small turns of every spot come first: a hopeless spot must not use up the planner's patience. Turns of one spot
     # score alike, so that the planner takes the one that is near.
-    groups = [(far, i) for far in (False, True) for i in range(len(spots))]
-    order = [(rank, i, yaw) for rank, (far, i) in enumerate(groups) for yaw in yaws if (abs(yaw) > np.pi / 4.0) == far]
+    n = len(spots)
+    ranked = [
+        (2 * n * _failed(used, spot, yaw, any_turn=n > 1) + n * (abs(yaw) > np.pi / 4.0) + i, i, yaw)
+        for i, spot in enumerate(spots)
+        for yaw in yaws
+    ]
+    order = sorted(ranked, key=lambda r: r[0])
     found: list[PlaceTarget] = []
     for rank, i, yaw in order:
         x, y = float(spots[i][0]), float(spots[i][1])
@@ -80,6 +93,13 @@ def place_targets(
             )
         )
     return tuple(found)
+
+
+def _failed(used: Sequence[PlaceTarget], spot: Array, yaw: float, *, any_turn: bool) -> bool:
+    return any(
+        np.linalg.norm(t.position[:2] - spot[:2]) < _SAME_SPOT and (any_turn or abs(t.yaw_offset - yaw) < 1e-6)
+        for t in used
+    )
 
 
 def yaw_offsets(step_deg: float) -> tuple[float, ...]:

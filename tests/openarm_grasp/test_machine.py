@@ -435,6 +435,15 @@ def test_a_place_that_cannot_be_planned_puts_the_object_back(world):
     assert outcome.place_position == (0.0, 0.0, 0.0)
 
 
+def test_a_carry_that_was_blocked_puts_the_object_back_and_tries_again(world):
+    world.faults.append(fail_on(is_execute("carry"), Code.EXECUTION_FAILED, times=1))
+    outcome = world.grasp()
+    assert outcome.success, outcome.message
+    assert outcome.attempts == 2
+    first, _, second = world.done(fx.PlanPlace)
+    assert first.targets[0].position != pytest.approx(second.targets[0].position)
+
+
 def test_a_hand_that_can_put_its_object_nowhere_keeps_it_and_says_so(world):
     world.faults.append(fail_on(lambda e: isinstance(e, fx.PlanPlace), Code.NO_PLAN))
     outcome = world.grasp()

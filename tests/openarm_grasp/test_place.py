@@ -62,6 +62,16 @@ def test_scores_follow_the_order():
     assert len(set(scores)) == 2  # small turns, large turns
 
 
+def test_a_failed_spot_comes_last_and_a_failed_turn_of_the_only_spot_too():
+    spots, candidate = [np.array([0.2, -0.3]), np.array([0.3, -0.3])], propose(box(), CONFIG)[0]
+    first = place_targets(box(), candidate, spots, CONFIG)
+    again = place_targets(box(), candidate, spots, CONFIG, used=first[:1])
+    assert {t.id.split("/")[0] for t in again[:12]} == {"spot1"}
+    only = place_targets(box(), candidate, spots[:1], CONFIG, used=first[:1])
+    assert only[-1].id == "spot0/yaw+0"
+    assert only[-1].score < min(t.score for t in only[:-1])
+
+
 @pytest.mark.parametrize(("step", "count"), [(15.0, 24), (30.0, 12), (90.0, 4), (180.0, 2), (100.0, 3)])
 def test_yaw_offsets_go_once_round(step, count):
     offsets = yaw_offsets(step)
