@@ -24,7 +24,12 @@ from openarm_sim_bridge.compiled import CompiledWorld, TrackedObject, compile_wo
 
 Array = NDArray[np.float64]
 
-_DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+_DIVERGED = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+    mujoco.mjtWarning.mjWARN_BADCTRL,  # MuJoCo would go on with all targets zero
+)
 #: Something that is put into a running world may touch what is there by this much, m.
 _OVERLAP_ALLOWED = 1e-3
 

@@ -4,6 +4,10 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 
@@ -569,3 +573,26 @@ def test_diagnostics_tell_how_well_it_keeps_up(bench: Bench) -> None:
         "frames_overhead",
         "frames_wrist",
     } <= set(values)
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_p34_a_signal_ends_the_process_in_order(ros, stop: signal.Signals) -> None:
+    """With cameras on and a trajectory under way: no error is told, and the exit code is 0."""
+    joints: list[JointState] = []
+    images: list[Image] = []
+    ros.node.create_subscription(JointState, "/joint_states", joints.append, QOS_COMMAND)
+    ros.node.create_subscription(Image, "/overhead/color/image_raw", images.append, QOS_SENSOR)
+    client = ActionClient(ros.node, FollowJointTrajectory, "/right_joint_trajectory_controller/follow_joint_trajectory")
+    command = [sys.executable, "-m", "openarm_sim_bridge.node", "--ros-args", "-p", "scene:=empty"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
+        try:
+            ros.spin_until(lambda: joints and images, 30.0, "joint states and images of the process")
+            handle, _ = ros.send_goal(client, trajectory_goal((5.0, NEAR_HOME)))
+            assert handle.accepted
+            process.send_signal(stop)
+            _, errors = process.communicate(timeout=10.0)
+        finally:
+            process.kill()
+    assert process.returncode == 0
+    assert "Traceback" not in errors, errors
+    assert "rror" not in errors, errors

@@ -221,6 +221,9 @@ def test_a_diverged_simulation_is_reported_and_a_reset_mends_it(
     world.reset()
     world.step_tick()
     assert np.all(np.isfinite(world.read_joints().position))
+    world.set_targets(np.array([np.nan, 0.0, 0.0]))
+    with pytest.raises(OpenArmError, match="diverged"):
+        world.step_tick()
 
 
 @pytest.mark.parametrize(
