@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ./openarm asks about the machine before there is an environment. Runs on any Python 3, so it uses old syntax only.
+"""What ./openarm asks about the machine before there is an environment. It runs on any Python 3: old syntax only.
 
 probe.py python                   prints "X.Y.Z <base interpreter>" and exits 0, or the reason against it and exits 1
 probe.py packages [build] [venv]  prints the apt package of each missing system part, one a line
