@@ -25,7 +25,7 @@ class DetectNodeConfig(Config):
     label: str = Field("", description="only objects of this name; empty takes all")
     max_rate: float = Field(10.0, gt=0.0, le=60.0, description="most frames processed a second of the stamps, Hz")
     transform_wait: float = Field(0.5, ge=0.0, le=5.0, description="longest wait for the camera's pose, s")
-    localizer: LocalizerConfig = LocalizerConfig()
+    localizer: LocalizerConfig = Field(default_factory=LocalizerConfig)
 
 
 class CloudNodeConfig(Config):

@@ -18,7 +18,7 @@ from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 
 Points = NDArray[np.float32]
-DepthImage = NDArray[np.uint16] | NDArray[np.float32]
+DepthImage = NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.uint16 | np.float32]
 
 
 class DepthLimits(Config):
@@ -55,7 +55,8 @@ def _count(depth: DepthImage, scale: np.float32, near: np.float32, far: np.float
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             z = np.float32(depth[v, u]) * scale
-            n += near <= z <= far
+            if near <= z <= far:
+                n += 1
     return n
 
 
@@ -105,7 +106,7 @@ def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> Non
         )
 
 
-def _frozen(depth: DepthImage) -> DepthImage:
+def _frozen(depth: DepthImage) -> NDArray[np.uint16 | np.float32]:
     """The same image as a contiguous read-only array: what a message gives, so that kernels are compiled once."""
     view = np.ascontiguousarray(depth).view()
     view.flags.writeable = False

@@ -70,7 +70,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._inputs: list[Subscription] = []
         self._waiting: _Frame | None = None
         self._last_ns: int | None = None
-        self._counts = dict.fromkeys(("frames", "skipped", "refused_frames", "refused_objects"), 0)
+        self._counts: dict[str, int] = dict.fromkeys(("frames", "skipped", "refused_frames", "refused_objects"), 0)
 
         self._boxes = self.create_publisher(Detection2DArray, "/detections_2d", reliable(5))
         self._objects = self.create_publisher(Detection3DArray, "/detections_3d", reliable(5))

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, cast
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
@@ -146,7 +147,7 @@ class ColorDetector:
             raise OpenArmError(
                 Code.BAD_IMAGE, f"colour image has shape {rgb.shape} and type {rgb.dtype}; expected (h, w, 3) of uint8"
             )
-        hsv = cv2.cvtColor(rgb, cv2.COLOR_RGB2HSV)
+        hsv = cast(Image, cv2.cvtColor(rgb, cv2.COLOR_RGB2HSV))
         found = [d for label, bounds in self._bounds.items() for d in self._of_colour(label, bounds, hsv)]
         return tuple(sorted((d for d in found if d.score >= self.config.min_score), key=lambda d: -d.area))
 
@@ -162,7 +163,7 @@ class ColorDetector:
         saturation = hsv[..., 1]
         return [d for contour in contours if (d := self._detection(label, contour, raw, saturation)) is not None]
 
-    def _detection(self, label: str, contour: NDArray[np.int32], raw: Image, saturation: Image) -> Detection2D | None:
+    def _detection(self, label: str, contour: MatLike, raw: MatLike, saturation: Image) -> Detection2D | None:
         u, v, width, height = cv2.boundingRect(contour)
         local = contour - np.array([u, v], np.int32)
         mask = cv2.drawContours(np.zeros((height, width), np.uint8), [local], -1, 1, cv2.FILLED)

@@ -41,14 +41,16 @@ _MARGIN = 4
 class LocalizerConfig(Config):
     """What counts as the object in the depth image."""
 
-    min_points: int = Field(40, ge=12, description="fewest pixels with depth on the object")
-    table_margin: float = Field(0.008, gt=0.0, le=0.05, description="what is lower above the table is table, m")
-    top_band: float = Field(0.003, gt=0.0, le=0.02, description="points within this of the top's height are top, m")
-    depth_gate: float = Field(0.15, gt=0.0, description="points farther from the median depth are strays, m")
-    hidden_step: float = Field(0.010, gt=0.0, description="a neighbour nearer by this hides the object, m")
-    side_step: float = Field(0.015, gt=0.0, description="a lower neighbour within this is a side of the object, m")
-    prism_rms: float = Field(0.0025, gt=0.0, description="an outline farther from its shape is no prism's, m (rms)")
-    std_floor: float = Field(0.0005, gt=0.0, description="smallest standard deviation of the position, m")
+    min_points: int = Field(default=40, ge=12, description="fewest pixels with depth on the object")
+    table_margin: float = Field(default=0.008, gt=0.0, le=0.05, description="what is lower above the table is table, m")
+    top_band: float = Field(default=0.003, gt=0.0, le=0.02, description="what lies within this of the top is top, m")
+    depth_gate: float = Field(default=0.15, gt=0.0, description="points farther from the median depth are strays, m")
+    hidden_step: float = Field(default=0.010, gt=0.0, description="a neighbour nearer by this hides the object, m")
+    side_step: float = Field(default=0.015, gt=0.0, description="a lower neighbour within this is a side, m")
+    prism_rms: float = Field(
+        default=0.0025, gt=0.0, description="an outline farther from its shape (rms) is no prism's, m"
+    )
+    std_floor: float = Field(default=0.0005, gt=0.0, description="smallest standard deviation of the position, m")
 
 
 @dataclass(frozen=True)
