@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of the README against the running graph: what they name exists, with that type and QoS, and no more."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rclpy
+from rclpy.action.graph import get_action_server_names_and_types_by_node
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+ROW = re.compile(r"^\| `(/[^`]+)` \| `([^`]+/(?:msg|srv|action)/[^`]+)` \|(.*)\|$", re.MULTILINE)
+QOS = {
+    "reliable": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
+    "latched": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
+    "best effort": (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
+}
+#: What rclpy and actions add by themselves, what is listened to, and what is beside a camera that is only looked at.
+UNTOLD = re.compile(r"/_action/|^/rosout$|^/parameter_events$|^/joint_commands$|^/spectator/color/camera_info$")
+
+pytestmark = pytest.mark.graph
+
+
+@pytest.fixture(scope="module")
+def graph() -> Iterator[Node]:
+    """A probe beside the running graph `sim`."""
+    command = [sys.executable, "-m", "openarm_bringup.cli", "up", "sim", "--domain", os.environ["ROS_DOMAIN_ID"]]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        assert process.stdout is not None
+        lines: list[str] = []
+        for line in process.stdout:
+            lines.append(line)
+            if "is ready after" in line:
+                break
+        rclpy.init()
+        node = rclpy.create_node("contract")
+        try:
+            if process.poll() is not None:
+                pytest.fail("the graph did not start:\n" + "".join(lines))
+            yield node
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=30.0)
+
+
+def _settled(node: Node) -> dict[str, list[str]]:
+    """Topics and types, once every topic of the README has every publisher that the README names (or 20 s later)."""
+    for _ in range(200):
+        if all(_publishers(node, name) == told for name, told in _told_publishers().items()):
+            break
+        rclpy.spin_once(node, timeout_sec=0.1)
+    return dict(node.get_topic_names_and_types())
+
+
+def _told_publishers() -> dict[str, list[str]]:
+    rows = [(name, rest.split("|")[1].strip()) for name, kind, rest in ROW.findall(README) if "/msg/" in kind]
+    everyone = ["calibration_publisher", "cloud", "detector", "grasp", "motion", "mujoco_bridge"]
+    return {name: everyone if who == "all" else sorted(w.strip() for w in who.split(",")) for name, who in rows}
+
+
+def _publishers(node: Node, topic: str) -> list[str]:
+    return sorted({info.node_name for info in node.get_publishers_info_by_topic(topic)})
+
+
+def test_topics_have_the_stated_type_publishers_and_qos(graph: Node) -> None:
+    topics = _settled(graph)
+    rows = [row for row in ROW.findall(README) if "/msg/" in row[1]]
+    assert len(rows) >= 25
+    assert {name: _publishers(graph, name) for name, _, _ in rows} == _told_publishers()
+    for name, kind, rest in rows:
+        assert topics[name] == [kind], name
+        for info in graph.get_publishers_info_by_topic(name):
+            qos = (info.qos_profile.reliability, info.qos_profile.durability)
+            assert qos == QOS[rest.split("|")[0].strip()], name
+
+
+def test_no_topic_is_left_untold(graph: Node) -> None:
+    told = {name for name, _, _ in ROW.findall(README)}
+    untold = [name for name in _settled(graph) if name not in told and not UNTOLD.search(name)]
+    assert untold == []
+
+
+def test_services_and_actions_have_the_stated_type_and_node(graph: Node) -> None:
+    _settled(graph)
+    rows = {name: (kind, rest.split("|")[0].strip()) for name, kind, rest in ROW.findall(README) if "/msg/" not in kind}
+    assert len(rows) >= 14
+    found: dict[str, tuple[str, str]] = {}
+    for node_name in ("mujoco_bridge", "motion", "grasp"):
+        services = graph.get_service_names_and_types_by_node(node_name, "/")
+        actions = get_action_server_names_and_types_by_node(graph, node_name, "/")
+        for name, kinds in services + actions:
+            if not re.search(r"/_action/|/(describe|get|list|set)_parameter|get_type_description", name):
+                found[name] = (kinds[0], node_name)
+    assert found == rows
+
+
+def test_a73_one_publisher_for_each_edge_of_the_frame_tree(graph: Node) -> None:
+    from tf2_msgs.msg import TFMessage
+
+    from openarm_common.node import QOS_STATIC_TF, QOS_TF
+
+    parents: dict[str, set[tuple[str, str]]] = {}
+
+    def note(kind: str, message: TFMessage) -> None:
+        for edge in message.transforms:
+            parents.setdefault(edge.child_frame_id, set()).add((edge.header.frame_id, kind))
+
+    graph.create_subscription(TFMessage, "/tf", lambda m: note("/tf", m), QOS_TF)
+    graph.create_subscription(TFMessage, "/tf_static", lambda m: note("/tf_static", m), QOS_STATIC_TF)
+    wanted = {"overhead_color_optical_frame", "wrist_link", "openarm_right_hand_tcp", "openarm_left_link7", "table"}
+    for _ in range(100):
+        rclpy.spin_once(graph, timeout_sec=0.1)
+        if wanted <= parents.keys():
+            break
+    assert wanted <= parents.keys()
+    assert {child: edges for child, edges in parents.items() if len(edges) > 1} == {}
+    roots = {parent for edges in parents.values() for parent, _ in edges} - parents.keys()
+    assert roots == {"world"}
