@@ -210,9 +210,8 @@ class Studio:
             self.observer.look_away(SPECTATOR)
         if self._film.close():
             self._result.pictures.append("grasp.mp4")
-        for name in ("grasp.webp", "grasp.gif"):
-            if self._film.save_animation(self._folder / name):
-                self._result.pictures.append(name)
+        if self._film.save_animation(self._folder / "grasp.webp"):
+            self._result.pictures.append("grasp.webp")
         if self._film.dropped:
             self._result.warnings.append(f"the film lost {self._film.dropped} frames")
 

@@ -85,8 +85,7 @@ class _Show:
     def ready(self, seconds: float) -> None:
         self._console.print(f"[green]the graph is ready[/green] after {seconds:.1f} s")
         if self._quiet:
-            head = f"{'seed':>5} {'target':<18}{'arm':<6}{'att.':>4}  {'outcome':<14}{'code':<18}"
-            head += f"{'mm':>6}{'sim s':>8}{'wall s':>8}"
+            head = f"{'seed':>4} {'target':<17}{'arm':<6}{'att.':>4}  {'outcome':<18}{'mm':>6}{'sim s':>7}{'wall s':>7}"
         else:
             head = f"{'sim s':>7}  {'state':<18}{'attempt':>7}  reason"
         self._console.print(head, style="bold")
@@ -105,9 +104,10 @@ class _Show:
             return
         row = trial.as_row()
         error = "-" if row["place_error_mm"] is None else f"{row['place_error_mm']:.1f}"
+        outcome = "placed" if trial.placed else f"FALSE {trial.code}" if trial.claimed else trial.code
         self._console.print(
-            f"{row['seed']:>5} {row['target']:<18}{row['arm']:<6}{row['attempts']:>4}  {row['outcome']:<14}"
-            f"{row['code']:<18}{error:>6}{row['sim_s']:>8.1f}{row['wall_s']:>8.1f}",
+            f"{row['seed']:>4} {row['target']:<17}{row['arm']:<6}{row['attempts']:>4}  {outcome:<18}{error:>6}"
+            f"{row['sim_s']:>7.1f}{row['wall_s']:>7.1f}",
             style="" if trial.placed else "red",
             markup=False,
         )

@@ -71,7 +71,7 @@ class Film:
         return self._written
 
     def save_animation(self, path: Path) -> bool:
-        """Write the small animation (.webp or .gif); False when there were too few frames."""
+        """Write the small animation (.webp, or .gif at forty times the size); False when there were too few frames."""
         if len(self._small) < 2:
             return False
         animation = cv2.Animation()

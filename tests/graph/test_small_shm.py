@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A container has 64 MB of /dev/shm unless told otherwise: no image may be lost there."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.graph, pytest.mark.slow]
+
+ROOT = Path(__file__).parents[2]
+
+
+def in_small_shm(*command: str) -> list[str]:
+    mount = 'mount -t tmpfs -o size=64m tmpfs /dev/shm && exec "$@"'
+    return ["unshare", "--mount", "--map-root-user", "sh", "-c", mount, "sh", *command]
+
+
+def can_mount() -> bool:
+    try:
+        return subprocess.run(in_small_shm("true"), capture_output=True, timeout=20, check=False).returncode == 0
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(not can_mount(), reason="this machine lets nobody make a mount namespace")
+def test_no_image_is_lost_on_64_mb_of_shared_memory() -> None:
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = in_small_shm(sys.executable, str(Path(__file__).parent / "small_shm.py"), "6")
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=200, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    result = json.loads(done.stdout.splitlines()[-1])
+    assert result["total_mib"] == 64
+    assert result["used_mib"] < 62
+    assert result["images"] > 150
+    assert result["others"] > 10
+    assert result["lost"] == 0, result
