@@ -8,6 +8,7 @@ from pydantic import Field
 from openarm_common.cameras import CameraConfig, load_cameras
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene import load_scene
 from openarm_perception.detector import Policy
 from openarm_perception.localize import LocalizerConfig
 
@@ -20,12 +21,23 @@ class DetectNodeConfig(Config):
     depth_topic: str = Field("/{camera}/depth/image_raw", description="aligned depth image; {camera} is filled in")
     info_topic: str = Field("/{camera}/depth/camera_info", description="CameraInfo of both; {camera} is filled in")
     colors: str = Field("", description="YAML of the colours; empty is config/params/detector.yaml")
-    table_height: float = Field(0.40, ge=-1.0, le=2.0, description="of the table in the base frame, m")
+    scene: str = Field("demo", description="scene whose table the objects stand on: a name or a path")
+    table_height: float | None = Field(
+        None, ge=-1.0, le=2.0, description="of the table in the base frame, m; without one, the scene's"
+    )
     policy: Policy = Field("score", description="which detection comes first: most certain, or nearest to the centre")
     label: str = Field("", description="only objects of this name; empty takes all")
     max_rate: float = Field(10.0, gt=0.0, le=60.0, description="most frames processed a second of the stamps, Hz")
     transform_wait: float = Field(0.5, ge=0.0, le=5.0, description="longest wait for the camera's pose, s")
     localizer: LocalizerConfig = Field(default_factory=LocalizerConfig)
+
+    def table_top_z(self) -> float:
+        """Height of the table in the base frame, m.
+
+        Raises:
+            OpenArmError: SCENE_INVALID, from the scene.
+        """
+        return load_scene(self.scene).table.top_z if self.table_height is None else self.table_height
 
 
 class CloudNodeConfig(Config):

@@ -61,7 +61,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         limits = DepthLimits(near=camera.near, far=camera.far)
         self._pipeline = Pipeline(
             ColorDetector(load_config(colors, ColorDetectorConfig)),
-            Localizer(config.localizer, limits, config.table_height),
+            Localizer(config.localizer, limits, config.table_top_z()),
             config.policy,
             config.label,
         )
