@@ -28,6 +28,8 @@ from openarm_common.errors import Code, OpenArmError
 OnFeedback = Callable[[GraspStatus], None]
 #: How often a waiting call looks up, so that Ctrl-C is noticed.
 _LOOK_S = 0.1
+#: A server that is not in the graph at so many looks in a row is gone.
+_GONE = 30
 
 
 @dataclass(frozen=True)
@@ -188,7 +190,11 @@ class GraspClient:
     def _wait(self, future: Future, timeout: float, what: str) -> Any:
         done = _done(future)
         deadline = time.monotonic() + timeout
+        missed = 0
         while not done.wait(_LOOK_S):
+            missed = 0 if self._client.server_is_ready() else missed + 1
+            if missed > _GONE:
+                raise OpenArmError(Code.NOT_READY, f"the grasp node is gone while waiting for {what}")
             if self._callback_error is not None:
                 error, self._callback_error = self._callback_error, None
                 raise error

@@ -487,6 +487,29 @@ def test_the_client_can_cancel_from_its_feedback(bench):
     assert results[0].code is Code.CANCELLED
 
 
+def test_the_client_notices_that_the_node_is_gone(bench):
+    bench.world.during = lambda what: Future()
+    errors: list[OpenArmError] = []
+
+    def script() -> None:
+        with GraspClient() as grasp:
+            try:
+                grasp.pick("red")
+            except OpenArmError as error:
+                errors.append(error)
+
+    thread = Thread(target=script)
+    thread.start()
+    bench.until(lambda: "execute" in bench.world.log, what="the arm moves")
+    bench.ros.executor.remove_node(bench.node)
+    bench.ros.nodes.remove(bench.node)
+    bench.node.close()
+    bench.node.destroy_node()
+    bench.until(lambda: not thread.is_alive(), 20.0, "the script ends")
+    thread.join()
+    assert errors[0].code is Code.NOT_READY
+
+
 def test_the_client_says_when_nobody_answers(ros):
     with GraspClient(timeout=0.2) as grasp, pytest.raises(OpenArmError, match="is the graph up") as error:
         grasp.pick("red")

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters, and what the package must not touch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+import openarm_grasp
+from openarm_grasp.config import GraspConfig
+
+
+def fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    for name, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from fields(field.annotation, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", field
+
+
+@pytest.mark.parametrize(("name", "field"), list(fields(GraspConfig)), ids=lambda v: v if isinstance(v, str) else "")
+def test_b62_every_parameter_is_described_and_numbers_have_a_range(name, field):
+    assert field.description
+    if field.annotation in (int, float):
+        assert field.metadata, f"{name} has no range"
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"),
+    [
+        ("timing", "pause_at_grasp", 0.5),  # B-52
+        ("timing", "after_close", 0.2),  # B-54
+        ("approach", "pregrasp_distance", 0.08),  # B-45
+        ("approach", "max_width", 0.070),  # B-17
+        ("detect", "max_age", 0.5),  # P-33
+        ("limits", "max_attempts", 3),  # A-70
+        ("held", "rise", 0.03),  # P-07
+        ("place", "tolerance", 0.02),  # P-09
+    ],
+)
+def test_defaults_are_those_of_the_requirements(section, key, value):
+    assert getattr(getattr(GraspConfig(), section), key) == value
+
+
+@pytest.mark.parametrize("tilts", [[], [-5.0], [0.0, 70.0]])
+def test_impossible_tilts_are_refused(tilts):
+    with pytest.raises(ValueError, match="tilts_deg"):
+        GraspConfig.model_validate({"approach": {"tilts_deg": tilts}})
+
+
+def test_a69_p16_no_source_reads_ground_truth_or_contacts_or_the_simulator():
+    folder = Path(openarm_grasp.__file__).parent
+    for path in folder.glob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        for word in ("ground_truth", "/sim/", "mujoco", ".contact", "qpos"):
+            assert word not in text, f"{path.name} mentions {word}"
