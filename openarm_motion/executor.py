@@ -25,10 +25,14 @@ from openarm_motion.checks import Motion
 
 #: Between two looks at a running motion, s of wall clock.
 _WATCH = 0.05
+#: A joint state no older than this shows where the robot is, s of wall clock.
+_FRESH = 0.5
 #: A controller has this long to accept, to refuse, or to end a cancelled motion, s of wall clock.
 _ANSWER = 2.0
-#: Controllers that are not seen in the graph in so many looks one after the other are gone.
-_GONE = 6
+#: A controller that has not been in the graph for so long is gone, s: discovery may lose it for a moment.
+_GONE = 1.0
+#: Joint states and controller have this long to appear before a motion, s of wall clock.
+_READY = 1.0
 
 _RESULT = FollowJointTrajectory.Result
 _FAULTS = {
@@ -86,9 +90,9 @@ class Follower:
             OpenArmError: NOT_READY, without controller or joint states; ROBOT_LOST, when either vanishes on the way;
                 EXECUTION_FAILED, with the controller's reason or the joint that did not arrive; TIMEOUT; CANCELLED.
         """
-        self._require_ready()
-        watch = _Watch(self._node)
+        watch = Watch(self._node, self._states)
         try:
+            await self._require_ready(watch)
             self.running = Running(motion, self._states.buffer.latest()[0])
             await self._send(watch, message, motion, cancelled, progress)
             await self._arrive(watch, motion, cancelled)
@@ -97,17 +101,14 @@ class Follower:
             watch.close()
         progress(1.0)
 
-    def _require_ready(self) -> None:
-        age = self._states.age_s()
-        if age > self._arm.config.execution.stale_after:
-            when = "none yet" if math.isinf(age) else f"the last is {age:.1f} s old"
-            raise OpenArmError(Code.NOT_READY, f"no fresh /joint_states ({when}); is the bridge or driver running?")
-        if not self._client.server_is_ready():
+    async def _require_ready(self, watch: Watch) -> None:
+        await watch.fresh()
+        if not await watch.until(self._client.server_is_ready, lambda: None, _READY):
             raise OpenArmError(Code.NOT_READY, f"no controller offers {self._topic}; is the bridge or driver running?")
 
     async def _send(
         self,
-        watch: _Watch,
+        watch: Watch,
         message: JointTrajectory,
         motion: Motion,
         cancelled: Callable[[], bool],
@@ -160,7 +161,7 @@ class Follower:
         if cancelling is not None and cancelled():
             raise OpenArmError(Code.CANCELLED, f"cancelled as the {self._arm.name} arm arrived; it holds there")
 
-    async def _arrive(self, watch: _Watch, motion: Motion, cancelled: Callable[[], bool]) -> None:
+    async def _arrive(self, watch: Watch, motion: Motion, cancelled: Callable[[], bool]) -> None:
         """Wait until the joints are where the motion ends; what a controller says is not evidence."""
         config = self._arm.config.execution
         arrived_ns = self._states.buffer.latest()[0]
@@ -188,27 +189,33 @@ class Follower:
     def _elapsed_ns(self) -> int:
         return self._states.buffer.latest()[0] - self.running.since_ns if self.running else 0
 
-    def _raise_if_lost(self, watch: _Watch) -> None:
-        age, limit = self._states.age_s(), self._arm.config.execution.stale_after
-        if age > limit and not watch.starved:
+    def _raise_if_lost(self, watch: Watch) -> None:
+        limit = self._arm.config.execution.stale_after
+        if watch.silence > limit:
+            age = self._states.age_s()
             raise OpenArmError(Code.ROBOT_LOST, f"no /joint_states for {age:.1f} s, expected one within {limit:g} s")
-        watch.missing = 0 if self._client.server_is_ready() else watch.missing + 1
-        if watch.missing >= _GONE:
+        watch.missing = 0.0 if self._client.server_is_ready() else watch.missing + _WATCH
+        if watch.missing > _GONE:
             raise OpenArmError(Code.ROBOT_LOST, f"controller {self._topic} is gone")
 
 
-class _Watch:
-    """Wakes a coroutine at a steady pace until something holds."""
+class Watch:
+    """Wakes a coroutine at a steady pace until something holds, and counts how long the robot has been silent.
 
-    def __init__(self, node: BaseNode[Any]) -> None:
-        self._node = node
+    Args:
+        node: The node that owns the timer.
+        states: The robot's joint states.
+    """
+
+    def __init__(self, node: BaseNode[Any], states: RobotStateListener) -> None:
+        self._node, self._states = node, states
         self._next = Future(executor=node.executor)
         self._timer = node.create_timer(_WATCH, self._tick, clock=node.wall_clock)
         self._last_ns = self._start_ns = node.wall_clock.now().nanoseconds
-        #: Looks in a row at which the controller was not in the graph.
-        self.missing = 0
-        #: The last pause was this process's own: messages may be waiting unread.
-        self.starved = False
+        #: How long the controller has not been in the graph, s.
+        self.missing = 0.0
+        #: How long this process was awake without a joint state, s: messages wait unread while it is not.
+        self.silence = 0.0
 
     def restart(self) -> None:
         """Count `elapsed` from now."""
@@ -230,13 +237,29 @@ class _Watch:
             look()
         return True
 
+    async def fresh(self) -> None:
+        """Wait a moment for a fresh joint state.
+
+        Raises:
+            OpenArmError: NOT_READY, when none comes.
+        """
+        if not await self.until(lambda: self._states.age_s() <= _FRESH, lambda: None, _READY):
+            raise stale(self._states.age_s())
+
     def close(self) -> None:
         """Stop waking."""
         self._node.destroy_timer(self._timer)
 
     def _tick(self) -> None:
         now = self._node.wall_clock.now().nanoseconds
-        self.starved = (now - self._last_ns) * 1e-9 > 4.0 * _WATCH
+        awake = min((now - self._last_ns) * 1e-9, 2.0 * _WATCH)
         self._last_ns = now
+        self.silence = min(self._states.age_s(), self.silence + awake)
         current, self._next = self._next, Future(executor=self._node.executor)
         current.set_result(None)
+
+
+def stale(age: float) -> OpenArmError:
+    """The error for joint states that are `age` seconds old."""
+    when = "none yet" if math.isinf(age) else f"the last is {age:.1f} s old"
+    return OpenArmError(Code.NOT_READY, f"no fresh /joint_states ({when}); is the bridge or driver running?")

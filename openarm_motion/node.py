@@ -33,7 +33,7 @@ from openarm_motion.arm import Arm, Situation
 from openarm_motion.checks import check_against_others, check_trajectory
 from openarm_motion.collision import Box, box_from
 from openarm_motion.config import MotionConfig
-from openarm_motion.executor import Follower
+from openarm_motion.executor import Follower, Watch, stale
 from openarm_motion.memory import HeldMemory
 from openarm_motion.trajectory import Trajectory
 
@@ -71,8 +71,8 @@ class MotionNode(BaseNode[MotionConfig]):
     def close(self) -> None:
         """Stop planning, then as every node."""
         self._closing = True
-        for server in self._servers:
-            server.destroy()
+        while self._servers:
+            self._servers.pop().destroy()
         super().close()
 
     # --- actions
@@ -89,6 +89,8 @@ class MotionNode(BaseNode[MotionConfig]):
         try:
             arm = self._arm(goal.arm)
             request = convert.request_from_msg(goal)
+            if not len(goal.start):
+                await self._fresh()
             now = self._situation(arm, goal.start, goal.velocity_scale, self._stopper(handle))
             plan: ApproachPlan = await self.in_thread(plan_approach, arm, now, request, report)
             result.success, result.code, result.message = True, Code.OK.value, "planned"
@@ -117,6 +119,7 @@ class MotionNode(BaseNode[MotionConfig]):
             arm = self._arm(goal.arm)
             with self._claim(goal.arm, wanted=not goal.plan_only):
                 handle.publish_feedback(MoveArm.Feedback(stage="planning"))
+                await self._fresh()
                 now = self._situation(arm, (), goal.velocity_scale, self._stopper(handle))
                 around = moves.Around(convert.boxes_from_msg(goal.obstacles), convert.boxes_from_msg(goal.attached))
                 trajectory: Trajectory = await self.in_thread(self._planner_of(arm, now, goal, around))
@@ -138,6 +141,7 @@ class MotionNode(BaseNode[MotionConfig]):
         try:
             arm = self._arm(goal.arm)
             with self._claim(goal.arm, wanted=True):
+                await self._fresh()
                 await self._follow(handle, arm, goal.trajectory, ExecuteTrajectory.Feedback())
             result.success, result.code, result.message = True, Code.OK.value, "arrived"
         except OpenArmError as error:
@@ -197,15 +201,22 @@ class MotionNode(BaseNode[MotionConfig]):
     def _situation(self, arm: Arm, start: Sequence[float], scale: float, stopped: Callable[[], bool]) -> Situation:
         """The robot as it is now; a given start is enough where the joint states are missing."""
         state: dict[str, float] = {}
-        age, limit = self._states.age_s(), self.config.execution.stale_after
-        if age <= limit:
+        age = self._states.age_s()
+        if age <= self.config.execution.stale_after:
             state = self._states.buffer.latest()[1]
         elif len(start) == 0:
-            when = "none yet" if age == float("inf") else f"the last is {age:.1f} s old"
-            raise OpenArmError(
-                Code.NOT_READY, f"no fresh /joint_states ({when}); is the bridge or driver running? Or give a start"
-            )
+            raise stale(age)
         return arm.situation(state, start, scale, stopped)
+
+    async def _fresh(self) -> None:
+        """Wait a moment for a fresh joint state; see `Watch.fresh`."""
+        if self._states.age_s() <= self.config.execution.stale_after:
+            return
+        watch = Watch(self, self._states)
+        try:
+            await watch.fresh()
+        finally:
+            watch.close()
 
     def _pose(self, message: PoseStamped) -> Array:
         """`T_base_pose` (4, 4) of a pose in any known frame."""

@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import functools
+import threading
 import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
 from control_msgs.action import FollowJointTrajectory
 from geometry_msgs.msg import PoseStamped, Vector3
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
@@ -20,6 +20,7 @@ from rclpy.action.client import ClientGoalHandle
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
+from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
@@ -31,8 +32,10 @@ from openarm_common.convert import (
     trajectory_to_msg,
 )
 from openarm_common.description import RobotDescription
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF, BaseNode
 from openarm_motion.node import MotionNode, table_boxes
+from openarm_motion.planner import PlannedPath, PlanQuery
 
 Result = FollowJointTrajectory.Result
 HZ = 100
@@ -51,6 +54,7 @@ class FakeRobot:
         self.stuck: set[str] = set()
         self.accept = True
         self.cancelled: list[str] = []
+        self.gone: set[str] = set()
         self.active: dict[str, tuple[int, list[str], np.ndarray, np.ndarray]] = {}
         self._wake = Future()
         self._publisher = node.create_publisher(JointState, "/joint_states", QOS_COMMAND)
@@ -90,9 +94,11 @@ class FakeRobot:
         self.active[side] = (self.t_ns, names, t, q)
         result = FollowJointTrajectory.Result(error_code=Result.SUCCESSFUL)
         end_ns = self.t_ns + int(t[-1] * 1e9)
-        while self.t_ns < end_ns and not handle.is_cancel_requested:
+        while self.t_ns < end_ns and side not in self.gone and not handle.is_cancel_requested:
             await self._wake
-        del self.active[side]
+        self.active.pop(side)
+        if side in self.gone:
+            return result
         if handle.is_cancel_requested:
             self.cancelled.append(side)
             handle.canceled()
@@ -120,6 +126,7 @@ class Bench:
         self.markers: list[MarkerArray] = []
         ros.node.create_subscription(MarkerArray, "/motion/attached_objects", self.markers.append, QOS_LATCHED)
         ros.spin_until(lambda: self.node._states.age_s() < 0.5, 10.0, "joint states")
+        ros.spin_until(lambda: "table" in self.node._states.buffer._static, 10.0, "the table's frame")
         for follower in self.node._followers.values():
             ros.spin_until(follower._client.server_is_ready, 10.0, "controllers")
 
@@ -132,6 +139,14 @@ class Bench:
         """Send a goal and return its result."""
         _, future = self.start(client, goal, **kwargs)
         return self.ros.result(future, timeout).result
+
+    def begin(self, side: str, trajectory: JointTrajectory) -> tuple[ClientGoalHandle, Future]:
+        """Send a trajectory and wait until the arm is on its way."""
+        goal = ExecuteTrajectory.Goal(arm=side, trajectory=trajectory)
+        handle, future = self.start(self.execute_client, goal)
+        self.ros.spin_until(lambda: side in self.robot.active or future.done(), 10.0, "the arm to start")
+        assert not future.done(), future.result()
+        return handle, future
 
     def q(self, side: str) -> np.ndarray:
         return np.array([self.robot.state[name] for name in self.description.arm_joints(side)])
@@ -358,12 +373,15 @@ def test_an_approach_that_fails_carries_all_refusals(bench: Bench) -> None:
 
 
 # --- execution
-def short_plan(bench: Bench):
-    return bench.run(bench.move_client, named(plan_only=True)).trajectory
+def slow_plan(bench: Bench) -> JointTrajectory:
+    """A motion that takes long enough to be disturbed: 40 s of the robot's time, 10 of the wall clock."""
+    goal = named(plan_only=True)
+    goal.velocity_scale = 0.02
+    return bench.run(bench.move_client, goal).trajectory
 
 
 def test_a_bad_trajectory_is_refused_with_joint_and_value(bench: Bench) -> None:
-    good = short_plan(bench)
+    good = slow_plan(bench)
     names, t, q, v, a = trajectory_from_msg(good)
     cases = []
     cases.append((["elbow", *names[1:]], q, "INVALID_ARGUMENT", "unknown elbow"))
@@ -382,9 +400,7 @@ def test_a_bad_trajectory_is_refused_with_joint_and_value(bench: Bench) -> None:
 
 
 def test_cancel_holds(bench: Bench) -> None:
-    handle, future = bench.start(
-        bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=short_plan(bench))
-    )
+    handle, future = bench.start(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=slow_plan(bench)))
     bench.ros.spin_until(lambda: "right" in bench.robot.active, 5.0, "the arm to start")
     bench.ros.result(handle.cancel_goal_async())
     answer = bench.ros.result(future)
@@ -417,8 +433,7 @@ def test_a71_a_controller_that_says_success_is_not_evidence(bench: Bench) -> Non
 
 
 def test_a_silent_robot_ends_a_motion_within_two_seconds(bench: Bench) -> None:
-    future = bench.start(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=short_plan(bench)))[1]
-    bench.ros.spin_until(lambda: "right" in bench.robot.active, 5.0, "the arm to start")
+    _, future = bench.begin("right", slow_plan(bench))
     bench.robot.silent = True
     begin = time.monotonic()
     result = bench.ros.result(future).result
@@ -433,11 +448,10 @@ def test_a_silent_robot_ends_a_motion_within_two_seconds(bench: Bench) -> None:
 
 
 def test_a_controller_that_vanishes_ends_a_motion_within_two_seconds(bench: Bench) -> None:
-    future = bench.start(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=short_plan(bench)))[1]
-    bench.ros.spin_until(lambda: "right" in bench.robot.active, 5.0, "the arm to start")
-    bench.robot.active.clear()
+    _, future = bench.begin("right", slow_plan(bench))
     begin = time.monotonic()
     bench.robot.servers["right"].destroy()
+    bench.robot.gone.add("right")
     result = bench.ros.result(future).result
     assert time.monotonic() - begin < 2.0
     assert (result.success, result.code) == (False, "ROBOT_LOST")
@@ -462,5 +476,37 @@ def test_b50_obstacles_travel_with_the_request(bench: Bench) -> None:
     assert bench.run(bench.move_client, named("right", "home", plan_only=True)).success
 
 
-def test_stamp_helper_keeps_nanoseconds() -> None:
-    assert ns_to_stamp(1_500_000_000) == Time(sec=1, nanosec=500_000_000)
+class WaitingPlanner:
+    """Searches until it is stopped."""
+
+    def __init__(self) -> None:
+        self.searching = threading.Event()
+
+    def plan(self, query: PlanQuery) -> PlannedPath:
+        self.searching.set()
+        deadline = time.monotonic() + 20.0
+        while not query.stopped():
+            assert time.monotonic() < deadline, "nobody stopped the search"
+            threading.Event().wait(0.01)
+        raise OpenArmError(Code.CANCELLED, "planning was stopped")
+
+
+def test_a_search_ends_by_cancel(bench: Bench) -> None:
+    planner = bench.node._arms["right"]._planner = WaitingPlanner()
+    for client, goal in ((bench.move_client, named()), (bench.plan_client, approach_goal())):
+        planner.searching.clear()
+        handle, future = bench.start(client, goal)
+        bench.ros.spin_until(planner.searching.is_set, 5.0, "the search")
+        bench.ros.result(handle.cancel_goal_async())
+        answer = bench.ros.result(future)
+        assert answer.status == 5  # canceled
+        assert answer.result.code == "CANCELLED"
+
+
+def test_a_search_ends_with_the_node(bench: Bench) -> None:
+    planner = bench.node._arms["right"]._planner = WaitingPlanner()
+    bench.start(bench.move_client, named())
+    bench.ros.spin_until(planner.searching.is_set, 5.0, "the search")
+    begin = time.monotonic()
+    bench.node.close()
+    assert time.monotonic() - begin < 1.0
