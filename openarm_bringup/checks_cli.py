@@ -18,7 +18,7 @@ from openarm_common.errors import Code, OpenArmError
 #: Tests that start processes come last: a fault in a core shows in seconds.
 LAST = ("nodes", "replay", "graph")
 
-Rest = Annotated[tuple[str, ...], Parameter(allow_leading_hyphen=True)]
+Rest = Annotated[str, Parameter(allow_leading_hyphen=True)]
 
 
 def test(*args: Rest) -> Outcome:

@@ -77,7 +77,7 @@ class Film:
         animation = cv2.Animation()
         animation.frames = self._small
         milliseconds = round(1000.0 / (ANIMATION_FPS * ANIMATION_SPEED))
-        animation.durations = np.full(len(self._small), milliseconds, np.int32)
+        animation.durations = [milliseconds] * len(self._small)
         animation.loop_count = 0
         options = [cv2.IMWRITE_WEBP_QUALITY, 65] if path.suffix == ".webp" else []
         return bool(cv2.imwriteanimation(str(path), animation, options))

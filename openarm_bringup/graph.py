@@ -30,10 +30,10 @@ VARIABLES = ("scene", "seed", "mount_seed")
 class Ready(Config):
     """One condition of readiness: exactly one of the four names is given."""
 
-    topic: str | None = Field(None, description="has a publisher")
-    message: str | None = Field(None, description="a message of this topic was received")
-    service: str | None = Field(None, description="has a server")
-    action: str | None = Field(None, description="has a server")
+    topic: str | None = Field(default=None, description="has a publisher")
+    message: str | None = Field(default=None, description="a message of this topic was received")
+    service: str | None = Field(default=None, description="has a server")
+    action: str | None = Field(default=None, description="has a server")
 
     @model_validator(mode="after")
     def _one(self) -> Ready:
@@ -64,29 +64,29 @@ class Restart(Config):
     """What happens when a node ends by itself."""
 
     policy: Literal["never", "on_failure", "always"] = "on_failure"
-    backoff: float = Field(0.5, gt=0, description="s before the first restart; doubles with each one")
-    backoff_max: float = Field(8.0, gt=0, description="s, the longest wait")
-    max: int = Field(5, ge=0, description="restarts before the node is given up")
-    forget_after: float = Field(60.0, gt=0, description="s of being ready after which earlier restarts are forgotten")
+    backoff: float = Field(default=0.5, gt=0, description="s before the first restart; doubles with each one")
+    backoff_max: float = Field(default=8.0, gt=0, description="s, the longest wait")
+    max: int = Field(default=5, ge=0, description="restarts before the node is given up")
+    forget_after: float = Field(default=60.0, gt=0, description="s of being ready that make up for earlier restarts")
 
 
 class NodeSpec(Config):
     """One process of the graph."""
 
-    module: str | None = Field(None, description="started as `python -m module`")
-    command: tuple[str, ...] = Field((), description="started instead of a module")
+    module: str | None = Field(default=None, description="started as `python -m module`")
+    command: tuple[str, ...] = Field(default=(), description="started instead of a module")
     params: dict[str, Any] = Field(default_factory=dict, description="ROS parameters, nested or joined by dots")
-    params_file: str | None = Field(None, description="ROS parameter file, relative to config/ or to the graph file")
+    params_file: str | None = Field(default=None, description="ROS parameter file, in config/ or beside the graph")
     remaps: dict[str, str] = Field(default_factory=dict)
-    ready: tuple[Ready, ...] = Field((), description="all must hold; none = ready when started")
-    ready_timeout: float = Field(60.0, gt=0, description="s")
-    needs: tuple[str, ...] = Field((), description="nodes that must be ready before this one is started")
+    ready: tuple[Ready, ...] = Field(default=(), description="all must hold; none = ready when started")
+    ready_timeout: float = Field(default=60.0, gt=0, description="s")
+    needs: tuple[str, ...] = Field(default=(), description="nodes that must be ready before this one is started")
     restart: Restart = Restart()
-    large_messages: bool = Field(False, description="publishes images or clouds: gets the large Fast DDS segment")
-    segment_mib: int = Field(32, ge=1, le=1024, description="MiB of /dev/shm for large messages")
+    large_messages: bool = Field(default=False, description="publishes images or clouds: a large Fast DDS segment")
+    segment_mib: int = Field(default=32, ge=1, le=1024, description="MiB of /dev/shm for large messages")
     env: dict[str, str] = Field(default_factory=dict)
-    offers: tuple[str, ...] = Field((), description="topics, services, actions, for `graph draw`")
-    uses: tuple[str, ...] = Field((), description="names that other nodes offer, for `graph draw`")
+    offers: tuple[str, ...] = Field(default=(), description="topics, services, actions, for `graph draw`")
+    uses: tuple[str, ...] = Field(default=(), description="names that other nodes offer, for `graph draw`")
 
     @model_validator(mode="after")
     def _start(self) -> NodeSpec:
@@ -100,11 +100,11 @@ class Graph(Config):
 
     name: str
     description: str = ""
-    scene: str = Field("demo", description="name or path of a scene, or `random`")
-    seed: int = Field(0, ge=0, description="of a random scene")
-    mount_seed: int | Literal["none"] = Field("none", description="of the true camera mounts; none = nominal")
-    domain: int | None = Field(None, ge=0, le=232, description="ROS_DOMAIN_ID; null = of the environment, or 0")
-    discovery: Discovery = Field("localhost", description="ROS_AUTOMATIC_DISCOVERY_RANGE")
+    scene: str = Field(default="demo", description="name or path of a scene, or `random`")
+    seed: int = Field(default=0, ge=0, description="of a random scene")
+    mount_seed: int | Literal["none"] = Field(default="none", description="of the true camera mounts; none = nominal")
+    domain: int | None = Field(default=None, ge=0, le=232, description="ROS_DOMAIN_ID; null = of the environment, or 0")
+    discovery: Discovery = Field(default="localhost", description="ROS_AUTOMATIC_DISCOVERY_RANGE")
     nodes: dict[str, NodeSpec] = Field(min_length=1)
 
     def levels(self) -> tuple[tuple[str, ...], ...]:

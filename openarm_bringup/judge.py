@@ -22,15 +22,15 @@ from openarm_common.config import Config
 class JudgeConfig(Config):
     """What counts as placed."""
 
-    place_tolerance: float = Field(0.020, gt=0, description="m, footprint centre to target")
-    lift: float = Field(0.05, gt=0, description="m, least rise of the centre during the run")
-    tilt: float = Field(math.radians(10.0), gt=0, description="rad, between the upward axis before and after")
+    place_tolerance: float = Field(default=0.020, gt=0, description="m, footprint centre to target")
+    lift: float = Field(default=0.05, gt=0, description="m, least rise of the centre during the run")
+    tilt: float = Field(default=math.radians(10.0), gt=0, description="rad, between the upward axis before and after")
     height: float = Field(
-        0.005, gt=0, description="m, centre after against centre before (it stands, and on the table)"
+        default=0.005, gt=0, description="m, centre after against centre before (it stands, and on the table)"
     )
-    speed: float = Field(0.005, gt=0, description="m/s at rest")
-    turn: float = Field(0.05, gt=0, description="rad/s at rest")
-    rest: float = Field(0.5, gt=0, description="s of simulated time at rest at the end")
+    speed: float = Field(default=0.005, gt=0, description="m/s at rest")
+    turn: float = Field(default=0.05, gt=0, description="rad/s at rest")
+    rest: float = Field(default=0.5, gt=0, description="s of simulated time at rest at the end")
 
 
 @dataclass(frozen=True)

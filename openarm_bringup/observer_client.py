@@ -136,7 +136,7 @@ class Observer:
 
         def receive(message: Image) -> None:
             try:
-                picture = image_to_array(message).copy()
+                picture = np.array(image_to_array(message), dtype=np.uint8)
             except OpenArmError as error:
                 self._node.get_logger().warning(str(error), throttle_duration_sec=5.0)
                 return

@@ -71,8 +71,9 @@ class ReadinessClient:
             if client.wait_for_service(timeout_sec=timeout_s):
                 future = client.call_async(ListParameters.Request())
                 self._executor.spin_until_future_complete(future, timeout_sec=timeout_s)
-                if future.done():
-                    return frozenset(future.result().result.names)
+                answer = future.result()
+                if answer is not None:
+                    return frozenset(answer.result.names)
         finally:
             self._node.destroy_client(client)
         raise OpenArmError(Code.TIMEOUT, f"/{node}/list_parameters did not answer within {timeout_s:g} s")

@@ -13,7 +13,7 @@ from openarm_perception.depth import Deprojector, DepthLimits
 def warm_perception() -> None:
     """Run the depth kernels with both encodings."""
     intrinsics = Intrinsics.from_fovy(8, 6, 1.0)
-    deprojector = Deprojector(DepthLimits())
+    deprojector = Deprojector(DepthLimits(near=0.05, far=3.0))
     for depth in (np.full((6, 8), 500, np.uint16), np.full((6, 8), 0.5, np.float32)):
         deprojector.organised(depth, intrinsics)
         deprojector.valid_points(depth, intrinsics)
