@@ -16,7 +16,8 @@ def warm() -> None:
     description = RobotDescription.load()
     kinematics = ArmKinematics(description, description.tcp_link(SIDES[0]))
     inverse = InverseKinematics(kinematics)
-    q = 0.5 * (kinematics.lower + kinematics.upper)
+    home = description.group_state(f"{SIDES[0]}_arm", "home")  # clear of singularities: a straight line leads away
+    q = np.array([home[joint] for joint in description.arm_joints(SIDES[0])])
     pose = kinematics.fk_many(np.stack([q, q]))[0]
     kinematics.jacobian(q)
     inverse.nearest(pose, q)

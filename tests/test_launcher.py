@@ -237,9 +237,9 @@ def test_no_network_for_pip_where_uv_is_missing_is_told_as_such(machine: Machine
 
 
 def test_a_build_that_fails_shows_its_end_and_its_log(machine: Machine) -> None:
-    machine.stub("uv", _UV.replace('"build "*)', '"build "*) echo "ninja: stopped"; exit 1;;\n"x")'))
+    machine.stub("uv", _UV.replace('"build "*)', '"build "*) echo "ninja: cannot connect the pieces"; exit 1;;\n"x")'))
     words = machine.refused()
-    assert "ninja: stopped" in words
+    assert "ninja: cannot connect the pieces" in words
     assert f"failed while building the packages of interfaces/. Log: {machine.root}/runs/setup.log" in words
 
 
