@@ -173,7 +173,7 @@ class Arm:
             gripper: Position of the finger joints instead of the present one, m.
         """
         clearance = self.config.straight if straight else self.config.clearance
-        supports = frozenset(box.id for box in self.static) | touchable
+        fixed = frozenset(box.id for box in self.static)
         return CollisionScene(
             self.robot,
             Surroundings(
@@ -181,7 +181,8 @@ class Arm:
                 boxes=[*self.static, *boxes],
                 held=held,
                 touchable=touchable,
-                supports=supports,
+                supports=fixed | touchable,
+                fixed=fixed,
                 clearance=clearance,
             ),
         )
@@ -191,12 +192,13 @@ class Arm:
         return {**state, **dict.fromkeys(self.robot.arm.gripper_joints, position)}
 
     def relax(self, scene: CollisionScene, start: Array) -> None:
-        """Let the arm leave its start.
+        """Let the arm leave its start: where it overlaps an estimated box, the box is wrong, not the arm.
 
         Raises:
             OpenArmError: IN_COLLISION, when it is stuck deeper than an error of measurement explains.
         """
-        contact = scene.relax(start, self.config.planning.start_overlap)
+        planning = self.config.planning
+        contact = scene.relax(start, planning.start_overlap, planning.estimate_overlap)
         if contact is not None:
             raise OpenArmError(
                 Code.IN_COLLISION,

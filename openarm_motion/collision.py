@@ -68,6 +68,7 @@ class Surroundings:
         held: Boxes held by this arm, pose in the tool frame.
         touchable: Ids of boxes that the fingers may touch.
         supports: Ids of boxes that a held box may stand on.
+        fixed: Ids of boxes that are where they are said to be; the others are estimates.
         clearance: Distances to keep.
         own: Whether the arm is checked against itself and the robot's body; False leaves the other arm and the boxes.
     """
@@ -77,6 +78,7 @@ class Surroundings:
     held: Sequence[Box] = ()
     touchable: frozenset[str] = frozenset()
     supports: frozenset[str] = frozenset()
+    fixed: frozenset[str] = frozenset()
     clearance: Clearance = field(default_factory=Clearance)
     own: bool = True
 
@@ -160,20 +162,23 @@ class CollisionScene:
                 return q
         return None
 
-    def relax(self, q: ArrayLike, allowance: float) -> Contact | None:
+    def relax(self, q: ArrayLike, allowance: float, estimates: float | None = None) -> Contact | None:
         """Let pairs that are too near at `q` stay as near as they are: an arm must be able to leave where it is.
 
         Args:
             q: (n,) where a motion starts.
             allowance: Overlap that is taken for an error of measurement, m.
+            estimates: The same for pairs with boxes that are only estimated (all but `fixed`), m.
 
         Returns:
             A pair that overlaps deeper than that (nothing is relaxed then), or None.
         """
         colliding = self._colliding(q)
         contacts = [self._contact(k) for k in colliding]
+        guessed = {box.id for box in self._around.boxes} - self._around.fixed
         for contact in contacts:
-            if contact.distance < -allowance:
+            limit = allowance if estimates is None or contact.second not in guessed else estimates
+            if contact.distance < -limit:
                 return contact
         for k, contact in zip(colliding, contacts, strict=True):
             self._required[k] = contact.distance - 1e-3

@@ -50,6 +50,7 @@ class PlanningConfig(Config):
     edge_step: float = Field(0.05, gt=0.0, le=0.2, description="joint turn between two collision checks, rad")
     edge_travel: float = Field(0.02, gt=0.0, le=0.1, description="travel of any point between two checks, m")
     start_overlap: float = Field(0.005, ge=0.0, le=0.05, description="overlap at a start taken for an error, m")
+    estimate_overlap: float = Field(0.03, ge=0.0, le=0.2, description="the same with obstacles of a request, m")
     score_step: float = Field(0.05, ge=0.0, description="targets whose scores differ by less count as equally good")
     keep: int = Field(4, ge=1, le=64, description="configurations kept a target")
     period: float = Field(0.02, ge=0.002, le=0.2, description="greatest time between trajectory samples, s")

@@ -24,6 +24,7 @@ from visualization_msgs.msg import MarkerArray
 
 from openarm_common.convert import matrix_to_pose, pose_to_matrix, trajectory_from_msg
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.housings import with_housings
 from openarm_common.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
 from openarm_common.scene import load_scene
 from openarm_common.tf import RobotStateListener
@@ -51,7 +52,8 @@ class MotionNode(BaseNode[MotionConfig]):
         super().__init__("motion", MotionConfig, **kwargs)
         static = table_boxes(self.config.scene)
         self._states = RobotStateListener(self, self.description)
-        self._arms = {name: Arm(name, self.description, self.config, static) for name in self.config.arms}
+        robot = with_housings(self.description, load_cameras().values())
+        self._arms = {name: Arm(name, robot, self.config, static) for name in self.config.arms}
         self._followers = {name: Follower(self, arm, self._states) for name, arm in self._arms.items()}
         self._claimed: set[str] = set()
         self._closing = False

@@ -14,6 +14,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_motion.approach import ApproachFailedError, ApproachRequest, Target, plan_approach
 from openarm_motion.arm import Arm
 from openarm_motion.collision import Box, box_from
+from openarm_motion.planner import OmplPlanner, PlannedPath, PlanQuery
 
 TABLE_Z = 0.40
 UP = np.array([0.0, 0.0, 0.12])
@@ -193,6 +194,29 @@ def test_24_targets_are_planned_quickly(right: Arm, home: dict[str, float]) -> N
         plan_approach(right, right.situation(home), request)
         took.append(time.thread_time() - begin)
     assert np.median(took) < 0.3
+
+
+def test_where_the_best_targets_have_no_path_the_next_are_planned(right: Arm, home: dict[str, float]) -> None:
+    class Choosy:
+        """Finds nothing at first."""
+
+        def __init__(self) -> None:
+            self.limits: list[float] = []
+
+        def plan(self, query: PlanQuery) -> PlannedPath:
+            self.limits.append(query.time_limit)
+            if len(self.limits) == 1:
+                raise OpenArmError(Code.NO_PLAN, "no free path")
+            return OmplPlanner().plan(query)
+
+    planner = Choosy()
+    arm = Arm("right", right.description, right.config, right.static, planner)
+    best = grasp("best", 0.26, -0.22, 0.05, 0.0, score=1.0)
+    next_best = grasp("next", 0.26, -0.22, 0.05, 0.0, np.radians(15.0), score=0.5)
+    plan = plan_approach(arm, arm.situation(home), ApproachRequest((next_best, best)))
+    assert plan.chosen == 0
+    assert [(r.id, r.code) for r in plan.refusals] == [("best", Code.NO_PLAN)]
+    assert planner.limits[0] < 0.6 * arm.config.planning.time_limit  # time is left for the others
 
 
 def test_progress_is_reported_and_a_plan_can_be_cancelled(right: Arm, home: dict[str, float]) -> None:

@@ -227,6 +227,12 @@ def test_an_arm_may_leave_a_place_that_is_too_near(right: Arm, home: dict[str, f
     contact = right.scene(home, [deep]).relax(q, 0.005)
     assert contact is not None
     assert contact.second == "post"
+    # an estimate that is 1 to 3 cm out can't hold the arm: it is where it is
+    over = Box("cube", tip @ se3.make(None, (0, 0, 0.003 - 0.012 + 0.025)), np.array([0.05, 0.05, 0.05]))
+    stuck = right.scene(home, [over])
+    assert stuck.relax(q, 0.005) is not None
+    assert stuck.relax(q, 0.005, 0.03) is None
+    assert not stuck.collides(q)
 
 
 def test_boxes_move_without_a_new_scene(right: Arm, home: dict[str, float]) -> None:
