@@ -111,6 +111,12 @@ class CameraConfig(Config):
         return self.T_parent_link @ T_LINK_OPTICAL
 
     @property
+    def T_link_housing(self) -> Array:
+        """Centre of the housing in the link frame, (4, 4): its front face is 2 mm behind the lens."""
+        depth = self.housing[0] if self.housing else 0.0
+        return se3.make(None, (-depth / 2.0 - 0.002, 0.0, 0.0))
+
+    @property
     def intrinsics(self) -> Intrinsics:
         """Pinhole intrinsics."""
         return Intrinsics.from_fovy(self.width, self.height, self.fovy_deg)

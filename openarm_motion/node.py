@@ -22,6 +22,7 @@ from rclpy.action.server import ServerGoalHandle
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
+from openarm_common.cameras import load_cameras
 from openarm_common.convert import matrix_to_pose, pose_to_matrix, trajectory_from_msg
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.housings import with_housings

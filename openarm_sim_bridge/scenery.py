@@ -148,13 +148,15 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig], mount_seed
         offscreen.offwidth = max(offscreen.offwidth, camera.width)
         offscreen.offheight = max(offscreen.offheight, camera.height)
         if camera.housing is not None:
-            _add_housing(parent, camera.name, camera.housing, T_parent_link)
+            _add_housing(parent, camera.name, camera.housing, T_parent_link, camera.T_link_housing)
 
 
-def _add_housing(parent: Any, name: str, housing: tuple[float, float, float], T_parent_link: se3.Array) -> None:
+def _add_housing(
+    parent: Any, name: str, housing: tuple[float, float, float], T_parent_link: se3.Array, T_link_housing: se3.Array
+) -> None:
     """A box with its front face just behind the lens; it collides like a part of the link that carries it."""
     depth, width, height = housing
-    T_parent_housing = T_parent_link @ se3.make(None, (-depth / 2.0 - 0.002, 0.0, 0.0))
+    T_parent_housing = T_parent_link @ T_link_housing
     parent.add_geom(
         name=f"{name}_housing",
         type=mujoco.mjtGeom.mjGEOM_BOX,

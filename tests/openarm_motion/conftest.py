@@ -6,7 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from openarm_common.cameras import load_cameras
 from openarm_common.description import RobotDescription
+from openarm_common.housings import with_housings
 from openarm_motion.arm import Arm
 from openarm_motion.collision import Box, box_from
 from openarm_motion.config import MotionConfig
@@ -50,7 +52,7 @@ def six_joint_urdf() -> str:
 
 @pytest.fixture(scope="session")
 def description() -> RobotDescription:
-    return RobotDescription.load()
+    return with_housings(RobotDescription.load(), load_cameras().values())
 
 
 @pytest.fixture(scope="session")

@@ -57,6 +57,14 @@ def test_a74_known_postures_are_free(
     assert arm.scene(zero).contacts(np.zeros(7)) == []
 
 
+def test_the_wrist_camera_is_part_of_the_arm(arms: dict[str, Arm], home: dict[str, float]) -> None:
+    """In this posture the camera on the right hand meets the right shoulder; without the camera it is free."""
+    q = np.array([-0.402, 2.745, 0.843, 2.151, -0.56, 0.217, 1.045])
+    contacts = arms["right"].scene(home).contacts(q)
+    assert {name for c in contacts for name in (c.first, c.second)} >= {"openarm_right_link7", "openarm_right_link1"}
+    assert arms["left"].scene(home).contacts(mirror(q)) == []
+
+
 def test_a74_crossed_arms_are_caught_and_the_pair_is_named(arms: dict[str, Arm], home: dict[str, float]) -> None:
     # both hands on the centre line, reached from either side: fine alone, a collision together
     crossed = {}
@@ -174,9 +182,10 @@ def test_fingers_are_where_they_are(right: Arm, home: dict[str, float]) -> None:
     assert contact.first == "openarm_right_left_finger"  # the follower moves too, on the +y side
 
 
-def test_an_edge_is_checked_between_its_ends(right: Arm, home: dict[str, float]) -> None:
-    scene = right.scene(home)
-    q = q_of(right, home)
+def test_an_edge_is_checked_between_its_ends(arms: dict[str, Arm], home: dict[str, float]) -> None:
+    left = arms["left"]  # the camera on the right hand leaves that arm no room to swing past the table's edge
+    scene = left.scene(home)
+    q = q_of(left, home)
     # from hanging straight down to home the straight joint line goes through table and body
     assert not scene.collides(np.zeros(7))
     assert not scene.collides(q)
@@ -184,7 +193,7 @@ def test_an_edge_is_checked_between_its_ends(right: Arm, home: dict[str, float])
     hit = scene.first_hit(np.zeros(7), q)
     assert hit is not None
     assert scene.collides(hit)
-    up = np.array([0, 2.2, 0, 0, 0, 0, 0.0])
+    up = np.array([0, -2.2, 0, 0, 0, 0, 0.0])
     assert scene.edge_free(np.zeros(7), up)
     assert scene.edge_free(up, q)
 
