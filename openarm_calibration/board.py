@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration boards: an asymmetric circle grid, or ChArUco.
+
+Board frame: origin in the middle of the marks, x right and y down as the board is read, z into the board, away from
+who looks at it; metres. A board lies in an image so that its axes turn as those of the image do: a mirrored one is no
+board.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, TypeAdapter, ValidationError, field_validator, model_validator
+
+from openarm_common.config import Config, describe_faults
+from openarm_common.errors import Code, OpenArmError
+
+Array = NDArray[np.float64]
+Pixels = NDArray[np.uint8]
+
+DICTIONARIES = ("DICT_4X4_100", "DICT_5X5_100", "DICT_6X6_100")
+_SUPERSAMPLE = 4
+
+
+class CircleGrid(Config):
+    """Rows of circles, every second row shifted by one spacing; 4 columns of 11 rows by default."""
+
+    kind: Literal["circles"] = "circles"
+    columns: int = Field(4, ge=2, le=20, description="circles in a row")
+    rows: int = Field(11, ge=3, le=41, description="rows; odd, so that half a turn is another pattern")
+    spacing: float = Field(0.02, gt=0.001, le=0.5, description="between rows, half of that between circles of a row, m")
+    diameter: float = Field(0.015, gt=0.0, le=0.5, description="of a circle, m")
+    border: float = Field(0.02, ge=0.0, le=0.5, description="of white around the outer circle centres, m")
+
+    @field_validator("rows")
+    @classmethod
+    def _odd(cls, value: int) -> int:
+        if value % 2 == 0:
+            raise ValueError("an even number of rows looks the same after half a turn; expected an odd number")
+        return value
+
+    @model_validator(mode="after")
+    def _fits(self) -> CircleGrid:
+        # neighbours are sqrt(2) spacings apart
+        if self.diameter > 1.2 * self.spacing:
+            raise ValueError(f"circles of {self.diameter} m at a spacing of {self.spacing} m touch; at most 1.2 times")
+        if self.border < 0.7 * self.diameter:
+            raise ValueError(f"border {self.border} m cuts the outer circles; expected at least 0.7 of the diameter")
+        return self
+
+    @property
+    def label(self) -> str:
+        """What people call it."""
+        size = f"{self.spacing * 1e3:g} mm spacing, {self.diameter * 1e3:g} mm circles"
+        return f"asymmetric circles {self.columns}x{self.rows}, {size}"
+
+    @property
+    def points(self) -> Array:
+        """(n, 3) circle centres, row by row."""
+        grid = [(2 * j + i % 2, i, 0) for i in range(self.rows) for j in range(self.columns)]
+        out = np.array(grid, dtype=np.float64) * self.spacing
+        return out - (out.max(axis=0) + out.min(axis=0)) / 2.0
+
+    @property
+    def radius(self) -> float:
+        """Of a circle, m."""
+        return self.diameter / 2.0
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the plate, m."""
+        extent = np.ptp(self.points[:, :2], axis=0)
+        return float(extent[0]) + 2.0 * self.border, float(extent[1]) + 2.0 * self.border
+
+    def draw(self, pixels_per_metre: float) -> Pixels:
+        """Grey picture (h, w) of the plate; black circles on white."""
+        width, height = (round(edge * pixels_per_metre) for edge in self.size)
+        k = pixels_per_metre * _SUPERSAMPLE
+        image = np.full((height * _SUPERSAMPLE, width * _SUPERSAMPLE), 255, np.uint8)
+        # centres of pixels are at integers: the plate's corner is at (-0.5, -0.5)
+        centre = np.array(image.shape[::-1]) / 2.0 - 0.5
+        for x, y in self.points[:, :2] * k + centre:
+            at = (round(x * 16), round(y * 16))
+            cv2.circle(image, at, round(self.radius * k * 16), (0,), -1, cv2.LINE_AA, shift=4)
+        return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
+class Charuco(Config):
+    """A chessboard with markers in its white squares; a part of it is enough."""
+
+    kind: Literal["charuco"] = "charuco"
+    columns: int = Field(9, ge=3, le=40, description="squares in a row")
+    rows: int = Field(7, ge=3, le=40, description="rows of squares")
+    spacing: float = Field(0.024, gt=0.001, le=0.5, description="edge of a square, m")
+    diameter: float = Field(0.018, gt=0.0, le=0.5, description="edge of a marker, m")
+    border: float = Field(0.012, ge=0.0, le=0.5, description="of white around the squares, m")
+    dictionary: str = Field("DICT_5X5_100", description="of the markers")
+
+    @field_validator("dictionary")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value not in DICTIONARIES:
+            raise ValueError(f"unknown dictionary; dictionaries: {', '.join(DICTIONARIES)}")
+        return value
+
+    @model_validator(mode="after")
+    def _fits(self) -> Charuco:
+        if not 0.4 * self.spacing <= self.diameter <= 0.9 * self.spacing:
+            raise ValueError(f"a marker of {self.diameter} m in a square of {self.spacing} m; expected 0.4 to 0.9")
+        if self.columns * self.rows // 2 > 100:
+            raise ValueError(f"{self.columns}x{self.rows} squares need more than the 100 markers of the dictionary")
+        return self
+
+    @property
+    def label(self) -> str:
+        """What people call it."""
+        return f"ChArUco {self.columns}x{self.rows}, {self.spacing * 1e3:g} mm squares, {self.dictionary}"
+
+    @property
+    def board(self) -> cv2.aruco.CharucoBoard:
+        """OpenCV's."""
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.spacing, self.diameter, dictionary)
+
+    @property
+    def points(self) -> Array:
+        """(n, 3) inner corners, in the order of OpenCV's ids."""
+        corners = np.asarray(self.board.getChessboardCorners(), dtype=np.float64).reshape(-1, 3)
+        middle = np.array([self.columns, self.rows, 0]) * self.spacing / 2.0
+        return corners - middle
+
+    @property
+    def radius(self) -> float:
+        """Corners are points."""
+        return 0.0
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of the plate, m."""
+        return self.columns * self.spacing + 2.0 * self.border, self.rows * self.spacing + 2.0 * self.border
+
+    def draw(self, pixels_per_metre: float) -> Pixels:
+        """Grey picture (h, w) of the plate."""
+        width, height = (round(edge * pixels_per_metre) for edge in self.size)
+        k = max(round(self.spacing * pixels_per_metre), 1)
+        squares = self.board.generateImage((self.columns * k, self.rows * k), marginSize=0)
+        edge = self.border * pixels_per_metre
+        inner = cv2.resize(squares, (width - 2 * round(edge), height - 2 * round(edge)), interpolation=cv2.INTER_AREA)
+        image = np.full((height, width), 255, np.uint8)
+        image[round(edge) : round(edge) + inner.shape[0], round(edge) : round(edge) + inner.shape[1]] = inner
+        return image
+
+
+Board = CircleGrid | Charuco
+_ADAPTER: TypeAdapter[Board] = TypeAdapter(Annotated[Board, Field(discriminator="kind")])
+KINDS = ("circles", "charuco")
+
+
+def parse_board(data: dict[str, Any], where: str = "board") -> Board:
+    """Make a board of its keys; `kind` chooses, circles when it is missing.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming `where` and the key.
+    """
+    kind = data.get("kind", "circles")
+    if kind not in KINDS:
+        raise OpenArmError(Code.CONFIG_INVALID, f"{where}:kind: no board {kind!r}; boards: {', '.join(KINDS)}")
+    try:
+        return _ADAPTER.validate_python({**data, "kind": kind})
+    except ValidationError as error:
+        model = CircleGrid if kind == "circles" else Charuco
+        raise OpenArmError(Code.CONFIG_INVALID, describe_faults(error, where, model)) from error
