@@ -68,7 +68,8 @@ class Trajectory:
         """Positions, velocities, accelerations (k, n) at times (k,), by quintic interpolation; held beyond the ends."""
         times = np.clip(np.atleast_1d(np.asarray(t, dtype=np.float64)), self.t[0], self.t[-1])
         if self.t.size == 1:
-            return tuple(np.repeat(x, times.size, axis=0) for x in (self.q, self.v, self.a))  # type: ignore[return-value]
+            q, v, a = (np.repeat(x, times.size, axis=0) for x in (self.q, self.v, self.a))
+            return q, v, a
         i = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, self.t.size - 2)
         h = (self.t[i + 1] - self.t[i])[:, None]
         u = (times - self.t[i])[:, None] / h
