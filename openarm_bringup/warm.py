@@ -7,6 +7,7 @@ import numpy as np
 
 from openarm_common.cameras import Intrinsics
 from openarm_motion.warm import warm as warm_motion
+from openarm_octomap.warm import warm as warm_octomap
 from openarm_perception.depth import Deprojector, DepthLimits
 
 
@@ -23,6 +24,7 @@ def main() -> None:
     """Warm all packages that have kernels."""
     warm_perception()
     warm_motion()
+    warm_octomap()
 
 
 if __name__ == "__main__":

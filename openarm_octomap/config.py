@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the map and of the node."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from openarm_common.config import Config
+
+Vector3 = tuple[float, float, float]
+
+#: Log-odds are kept within ±CLAMP when they are derived from numbers of frames; only ratios matter.
+CLAMP = 2.0
+
+
+class GridConfig(Config):
+    """Where the map is and how it believes.
+
+    A known cell changes its mind after `frames_to_mark` or `frames_to_clear` looks that all say the opposite; an
+    unknown cell believes the first one. To use log-odds as liboctomap counts them, give `hit` and `miss`.
+    """
+
+    resolution: float = Field(0.02, ge=0.005, le=0.2, description="edge of a cell, m")
+    lower: Vector3 = Field((-0.48, -1.0, -0.08), description="corner of the workspace in the base frame, m")
+    upper: Vector3 = Field((1.28, 1.0, 1.36), description="opposite corner of the workspace, m")
+    frames_to_mark: int = Field(1, ge=1, le=20, description="hits in a row that make the freest cell occupied")
+    frames_to_clear: int = Field(1, ge=1, le=20, description="misses in a row that make the surest cell free")
+    hit: float = Field(0.0, ge=0.0, le=10.0, description="log-odds of a hit instead; 0 derives them from the frames")
+    miss: float = Field(0.0, ge=-10.0, le=0.0, description="log-odds of a miss instead; 0 derives them from the frames")
+    clamp_min: float = Field(-CLAMP, ge=-10.0, lt=0.0, description="lowest log-odds")
+    clamp_max: float = Field(CLAMP, gt=0.0, le=10.0, description="highest log-odds")
+    max_range: float = Field(3.0, description="surfaces further away mark nothing, m; negative: no limit")
+    clear_without_return: bool = Field(True, description="views into the distance clear, without a surface behind")
+    no_return_block: int = Field(4, ge=1, le=32, description="pixels a side that must all lack a return, for that")
+    no_return_range: float = Field(2.0, gt=0.0, le=10.0, description="how far they clear, m")
+    decay_s: float = Field(0.0, ge=0.0, description="occupied cells unseen for longer become unknown, s; 0: never")
+
+    @model_validator(mode="after")
+    def _pair(self) -> GridConfig:
+        if (self.hit == 0.0) != (self.miss == 0.0):
+            raise ValueError(f"give both hit and miss or neither, got {self.hit} and {self.miss}")
+        return self
+
+    @property
+    def hit_log_odds(self) -> float:
+        """Added for a hit."""
+        # half a step of margin, so that rounding never costs a frame
+        return self.hit or -self.clamp_min / (self.frames_to_mark - 0.5)
+
+    @property
+    def miss_log_odds(self) -> float:
+        """Added for a miss."""
+        return self.miss or -self.clamp_max / (self.frames_to_clear - 0.5)
+
+
+class FilterConfig(Config):
+    """How the robot is cut out of what its cameras see."""
+
+    enabled: bool = Field(True, description="cut the robot and what it holds out of the images")
+    padding: float = Field(0.02, ge=0.0, le=0.2, description="around every link, m")
+    link_padding: tuple[str, ...] = Field((), description="other paddings, as `link=metres`")
+    held_padding: float = Field(0.02, ge=0.0, le=0.2, description="around what a hand holds, m")
+    reset_padding: float = Field(0.01, ge=0.0, le=0.2, description="cells this near to the robot are made unknown, m")
+
+    @model_validator(mode="after")
+    def _pairs(self) -> FilterConfig:
+        self.paddings()
+        return self
+
+    def paddings(self) -> dict[str, float]:
+        """The paddings that differ, by link."""
+        out: dict[str, float] = {}
+        for item in self.link_padding:
+            link, _, metres = item.partition("=")
+            try:
+                out[link.strip()] = float(metres)
+            except ValueError:
+                example = "openarm_left_hand=0.03"
+                raise ValueError(f"link_padding {item!r}: expected `link=metres`, such as {example}") from None
+            if not 0.0 <= out[link.strip()] <= 0.2:
+                raise ValueError(f"link_padding {item!r}: expected 0 .. 0.2 m")
+        return out
+
+
+UnknownPolicy = Literal["free", "occupied"]
+
+
+class FieldConfig(Config):
+    """The distance field for planners."""
+
+    enabled: bool = Field(True, description="compute it and share it")
+    reach: float = Field(0.40, gt=0.0, le=2.0, description="distances are cut here, m")
+    unknown: UnknownPolicy = Field("free", description="what unknown cells count as")
+    name: str = Field("", pattern=r"^[A-Za-z0-9_.-]*$", description="of the shared memory; empty: by ROS domain")
+
+
+class OctomapNodeConfig(Config):
+    """Parameters of the node `octomap`."""
+
+    cameras: tuple[str, ...] = Field(("overhead", "wrist"), description="cameras of cameras.yaml")
+    depth_topic: str = Field("/{camera}/depth/image_raw", description="depth image; {camera} is filled in")
+    info_topic: str = Field("/{camera}/depth/camera_info", description="CameraInfo; {camera} is filled in")
+    cloud_topic: str = Field("cloud_in", description="clouds, a second input; empty: none")
+    period: float = Field(0.5, ge=0.05, le=60.0, description="time from update to update, s")
+    stale_after: float = Field(1.5, gt=0.0, description="a camera without a used frame for longer is reported, s")
+    pose_wait: float = Field(0.2, ge=0.0, le=5.0, description="how long a frame waits for its joint state, s")
+    map_file: str = Field("", description=".bt or .ot to start from; also where ~/save and ~/load go")
+    coarse_depths: tuple[int, ...] = Field((15, 14, 13), description="further depths that services answer")
+    publish_full: bool = Field(True, description="publish octomap_full too")
+    grid: GridConfig = GridConfig()
+    filter: FilterConfig = FilterConfig()
+    field: FieldConfig = FieldConfig()
+
+    @model_validator(mode="after")
+    def _depths(self) -> OctomapNodeConfig:
+        if any(not 1 <= depth <= 15 for depth in self.coarse_depths):
+            raise ValueError(f"coarse_depths are {self.coarse_depths}; expected 1 .. 15 (16 is the full resolution)")
+        return self

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The distance field of a map: metres from each cell to the nearest obstacle, between centres, cut at a reach."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.lattice import Lattice
+from openarm_octomap import distance_kernels as kernels
+from openarm_octomap.config import UnknownPolicy
+from openarm_octomap.kernels import OCCUPIED, UNKNOWN
+
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+
+
+class DistanceTransform:
+    """Computes distance fields of one box; keeps its buffers.
+
+    Args:
+        lattice: The box.
+        reach: Distances are cut here, m.
+        unknown: What unknown cells count as.
+    """
+
+    def __init__(self, lattice: Lattice, reach: float, unknown: UnknownPolicy = "free") -> None:
+        self._edge = np.float32(lattice.resolution)
+        self._reach = reach
+        # a neighbour further away than this can't be the nearest within reach
+        self._cells = min(math.ceil(reach / lattice.resolution), max(lattice.shape))
+        self._cap = np.float32((reach / lattice.resolution) ** 2)
+        self._unknown: UnknownPolicy = unknown
+        self._squares = np.empty(lattice.shape, np.float32)
+        self._plane = np.empty(lattice.shape[1:], np.float32)
+        self._line = np.empty(lattice.shape[2], np.float32)
+
+    def compute(self, states: Bytes, out: Floats) -> None:
+        """Fill `out` (nx, ny, nz), m, from states (nx, ny, nz)."""
+        if self._unknown == "occupied":
+            obstacles = (states == UNKNOWN) | (states == OCCUPIED)
+            kernels.along_z(obstacles.view(np.uint8), 1, 1, self._cap, self._squares)
+        else:
+            kernels.along_z(states, OCCUPIED, OCCUPIED, self._cap, self._squares)
+        kernels.along_y(self._squares, self._cap, self._cells, self._plane)
+        kernels.along_x(self._squares, self._cap, self._cells, self._edge, self._line, out)

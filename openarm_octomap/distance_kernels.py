@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba kernels of the distance field: exact Euclidean distances between cell centres, cut at a reach.
+
+Each axis is one pass (Felzenszwalb and Huttenlocher 2012: the lower envelope of parabolas), in whole cells squared.
+Because distances are cut at `reach` cells, cells further away than that never matter: a pass looks only at the
+neighbours within reach, and skips lines that have nothing within it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+
+
+@njit(cache=True, nogil=True)
+def along_z(states: Bytes, lowest: int, highest: int, cap: np.float32, out: Floats) -> None:
+    """Squared distance along z to the nearest cell with lowest <= state <= highest, cut at `cap`; (nx, ny, nz)."""
+    nx, ny, nz = states.shape
+    for i in range(nx):
+        for j in range(ny):
+            row = states[i, j]
+            line = out[i, j]
+            last = -100000
+            for k in range(nz):
+                if lowest <= row[k] <= highest:
+                    last = k
+                d = np.float32(k - last)
+                line[k] = min(d * d, cap)
+            last = 100000
+            for k in range(nz - 1, -1, -1):
+                if lowest <= row[k] <= highest:
+                    last = k
+                d = np.float32(last - k)
+                line[k] = min(line[k], d * d)
+
+
+@njit(cache=True, nogil=True)
+def along_y(squares: Floats, cap: np.float32, reach: int, scratch: Floats) -> None:
+    """Second pass, in place: all z of one row at a time, so that the inner loop runs over neighbours in memory.
+
+    Args:
+        squares: (nx, ny, nz) of the pass before, changed.
+        cap: Squared reach, cells.
+        reach: Cells.
+        scratch: (ny, nz).
+    """
+    nx, ny, nz = squares.shape
+    near = np.empty(ny, np.bool_)
+    for i in range(nx):
+        plane = squares[i]
+        for j in range(ny):
+            least = cap
+            for k in range(nz):
+                scratch[j, k] = plane[j, k]
+                least = min(least, plane[j, k])
+            near[j] = least < cap
+        for j in range(ny):
+            line = plane[j]
+            for other in range(max(j - reach, 0), min(j + reach + 1, ny)):
+                if other == j or not near[other]:
+                    continue
+                d = np.float32((other - j) * (other - j))
+                source = scratch[other]
+                for k in range(nz):
+                    candidate = source[k] + d
+                    line[k] = candidate if candidate < line[k] else line[k]
+
+
+@njit(cache=True, nogil=True)
+def along_x(squares: Floats, cap: np.float32, reach: int, edge: np.float32, scratch: Floats, out: Floats) -> None:
+    """Third pass, and metres.
+
+    Args:
+        squares: (nx, ny, nz) of the pass before.
+        cap: Squared reach, cells.
+        reach: Cells.
+        edge: Edge of a cell, m.
+        scratch: (nz,).
+        out: (nx, ny, nz) distances, m.
+    """
+    nx, ny, nz = squares.shape
+    near = np.empty((nx, ny), np.bool_)
+    for i in range(nx):
+        for j in range(ny):
+            least = cap
+            for k in range(nz):
+                least = min(least, squares[i, j, k])
+            near[i, j] = least < cap
+    for i in range(nx):
+        for j in range(ny):
+            line = scratch
+            for k in range(nz):
+                line[k] = squares[i, j, k]
+            for other in range(max(i - reach, 0), min(i + reach + 1, nx)):
+                if other == i or not near[other, j]:
+                    continue
+                d = np.float32((other - i) * (other - i))
+                source = squares[other, j]
+                for k in range(nz):
+                    candidate = source[k] + d
+                    line[k] = candidate if candidate < line[k] else line[k]
+            target = out[i, j]
+            for k in range(nz):
+                target[k] = np.sqrt(line[k]) * edge

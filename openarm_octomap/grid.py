@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map: a bounded box of cells with log-odds, fed with scans.
+
+`OccupancyGrid` is the one mutable object of the package. Coordinates are in the base frame, m. Cells are dense arrays:
+a workspace of 2 × 2 × 1.5 m at 2 cm is 3 MB, and no tree is walked to update it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from openarm_common.cameras import Intrinsics
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.lattice import DEPTH, Lattice
+from openarm_common.octomap_codec import Leaves, OctreeEncoder, Payload
+from openarm_octomap import end_kernels, kernels
+from openarm_octomap.config import GridConfig
+from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN, Depth
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+#: Keys outside of the box that one scan may end in.
+_TABLE = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class DepthScan:
+    """A depth image and where it was taken.
+
+    Attributes:
+        depth: (h, w) planar depth, uint16 mm or float32 m.
+        intrinsics: Of the camera.
+        T_base_camera: Optical frame in the base frame, (4, 4).
+        near: Nearest valid depth, m.
+        far: Farthest valid depth, m.
+        label: (h, w): 0 surroundings, 1 robot, 2 not known; None is all surroundings.
+    """
+
+    depth: Depth
+    intrinsics: Intrinsics
+    T_base_camera: Array
+    near: float
+    far: float
+    label: Bytes | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what does not fit together.
+
+        Raises:
+            OpenArmError: BAD_IMAGE, naming what does not.
+        """
+        if self.depth.ndim != 2 or self.depth.dtype.name not in ("uint16", "float32"):
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"depth image is {self.depth.dtype} {self.depth.shape}; expected (h, w) of uint16 mm or float32 m",
+            )
+        size = (self.intrinsics.height, self.intrinsics.width)
+        if self.depth.shape != size:
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"depth image is {self.depth.shape[1]}x{self.depth.shape[0]} pixels, but its CameraInfo says"
+                f" {size[1]}x{size[0]}",
+            )
+        if not (self.intrinsics.fx > 0.0 and self.intrinsics.fy > 0.0):
+            raise OpenArmError(
+                Code.BAD_IMAGE, f"focal lengths are {self.intrinsics.fx}, {self.intrinsics.fy}; expected > 0"
+            )
+        if not np.isfinite(self.T_base_camera).all():
+            raise OpenArmError(Code.NO_TRANSFORM, "the pose of the camera is not finite")
+
+    @property
+    def rays(self) -> tuple[Floats, Floats]:
+        """Directions of columns (x over z) and of rows (y over z)."""
+        k = self.intrinsics
+        x = ((np.arange(k.width) - k.cx) / k.fx).astype(np.float32)
+        return x, ((np.arange(k.height) - k.cy) / k.fy).astype(np.float32)
+
+    @property
+    def scale(self) -> np.float32:
+        """Metres of one count."""
+        return np.float32(1e-3 if self.depth.dtype == np.uint16 else 1.0)
+
+    def points(self) -> Floats:
+        """Points (n, 3) float32 of the valid pixels in the base frame, m: exactly those that are put into the map."""
+        out = np.empty((self.depth.size, 3), np.float32)
+        near, far = np.float32(self.near), np.float32(self.far)
+        T = np.ascontiguousarray(self.T_base_camera[:3], dtype=np.float32)
+        n = end_kernels.image_points(self.depth, self.scale, near, far, *self.rays, T, out)
+        return out[:n]
+
+
+@dataclass(frozen=True, eq=False)
+class CloudScan:
+    """Points (n, 3) float32 in the base frame, m, the origin (3,) of their rays, and labels (n,) as for an image."""
+
+    points: Floats
+    origin: Array
+    label: Bytes | None = None
+
+
+@dataclass(frozen=True)
+class Update:
+    """What an update did.
+
+    Attributes:
+        ends: Cells that rays ended in.
+        valid: Pixels or points that were valid.
+        cleared: Rays without a return that cleared.
+        changed: Flat indices of the cells whose state changed.
+    """
+
+    ends: int
+    valid: int
+    cleared: int
+    changed: NDArray[np.int32]
+
+
+class OccupancyGrid:
+    """Cells of a workspace; NaN log-odds are unknown.
+
+    Args:
+        config: Workspace, resolution and how fast cells change their mind.
+    """
+
+    def __init__(self, config: GridConfig) -> None:
+        self.config = config
+        # eight cells: whole coarse cells at three further depths, and rows of whole words
+        self.lattice = Lattice.from_bounds(config.resolution, config.lower, config.upper, align=8)
+        shape = self.lattice.shape
+        self.log_odds: Floats = np.full(shape, np.nan, np.float32)
+        self.states: Bytes = np.zeros(shape, np.uint8)
+        self.seen: NDArray[np.int32] = np.zeros(shape, np.int32)  # ms of the newest look
+        self._marks = np.zeros(shape, np.uint8)
+        self._ticks = np.zeros(shape, np.uint16)
+        self._tick = 0
+        self._table = np.full(_TABLE, -1, np.int64)
+        self._ends = np.empty((0, 3), np.int32)
+        self._changed = np.empty(self.lattice.cells, np.int32)
+        self._key_min = np.array(self.lattice.key_min, np.int64)
+        self._encoder = OctreeEncoder(self.lattice)
+        self._epoch_ns: int | None = None
+
+    def integrate(self, scans: Sequence[DepthScan | CloudScan], t_ns: int) -> Update:
+        """Put scans of one moment into the map; a cell that any of them hit counts as hit.
+
+        Args:
+            scans: Images or clouds.
+            t_ns: Their stamp.
+        """
+        ends = valid = cleared = 0
+        for scan in scans:
+            counts = self._mark(scan)
+            ends, valid, cleared = ends + counts[0], valid + counts[1], cleared + counts[2]
+        changed = self._apply(self._milliseconds(t_ns))
+        return Update(ends, valid, cleared, changed)
+
+    def decay(self, t_ns: int) -> NDArray[np.int32]:
+        """Make occupied cells unknown that nothing looked at for `decay_s`; flat indices of those."""
+        if self.config.decay_s <= 0.0:
+            return np.empty(0, np.int32)
+        limit = self._milliseconds(t_ns) - round(self.config.decay_s * 1e3)
+        n = kernels.forget_before(
+            limit, self.log_odds.reshape(-1), self.states.reshape(-1), self.seen.reshape(-1), self._changed
+        )
+        return self._changed[:n].copy()
+
+    def oldest_s(self, t_ns: int) -> float:
+        """Seconds since the occupied cell was looked at that has waited longest; 0 without occupied cells."""
+        seen = self.seen[self.states == OCCUPIED]
+        return float(self._milliseconds(t_ns) - seen.min()) / 1e3 if seen.size else 0.0
+
+    def counts(self) -> dict[str, int]:
+        """How many cells are occupied, free and unknown."""
+        number = np.bincount(self.states.reshape(-1), minlength=3)
+        return {"occupied": int(number[OCCUPIED]), "free": int(number[FREE]), "unknown": int(number[UNKNOWN])}
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.log_odds[...] = np.nan
+        self.states[...] = UNKNOWN
+        self.seen[...] = 0
+
+    def clear_box(self, lower: ArrayLike, upper: ArrayLike, state: int = FREE) -> int:
+        """Make the cells that a box touches free, or unknown.
+
+        Args:
+            lower: Corner (3,), m.
+            upper: Opposite corner (3,), m.
+            state: FREE or UNKNOWN.
+
+        Returns:
+            How many cells are set.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when the corners are not finite or not in order.
+        """
+        a, b = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+        if not (np.isfinite(a).all() and np.isfinite(b).all() and (a <= b).all()):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"box {a.tolist()} .. {b.tolist()}: expected finite corners, the lower one first"
+            )
+        box = self.lattice.range_of(a, b)
+        self.log_odds[box] = self.config.clamp_min if state == FREE else np.nan
+        self.states[box] = FREE if state == FREE else UNKNOWN
+        return int(self.states[box].size)
+
+    def load(self, leaves: Leaves) -> int:
+        """Replace the map; log-odds are cut to the limits of this map.
+
+        Returns:
+            How many leaves lie outside of the workspace, wholly or in part.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when the resolutions differ; the map is as it was.
+        """
+        values, outside = leaves.on(self.lattice)
+        self.log_odds[...] = np.clip(values, self.config.clamp_min, self.config.clamp_max)
+        known = np.isfinite(self.log_odds)
+        self.states[...] = np.where(known, np.where(self.log_odds >= 0.0, OCCUPIED, FREE), UNKNOWN)
+        self.seen[...] = 0
+        return outside
+
+    def binary(self) -> Payload:
+        """The map as OctoMap's binary form."""
+        return self._encoder.binary(self.states)
+
+    def full(self) -> Payload:
+        """The map as OctoMap's full form."""
+        return self._encoder.full(self.log_odds)
+
+    def coarse(self, depth: int) -> tuple[Lattice, Bytes]:
+        """States at another depth of the tree: a cell is occupied when any of its parts is, free when any is free.
+
+        Args:
+            depth: 16 is the resolution of the map, each level less doubles the edge.
+
+        Returns:
+            The box of coarse cells and their states.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, unless 1 <= depth <= 16.
+        """
+        if not 1 <= depth <= DEPTH:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"depth is {depth}; expected 1 .. {DEPTH}")
+        states = self.states
+        for level in range(DEPTH - depth):
+            finer = self.lattice.coarser(level)
+            pads = [(k % 2, (k + n) % 2) for k, n in zip(finer.key_min, finer.shape, strict=True)]
+            padded = np.pad(states, pads) if any(map(any, pads)) else states
+            nx, ny, nz = (n // 2 for n in padded.shape)
+            # UNKNOWN < FREE < OCCUPIED: the largest state is the careful one
+            states = padded.reshape(nx, 2, ny, 2, nz, 2).max(axis=(1, 3, 5))
+        return self.lattice.coarser(DEPTH - depth), states
+
+    def states_at(self, points: ArrayLike, depth: int = DEPTH) -> Bytes:
+        """States (n,) of the cells that contain points (n, 3), m; UNKNOWN outside of the workspace."""
+        lattice, states = self.coarse(depth)
+        index = lattice.indices(np.asarray(points, np.float64).reshape(-1, 3))
+        inside = lattice.contains(index)
+        out = np.full(index.shape[0], UNKNOWN, np.uint8)
+        out[inside] = states[tuple(index[inside].T)]
+        return out
+
+    def centres(self, state: int = OCCUPIED) -> Array:
+        """Centres (n, 3), m, of the cells of a state."""
+        return self.lattice.centres(np.argwhere(self.states == state))
+
+    def _mark(self, scan: DepthScan | CloudScan) -> tuple[int, int, int]:
+        config = self.config
+        self._tick += 1
+        if self._tick > 65535:
+            self._ticks[...] = 0
+            self._tick = 1
+        size = scan.depth.size if isinstance(scan, DepthScan) else scan.points.shape[0]
+        if self._ends.shape[0] < size:
+            self._ends = np.empty((size, 3), np.int32)
+        kept = (self._marks, self._ticks, self._tick, self._table, self._ends)
+        if isinstance(scan, DepthScan):
+            origin = scan.T_base_camera[:3, 3].astype(np.float32)
+            label = np.zeros(scan.depth.shape, np.uint8) if scan.label is None else scan.label
+            ends, valid, cleared = end_kernels.image_ends(
+                scan.depth, scan.scale, np.float32(scan.near), np.float32(scan.far),
+                config.no_return_block if config.clear_without_return else 0, self._stride(scan.intrinsics),
+                np.float32(config.no_return_range),
+                *scan.rays, np.ascontiguousarray(scan.T_base_camera[:3], dtype=np.float32), label,
+                config.resolution, self._key_min, origin, config.max_range, *kept,
+            )  # fmt: skip
+        else:
+            origin, cleared = scan.origin.astype(np.float32), 0
+            label = np.zeros(size, np.uint8) if scan.label is None else scan.label
+            ends, valid = end_kernels.cloud_ends(
+                scan.points, label, config.resolution, self._key_min, origin, config.max_range, *kept
+            )
+        kernels.walk_rays(self._ends, ends, config.resolution, self._key_min, origin, config.max_range, self._marks)
+        return ends, valid, cleared
+
+    def _apply(self, now: int) -> NDArray[np.int32]:
+        config = self.config
+        flat = self._marks.reshape(-1), self.log_odds.reshape(-1), self.states.reshape(-1), self.seen.reshape(-1)
+        numbers = (config.hit_log_odds, config.miss_log_odds, config.clamp_min, config.clamp_max)
+        hit, miss, low, high = (np.float32(v) for v in numbers)
+        n = kernels.apply_marks(*flat, now, hit, miss, low, high, self._changed)
+        return self._changed[:n].copy()
+
+    def _stride(self, intrinsics: Intrinsics) -> int:
+        """Pixels between rays that clear without a return: no cell within their range is left out between two."""
+        pixels = self.config.resolution * min(intrinsics.fx, intrinsics.fy) / self.config.no_return_range
+        return max(1, min(int(pixels), self.config.no_return_block))
+
+    def _milliseconds(self, t_ns: int) -> int:
+        """Time since the first scan; a clock that was set back begins anew."""
+        if self._epoch_ns is None or t_ns < self._epoch_ns:
+            self._epoch_ns = t_ns
+            self.seen[...] = 0
+        return (t_ns - self._epoch_ns) // 1_000_000

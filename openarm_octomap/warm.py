@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiles every numba kernel of the map, so that the first images of a process do not wait for that."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from openarm_common import se3
+from openarm_common.cameras import Intrinsics
+from openarm_common.description import RobotDescription
+from openarm_common.distance_field import sphere_clearance
+from openarm_common.octomap_codec import decode
+from openarm_octomap.config import FilterConfig, GridConfig
+from openarm_octomap.distance import DistanceTransform
+from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
+from openarm_octomap.self_filter import SelfFilter
+
+
+def warm() -> None:
+    """Run each kernel once with the types that the package uses; the compiled code is cached beside the sources."""
+    description = RobotDescription.load()
+    robot = SelfFilter(description, FilterConfig())
+    joints = {name: 0.0 for name, joint in description.joints.items() if joint.type != "fixed"}
+    shapes = robot.shapes(joints)
+    grid = OccupancyGrid(GridConfig(lower=(0.0, 0.0, 0.0), upper=(0.3, 0.3, 0.3), decay_s=1.0))
+    intrinsics, T = Intrinsics.from_fovy(8, 6, 60.0), se3.make(None, (0.15, 0.15, 0.0))
+    for depth in (np.full((6, 8), 200, np.uint16), np.full((6, 8), 0.2, np.float32)):
+        scan = DepthScan(depth, intrinsics, T, 0.05, 1.0)
+        robot.label_depth(scan, shapes)
+        grid.integrate([scan], 0)
+    cloud = CloudScan(scan.points(), T[:3, 3])
+    robot.label_cloud(cloud, shapes)
+    grid.integrate([cloud], 0)
+    grid.decay(0)
+    robot.reset(grid, shapes)
+    for payload in (grid.binary(), grid.full()):
+        decode(payload.data, grid.lattice.resolution, binary=payload.binary).on(grid.lattice)
+    distances = np.empty(grid.lattice.shape, np.float32)
+    DistanceTransform(grid.lattice, 0.1).compute(grid.states, distances)
+    sphere_clearance(distances, grid.lattice.lower, grid.lattice.resolution, np.zeros((1, 3)), np.zeros(1))
+
+
+if __name__ == "__main__":
+    warm()

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Octrees as bytes: hand-made trees, round trips, damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from openarm_common.errors import OpenArmError
+from openarm_common.lattice import Lattice
+from openarm_common.octomap_codec import OctreeEncoder, decode, read_file, write_file
+
+LATTICE = Lattice.from_bounds(0.02, (-0.16, -0.16, -0.08), (0.16, 0.16, 0.24), align=8)
+ENCODER = OctreeEncoder(LATTICE)
+
+
+def states_of(seed: int) -> np.ndarray:
+    """Random states with whole blocks of one kind, so that there is something to merge."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(0, 3, tuple(n // 4 for n in LATTICE.shape)).astype(np.uint8)
+    states = np.kron(coarse, np.ones((4, 4, 4), np.uint8))
+    some = rng.random(states.shape) < rng.choice([0.0, 0.05, 0.5])
+    states[some] = rng.integers(0, 3, np.count_nonzero(some))
+    return states
+
+
+def test_a57_one_voxel_is_thirty_two_bytes() -> None:
+    """Sixteen inner nodes of two bytes; the voxel at (0, 0, 0) is child 7 of the root and child 0 from there on."""
+    states = np.zeros(LATTICE.shape, np.uint8)
+    states[8, 8, 8] = 2
+    payload = ENCODER.binary(states)
+    assert payload.nodes == 17
+    assert payload.data.tobytes() == b"\x00\xc0" + b"\x03\x00" * 14 + b"\x02\x00"
+    states[8, 8, 8] = 1
+    assert ENCODER.binary(states).data.tobytes()[-2:] == b"\x01\x00"
+
+
+def test_an_empty_map_has_no_bytes() -> None:
+    """Readers remove the map then."""
+    empty = np.zeros(LATTICE.shape, np.uint8)
+    assert ENCODER.binary(empty).data.size == 0
+    assert ENCODER.full(np.full(LATTICE.shape, np.nan, np.float32)).data.size == 0
+    values, outside = decode(b"", 0.02, binary=True).on(LATTICE)
+    assert outside == 0
+    assert np.isnan(values).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a57_binary_round_trip(seed: int) -> None:
+    states = states_of(seed)
+    leaves = decode(ENCODER.binary(states).data, 0.02, binary=True)
+    values, outside = leaves.on(LATTICE)
+    assert outside == 0
+    np.testing.assert_array_equal(np.where(np.isnan(values), 0, np.where(values > 0, 2, 1)), states)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a57_full_round_trip(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    levels = np.array([np.nan, -2.0, -0.405, 0.442, 3.5], np.float32)
+    log_odds = levels[(states_of(seed) + rng.integers(0, 3)) % 5]
+    payload = ENCODER.full(log_odds)
+    values, outside = decode(payload.data, 0.02, binary=False).on(LATTICE)
+    assert outside == 0
+    np.testing.assert_array_equal(values, log_odds)
+
+
+def test_what_lies_outside_of_a_box_is_counted() -> None:
+    states = np.ones(LATTICE.shape, np.uint8)
+    leaves = decode(ENCODER.binary(states).data, 0.02, binary=True)
+    half = Lattice(0.02, LATTICE.key_min, (8, 16, 16))
+    values, outside = leaves.on(half)
+    assert outside > 0
+    assert not np.isnan(values).any()
+    with pytest.raises(OpenArmError, match=r"cells of 0\.02 m, expected 0\.04 m"):
+        leaves.on(half.coarser(1))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=400), st.booleans())
+def test_random_bytes_are_read_or_refused_never_worse(data: bytes, binary: bool) -> None:
+    try:
+        leaves = decode(data, 0.02, binary=binary)
+    except OpenArmError as error:
+        assert "octree is damaged" in error.message  # noqa: PT017
+    else:
+        assert np.isfinite(leaves.log_odds).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_a_damaged_file_is_refused_or_reads_as_some_tree(tmp_path_factory, data) -> None:
+    """Cut, lengthened or with bytes changed; a change that leaves a well-formed tree can't be seen."""
+    path = tmp_path_factory.mktemp("damage") / "map.ot"
+    write_file(path, ENCODER.full(np.where(states_of(3) == 2, np.float32(1.0), np.float32(np.nan))), 0.02)
+    content = bytearray(path.read_bytes())
+    kind = data.draw(st.sampled_from(["cut", "longer", "changed"]))
+    if kind == "cut":
+        del content[data.draw(st.integers(0, len(content) - 1)) :]
+    elif kind == "longer":
+        content += b"\0"
+    else:
+        for _ in range(3):
+            content[data.draw(st.integers(0, len(content) - 1))] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(bytes(content))
+    if kind == "changed":
+        try:
+            read_file(path)
+        except OpenArmError as error:
+            assert str(path) in error.message  # noqa: PT017
+    else:
+        with pytest.raises(OpenArmError, match=r"map\.ot"):
+            read_file(path)
+
+
+HEAD = b"# Octomap OcTree binary file\nid OcTree\nsize 17\nres 0.02\ndata\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (b"", "not an octree file"),
+        (b"P5\n640 480\ndata\n", "not an octree file"),
+        (HEAD[:-5], "not an octree file"),
+        (HEAD.replace(b"id OcTree", b"id ColorOcTree"), "class 'ColorOcTree'"),
+        (HEAD.replace(b"res 0.02", b"res 0"), "res is 0"),
+        (HEAD.replace(b"res 0.02", b"res nan"), "res is nan"),
+        (HEAD.replace(b"size 17\n", b""), "needs numbers"),
+        (HEAD + b"\x00", "ends after 1 bytes"),
+        (HEAD + b"\x03\x00" * 16, "deeper than 16"),
+        (HEAD + b"\x02\x00", "has 2 nodes, its header says 17"),
+    ],
+)
+def test_files_that_are_none_are_refused_with_the_reason(content: bytes, text: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.bt"
+    path.write_bytes(content)
+    with pytest.raises(OpenArmError, match=text):
+        read_file(path)
+
+
+def test_missing_files_and_wrong_suffixes_are_named(tmp_path: Path) -> None:
+    with pytest.raises(OpenArmError, match="can't be read"):
+        read_file(tmp_path / "none.bt")
+    payload = ENCODER.binary(states_of(1))
+    with pytest.raises(OpenArmError, match=r"needs the suffix \.bt"):
+        write_file(tmp_path / "map.ot", payload, 0.02)
+    with pytest.raises(OpenArmError, match="can't be written"):
+        write_file(tmp_path / "no" / "folder" / "map.bt", payload, 0.02)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_boxes_at_odd_keys_are_refused() -> None:
+    with pytest.raises(OpenArmError, match="even"):
+        OctreeEncoder(Lattice(0.02, (1, 0, 0), (2, 2, 2)))
