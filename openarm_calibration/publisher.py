@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node `calibration_publisher`: where the cameras are mounted, on /tf_static.
 
-For each camera: parent → `<camera>_link` (the mount; nominal, as configured) and `<camera>_link` →
-`<camera>_color_optical_frame` (the turn of the axes). Nothing else publishes these edges.
+For each camera: parent → `<camera>_link` (the mount) and `<camera>_link` → `<camera>_color_optical_frame` (the turn of
+the axes). The mount is the stored calibration of the camera, or, where there is none of these mounts, the nominal one.
+A change of the store is published within `period`. Nothing else publishes these edges.
 """
 
 from __future__ import annotations
@@ -10,38 +11,88 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from tf2_msgs.msg import TFMessage
 
 from openarm_calibration.config import PublisherConfig
-from openarm_common.cameras import T_LINK_OPTICAL, load_cameras
+from openarm_calibration.store import CalibrationStore, check_mount_seed, default_folder
+from openarm_common.cameras import T_LINK_OPTICAL, CameraConfig, load_cameras
 from openarm_common.convert import matrix_to_transform
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_LATCHED, BaseNode, run
 
+Array = NDArray[np.float64]
+
 
 class PublisherNode(BaseNode[PublisherConfig]):
-    """Publishes the mounts once, latched."""
+    """Publishes the mounts, latched, and again when the store changes."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("calibration_publisher", PublisherConfig, **kwargs)
-        cameras = load_cameras(Path(self.config.cameras) if self.config.cameras else None)
+        self._cameras = load_cameras(Path(self.config.cameras) if self.config.cameras else None)
         links = self.description.links
-        message = TFMessage()
-        for camera in cameras.values():
+        for camera in self._cameras.values():
             if camera.parent not in links:
                 raise OpenArmError(
                     Code.CONFIG_INVALID,
                     f"camera {camera.name!r}: parent {camera.parent!r} is no link of the robot;"
                     f" links: {', '.join(links)}",
                 )
+        self._store = CalibrationStore(Path(self.config.store) if self.config.store else default_folder())
+        self._seen = self._store.state()
+        self._last: dict[str, Array] = {}
+        self._mounts = self.create_publisher(TFMessage, "/tf_static", QOS_LATCHED)
+        self._publish()
+        self.create_timer(self.config.period, self._look, clock=self.wall_clock)
+
+    def _look(self) -> None:
+        state = self._store.state()
+        if state != self._seen:
+            self._seen = state
+            self._publish()
+
+    def _publish(self) -> None:
+        message = TFMessage()
+        sources: dict[str, str] = {}
+        faults: list[str] = []
+        for camera in self._cameras.values():
+            mount, sources[camera.name] = self._mount(camera, faults)
             # stamp 0: a fixed edge holds at any time, and this node needs no clock
             message.transforms += [
-                matrix_to_transform(camera.parent, camera.link_frame, camera.T_parent_link, 0),
+                matrix_to_transform(camera.parent, camera.link_frame, mount, 0),
                 matrix_to_transform(camera.link_frame, camera.optical_frame, T_LINK_OPTICAL, 0),
             ]
-        self._mounts = self.create_publisher(TFMessage, "/tf_static", QOS_LATCHED)
         self._mounts.publish(message)
-        self.diagnose(True, f"nominal mounts of {', '.join(cameras)}")
+        for fault in faults:
+            self.get_logger().warning(fault)
+        text = ", ".join(f"{name} {source}" for name, source in sources.items())
+        self.get_logger().info(f"mounts: {text}")
+        self.diagnose(not faults, "; ".join(faults) or f"mounts: {text}", **sources)
+
+    def _mount(self, camera: CameraConfig, faults: list[str]) -> tuple[Array, str]:
+        """The mount of a camera and where it is from; a stored one that can't be used is a fault."""
+        try:
+            found = self._store.find(camera.name)
+            if found is None:
+                return camera.T_parent_link, "nominal"
+            calibration = found.calibration
+            check_mount_seed(calibration, self.config.seed if camera.mount_error else None)
+            if calibration.parent != camera.parent:
+                raise OpenArmError(
+                    Code.CONFIG_INVALID,
+                    f"the calibration of {camera.name!r} is for parent {calibration.parent!r}, the camera is on"
+                    f" {camera.parent!r}; calibrate again",
+                )
+        except OpenArmError as error:
+            faults.append(error.message)
+            if camera.name in self._last:
+                return self._last[camera.name], "calibrated, the file before"
+            return camera.T_parent_link, "nominal"
+        if found.warning:
+            faults.append(found.warning)
+        self._last[camera.name] = calibration.T_parent_link
+        return calibration.T_parent_link, f"calibrated {calibration.digest()[:12]}"
 
 
 def main() -> None:

@@ -9,12 +9,20 @@ from rclpy.parameter import Parameter
 from tf2_msgs.msg import TFMessage
 
 from openarm_calibration.publisher import PublisherNode
+from openarm_calibration.store import CalibrationStore, StoredCalibration, default_folder
+from openarm_common import se3
 from openarm_common.cameras import load_cameras
 from openarm_common.convert import transform_to_matrix
 from openarm_common.description import RobotDescription
 from openarm_common.errors import OpenArmError
 from openarm_common.node import QOS_STATIC_TF
 from openarm_common.robot_state import RobotStateBuffer
+
+
+@pytest.fixture(autouse=True)
+def _own_store(tmp_path, monkeypatch) -> None:
+    """A store of this test alone."""
+    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
 
 
 def edges(ros) -> dict[tuple[str, str], np.ndarray]:
@@ -70,3 +78,40 @@ def test_a_camera_on_an_unknown_link_is_refused(ros, tmp_path) -> None:
     )
     with pytest.raises(OpenArmError, match=r"parent 'nowhere' is no link of the robot; links: .*openarm_body_link0"):
         PublisherNode(parameter_overrides=[Parameter("cameras", value=str(path))])
+
+
+def stored(x: float, seed: int | None, parent: str = "openarm_right_link7") -> StoredCalibration:
+    T = se3.make(se3.exp_so3((0.1, 0.0, 0.2)), (x, 0.0, 0.08))
+    return StoredCalibration.of_mount("wrist", parent, T, mount_seed=seed)
+
+
+def test_a45_stored_calibrations_are_latched_and_a_change_arrives_without_a_restart(ros) -> None:
+    """Stored, replaced, damaged (the last good one stays), rolled back."""
+    store = CalibrationStore(default_folder())
+    store.save(stored(0.10, 3))
+    ros.add(PublisherNode(parameter_overrides=[Parameter("mount_seed", value=3), Parameter("period", value=0.05)]))
+    got: list[TFMessage] = []
+    ros.node.create_subscription(TFMessage, "/tf_static", got.append, QOS_STATIC_TF)
+
+    def wrist() -> float:
+        edge = [e for e in got[-1].transforms if e.child_frame_id == "wrist_link"] if got else []
+        return edge[0].transform.translation.x if edge else 0.0
+
+    ros.spin_until(lambda: wrist() == 0.10, 10.0, "the stored mount")
+    path = store.save(stored(0.11, 3))
+    ros.spin_until(lambda: wrist() == 0.11, 10.0, "the new mount")
+    count = len(got)
+    path.write_text("camera: wrist\n")
+    ros.spin_until(lambda: len(got) > count, 10.0, "a message after the damage")
+    assert wrist() == 0.11
+    store.rollback("wrist")
+    ros.spin_until(lambda: wrist() == 0.10, 10.0, "the mount before")
+
+
+@pytest.mark.parametrize("wrong", [stored(0.2, 1), stored(0.2, None, "openarm_left_link7")])
+def test_a_calibration_of_other_mounts_is_refused_and_the_nominal_mount_served(ros, wrong) -> None:
+    """Another mount seed, another parent."""
+    CalibrationStore(default_folder()).save(wrong)
+    ros.add(PublisherNode())
+    camera = load_cameras()["wrist"]
+    np.testing.assert_allclose(edges(ros)[camera.parent, "wrist_link"], camera.T_parent_link, atol=1e-9)

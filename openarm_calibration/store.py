@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stored calibrations: one YAML a camera, checked by its own hash, with history and rollback.
+
+A mount is `T_parent_link` of the camera (position in m, quaternion x, y, z, w; link frame x forward, z up). Files are
+written beside and renamed, so that a reader sees an old or a new one, never a part. A file that is damaged is refused,
+and the newest good one of the history takes its place.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from openarm_common import se3
+from openarm_common.config import Config, load_yaml, validate
+from openarm_common.errors import Code, OpenArmError
+
+Array = NDArray[np.float64]
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
+_FORMAT = 1
+
+
+class StoredCalibration(Config):
+    """The mount of one camera and where it comes from."""
+
+    format: int = Field(_FORMAT, ge=_FORMAT, le=_FORMAT, description="of this file")
+    camera: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="name of the camera")
+    parent: str = Field(min_length=1, description="link that carries the camera")
+    position: tuple[float, float, float] = Field(description="of <camera>_link in the parent, m")
+    quaternion_xyzw: tuple[float, float, float, float] = Field(description="of <camera>_link in the parent")
+    sigma_translation: float = Field(0.0, ge=0.0, description="predicted error of the position, m")
+    sigma_rotation: float = Field(0.0, ge=0.0, description="predicted error of the rotation, rad")
+    mount_seed: int | None = Field(
+        None, description="of the simulated mounts that were calibrated; None: real or nominal"
+    )
+    method: str = Field("REFINED", description="solver")
+    board: str = Field("", description="that was looked at")
+    samples: int = Field(0, ge=0, description="that the result rests on")
+    session: str = Field("", description="hash of the session file")
+    created: str = Field("", description="when, as ISO 8601")
+    versions: dict[str, str] = Field(default_factory=dict, description="of the software")
+
+    @field_validator("position", "quaternion_xyzw")
+    @classmethod
+    def _finite(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if not np.isfinite(value).all():
+            raise ValueError("expected finite numbers")
+        if len(value) == 4 and abs(float(np.linalg.norm(value)) - 1.0) > 1e-3:
+            raise ValueError("expected a unit quaternion")
+        return value
+
+    @property
+    def T_parent_link(self) -> Array:
+        """Mount, (4, 4)."""
+        return se3.make(se3.matrix_from_quat_xyzw(self.quaternion_xyzw), self.position)
+
+    @classmethod
+    def of_mount(cls, camera: str, parent: str, T_parent_link: Array, **provenance: Any) -> StoredCalibration:
+        """Make one of a mount (4, 4)."""
+        x, y, z = (float(v) for v in T_parent_link[:3, 3])
+        qx, qy, qz, qw = (float(v) for v in se3.quat_xyzw_from_matrix(T_parent_link[:3, :3]))
+        data = {"camera": camera, "parent": parent, "position": (x, y, z), "quaternion_xyzw": (qx, qy, qz, qw)}
+        return validate(cls, {**data, **provenance}, f"calibration of {camera!r}")
+
+    def digest(self) -> str:
+        """Hash of all fields."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the store has for a camera: the calibration, and what was wrong with the file when it is an older one."""
+
+    calibration: StoredCalibration
+    warning: str = ""
+
+
+class CalibrationStore:
+    """A folder of calibrations.
+
+    Args:
+        folder: Where; made at the first save.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, camera: str) -> Path:
+        """File of a camera.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for a name that could lead elsewhere.
+        """
+        return self.folder / f"{checked_name(camera)}.yaml"
+
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras that have a file, damaged or not."""
+        if not self.folder.is_dir():
+            return ()
+        return tuple(sorted(p.stem for p in self.folder.glob("*.yaml") if _NAME.fullmatch(p.stem)))
+
+    def save(self, calibration: StoredCalibration) -> Path:
+        """Make it the camera's calibration; the one before stays in the history.
+
+        Raises:
+            OpenArmError: ENVIRONMENT, when the folder can't be written.
+        """
+        path = self.path(calibration.camera)
+        digest = calibration.digest()
+        text = yaml.safe_dump({**calibration.model_dump(mode="json"), "sha256": digest}, sort_keys=False)
+        past = self._past(calibration.camera)
+        number = 1 + max((_number(p) for p in past), default=0)
+        _write(self._history(calibration.camera) / f"{number:06d}-{digest[:12]}.yaml", text)
+        _write(path, text)
+        return path
+
+    def load(self, camera: str) -> StoredCalibration:
+        """Read the camera's calibration.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when there is none or it is damaged, saying how.
+        """
+        path = self.path(camera)
+        if not path.is_file():
+            known = ", ".join(self.cameras()) or "none"
+            raise OpenArmError(
+                Code.CONFIG_INVALID, f"no calibration of {camera!r} in {self.folder}; stored cameras: {known}"
+            )
+        return read(path)
+
+    def find(self, camera: str) -> Found | None:
+        """The camera's calibration, or the newest good one before it; None when nothing was ever stored.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when the file is damaged and the history has no good one.
+        """
+        path = self.path(camera)
+        past = self._past(camera)
+        if not path.is_file() and not past:
+            return None
+        try:
+            return Found(self.load(camera))
+        except OpenArmError as error:
+            for older in reversed(past):
+                try:
+                    return Found(read(older), f"{error.message}; the last good one, {older.name}, is used")
+                except OpenArmError:
+                    continue  # damaged too: the one before it is tried
+            raise
+
+    def history(self, camera: str) -> tuple[StoredCalibration, ...]:
+        """All good calibrations of a camera, oldest first."""
+        out: list[StoredCalibration] = []
+        for path in self._past(camera):
+            try:
+                out.append(read(path))
+            except OpenArmError:
+                continue  # a damaged one is no part of the history
+        return tuple(out)
+
+    def rollback(self, camera: str) -> StoredCalibration:
+        """Go back to the calibration before the present one; the present one leaves the history.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when there is none before it.
+        """
+        past = self._past(camera)
+        good = [(path, found) for path in past if (found := _try_read(path)) is not None]
+        if len(good) < 2:
+            raise OpenArmError(
+                Code.CONFIG_INVALID,
+                f"{camera!r} has {len(good)} stored calibrations; going back needs one before the present",
+            )
+        path, before = good[-2]
+        _write(self.path(camera), path.read_text(encoding="utf-8"))
+        for later in past[past.index(path) + 1 :]:
+            later.unlink()
+        return before
+
+    def state(self) -> tuple[tuple[str, int, int], ...]:
+        """What changes when a file does: names, sizes and times of the files."""
+        out: list[tuple[str, int, int]] = []
+        for camera in self.cameras():
+            try:
+                status = self.path(camera).stat()
+            except FileNotFoundError:
+                continue  # between the listing and now
+            out.append((camera, status.st_mtime_ns, status.st_size))
+        return tuple(out)
+
+    def _history(self, camera: str) -> Path:
+        return self.folder / "history" / checked_name(camera)
+
+    def _past(self, camera: str) -> list[Path]:
+        folder = self._history(camera)
+        return sorted(folder.glob("*.yaml"), key=_number) if folder.is_dir() else []
+
+
+def checked_name(camera: str) -> str:
+    """Return a camera's name when it is one.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for anything else, above all what a file system reads as a path.
+    """
+    if not _NAME.fullmatch(camera):
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"camera name {camera!r}: expected lower-case letters, digits and _, beginning with a letter, at most 64",
+        )
+    return camera
+
+
+def read(path: Path) -> StoredCalibration:
+    """Read and check one file.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when it is not as it was written.
+    """
+    data = load_yaml(path)
+    told = data.pop("sha256", None)
+    calibration = validate(StoredCalibration, data, str(path))
+    if told != calibration.digest():
+        raise OpenArmError(
+            Code.CONFIG_INVALID,
+            f"{path} is damaged or was edited: its contents do not have the hash that it states; calibrate and save"
+            " again, or roll back",
+        )
+    return calibration
+
+
+def check_mount_seed(calibration: StoredCalibration, mount_seed: int | None) -> None:
+    """Refuse a calibration of other mounts than those in use.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming both seeds.
+    """
+    if calibration.mount_seed != mount_seed:
+        names = ["none" if seed is None else str(seed) for seed in (calibration.mount_seed, mount_seed)]
+        raise OpenArmError(
+            Code.CONFIG_INVALID,
+            f"the calibration of {calibration.camera!r} is of mount seed {names[0]}, the mounts in use are of mount"
+            f" seed {names[1]}; calibrate again",
+        )
+
+
+def default_folder() -> Path:
+    """Where calibrations are when nothing else is said: OPENARM_CALIBRATIONS, or the user's data folder."""
+    given = os.environ.get("OPENARM_CALIBRATIONS", "")
+    if given:
+        return Path(given).expanduser()
+    base = os.environ.get("XDG_DATA_HOME", "")
+    return (Path(base) if base else Path.home() / ".local" / "share") / "openarm" / "calibrations"
+
+
+def _number(path: Path) -> int:
+    head = path.name.partition("-")[0]
+    return int(head) if head.isdigit() else 0
+
+
+def _try_read(path: Path) -> StoredCalibration | None:
+    try:
+        return read(path)
+    except OpenArmError:
+        return None
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=".", delete=False, encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(file.name).chmod(0o644)
+        os.replace(file.name, path)
+    except OSError as error:
+        raise OpenArmError(Code.ENVIRONMENT, f"can't write {path}: {error.strerror}") from error

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stored calibrations: hash, history, rollback, names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from openarm_calibration.store import CalibrationStore, StoredCalibration, check_mount_seed
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+
+
+def calibration(x: float = 0.1, **more) -> StoredCalibration:
+    T = se3.make(se3.exp_so3((0.1, 0.2, 0.3)), (x, 0.2, 0.3))
+    return StoredCalibration.of_mount(
+        "wrist", "openarm_right_link7", T, samples=12, created="2026-01-01T00:00:00Z", **more
+    )
+
+
+def test_a45_a_saved_mount_comes_back_exactly(tmp_path: Path) -> None:
+    store = CalibrationStore(tmp_path / "store")
+    assert store.find("wrist") is None
+    saved = calibration()
+    path = store.save(saved)
+    assert store.load("wrist") == saved
+    np.testing.assert_allclose(store.load("wrist").T_parent_link, saved.T_parent_link, atol=1e-15)
+    assert store.cameras() == ("wrist",)
+    assert [p.name for p in path.parent.iterdir() if p.name.startswith(".")] == []
+
+
+def test_an_edited_or_cut_file_is_refused_and_the_last_good_one_stays(tmp_path: Path) -> None:
+    store = CalibrationStore(tmp_path)
+    store.save(calibration(0.1))
+    path = store.save(calibration(0.2))
+    text = path.read_text()
+    for damaged in (text.replace("0.2\n", "0.9\n", 1), text[: len(text) // 2], "", "- a list\n", "a: [", "\x00"):
+        path.write_text(damaged)
+        with pytest.raises(OpenArmError) as caught:
+            store.load("wrist")
+        assert caught.value.code == Code.CONFIG_INVALID
+        found = store.find("wrist")
+        assert found is not None
+        assert found.calibration.position[0] == 0.2
+        assert "last good one" in found.warning
+
+
+def test_yaml_that_would_run_something_is_refused(tmp_path: Path) -> None:
+    store = CalibrationStore(tmp_path)
+    mark = tmp_path / "ran"
+    (tmp_path / "wrist.yaml").write_text(f"!!python/object/apply:os.mkdir ['{mark}']\n")
+    with pytest.raises(OpenArmError, match="not valid YAML"):
+        store.load("wrist")
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["../wrist", "a/b", "", ".", "..", "/etc/passwd", "Wrist", "wrist\n", "a" * 65, "w\x00"]
+)
+def test_names_with_path_tricks_are_refused(tmp_path: Path, name: str) -> None:
+    store = CalibrationStore(tmp_path)
+    for use in (store.load, store.find, store.history, store.rollback, store.path):
+        with pytest.raises(OpenArmError, match="camera name"):
+            use(name)
+    with pytest.raises(OpenArmError, match="camera"):
+        StoredCalibration.of_mount(name, "p", np.eye(4))
+
+
+def test_rollback_goes_back_one_and_says_when_there_is_none(tmp_path: Path) -> None:
+    store = CalibrationStore(tmp_path)
+    for x in (0.1, 0.2, 0.3):
+        store.save(calibration(x))
+    assert [c.position[0] for c in store.history("wrist")] == [0.1, 0.2, 0.3]
+    assert store.rollback("wrist").position[0] == 0.2
+    assert store.load("wrist").position[0] == 0.2
+    assert store.rollback("wrist").position[0] == 0.1
+    with pytest.raises(OpenArmError, match="has 1 stored calibrations"):
+        store.rollback("wrist")
+
+
+def test_a_calibration_of_another_mount_seed_is_refused() -> None:
+    check_mount_seed(calibration(mount_seed=1), 1)
+    with pytest.raises(OpenArmError, match="is of mount seed 1, the mounts in use are of mount seed none"):
+        check_mount_seed(calibration(mount_seed=1), None)
+
+
+def test_a_missing_camera_lists_those_there_are(tmp_path: Path) -> None:
+    store = CalibrationStore(tmp_path)
+    store.save(calibration())
+    with pytest.raises(OpenArmError, match=r"no calibration of 'overhead' in .*; stored cameras: wrist"):
+        store.load("overhead")
+
+
+def test_a_folder_that_cant_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OpenArmError, match="can't write") as caught:
+        CalibrationStore(tmp_path / "file").save(calibration())
+    assert caught.value.code == Code.ENVIRONMENT
