@@ -467,13 +467,13 @@ def test_b49_table_comes_from_the_scene_description() -> None:
 def test_b50_obstacles_travel_with_the_request(bench: Bench) -> None:
     # no planning scene that could lack them: the same goal is refused with the box and planned without it
     arm = bench.node._arms["right"]
-    goal = named("right", "home", plan_only=True)
-    tip = arm.kinematics.fk(bench.q("right"))
+    goal = named("right", "official_home", plan_only=True)
+    tip = arm.kinematics.fk([0, 0, 0, 1.5708, 0, 0, 0])
     goal.obstacles = [CollisionBox(id="box", pose=matrix_to_pose(tip), size=Vector3(x=0.05, y=0.05, z=0.05))]
     result = bench.run(bench.move_client, goal)
     assert result.code == "IN_COLLISION"
     assert "box" in result.message
-    assert bench.run(bench.move_client, named("right", "home", plan_only=True)).success
+    assert bench.run(bench.move_client, named("right", "official_home", plan_only=True)).success
 
 
 class WaitingPlanner:
