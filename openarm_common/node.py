@@ -106,8 +106,8 @@ class BaseNode(Node, Generic[ConfigT]):
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         self.__status = status
 
-    def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Future:
-        """Run `fn` in a worker thread; await the returned future in a coroutine callback.
+    def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Any:
+        """Run `fn` in a worker thread; await the returned rclpy future (which carries no type) in a coroutine callback.
 
         A future completed from another thread does not wake a waiting executor, so this does.
         """

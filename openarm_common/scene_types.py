@@ -46,10 +46,10 @@ _COLUMN_FRONT = 0.035
 class Table(Config):
     """A table with four legs; its top is a box."""
 
-    top_z: float = Field(0.40, ge=0.05, le=1.2, description="height of the top, m")
-    x: tuple[float, float] = Field((0.11, 0.81), description="front and back edge, m")
-    y: tuple[float, float] = Field((-0.60, 0.60), description="right and left edge, m")
-    thickness: float = Field(0.04, gt=0.0, le=0.2, description="of the top, m")
+    top_z: float = Field(default=0.40, ge=0.05, le=1.2, description="height of the top, m")
+    x: tuple[float, float] = Field(default=(0.11, 0.81), description="front and back edge, m")
+    y: tuple[float, float] = Field(default=(-0.60, 0.60), description="right and left edge, m")
+    thickness: float = Field(default=0.04, gt=0.0, le=0.2, description="of the top, m")
 
     @field_validator("x", "y")
     @classmethod
@@ -84,13 +84,13 @@ class SceneObject(Config):
     """
 
     name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")
-    label: str = Field("", description="what the detector calls it; the colour where it is not given")
+    label: str = Field(default="", description="what the detector calls it; the colour where it is not given")
     shape: str = Field(description="box or cylinder")
     size: tuple[float, float, float] = Field(description="extents, m")
     color: str = Field(description="a colour of the palette")
-    mass: float = Field(0.0, ge=0.0, le=10.0, description="kg; 0 is the volume times the density of hard wood")
+    mass: float = Field(default=0.0, ge=0.0, le=10.0, description="kg; 0 is the volume times the density of hard wood")
     position: tuple[float, float] | tuple[float, float, float] = Field(description="of the centre, m")
-    yaw: float = Field(0.0, description="rad")
+    yaw: float = Field(default=0.0, description="rad")
 
     @model_validator(mode="before")
     @classmethod
@@ -173,7 +173,7 @@ class SceneObject(Config):
 class Scene(Config):
     """A table and what is on it."""
 
-    name: str = Field("scene", min_length=1)
+    name: str = Field(default="scene", min_length=1)
     table: Table = Table()
     objects: tuple[SceneObject, ...] = ()
 

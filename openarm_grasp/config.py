@@ -13,15 +13,25 @@ from openarm_common.config import Config
 class ApproachConfig(Config):
     """Where the hand stands before, at and after the grasp."""
 
-    pregrasp_distance: float = Field(0.08, ge=0.05, le=0.08, description="straight approach before the grasp, m")
-    path_tolerance: float = Field(0.02, gt=0.0, le=0.04, description="how far the TCP may be off its path, m")
-    lift_height: float = Field(0.12, ge=0.03, le=0.25, description="straight lift after the grasp, m")
-    tilts_deg: tuple[float, ...] = Field((0.0, 15.0, 30.0, 45.0), description="leans of the hand from vertical, deg")
-    max_width: float = Field(0.070, gt=0.0, le=0.080, description="widest object side that is grasped, m")
-    width_noise: float = Field(0.002, ge=0.0, le=0.005, description="error of a measured width allowed beyond it, m")
-    overlap_half_width: float = Field(0.12, ge=0.0, le=0.3, description="|y| up to which `auto` tries both arms, m")
-    obstacle_margin: float = Field(0.005, ge=0.0, le=0.03, description="other objects are inflated by this, m")
-    table_gap: float = Field(0.003, ge=0.0, le=0.01, description="the object's own box ends this above the table, m")
+    pregrasp_distance: float = Field(
+        default=0.08, ge=0.05, le=0.08, description="straight approach before the grasp, m"
+    )
+    path_tolerance: float = Field(default=0.02, gt=0.0, le=0.04, description="how far the TCP may be off its path, m")
+    lift_height: float = Field(default=0.12, ge=0.03, le=0.25, description="straight lift after the grasp, m")
+    tilts_deg: tuple[float, ...] = Field(
+        default=(0.0, 15.0, 30.0, 45.0), description="leans of the hand from vertical, deg"
+    )
+    max_width: float = Field(default=0.070, gt=0.0, le=0.080, description="widest object side that is grasped, m")
+    width_noise: float = Field(
+        default=0.002, ge=0.0, le=0.005, description="error of a measured width allowed beyond it, m"
+    )
+    overlap_half_width: float = Field(
+        default=0.12, ge=0.0, le=0.3, description="|y| up to which `auto` tries both arms, m"
+    )
+    obstacle_margin: float = Field(default=0.005, ge=0.0, le=0.03, description="other objects are inflated by this, m")
+    table_gap: float = Field(
+        default=0.003, ge=0.0, le=0.01, description="the object's own box ends this above the table, m"
+    )
 
     @model_validator(mode="after")
     def _pregrasp_is_beyond_tolerance(self) -> Self:
@@ -39,59 +49,83 @@ class ApproachConfig(Config):
 class HandConfig(Config):
     """The gripper's own measures, behind the tool centre point (TCP)."""
 
-    opening: float = Field(0.044, gt=0.0, le=0.1, description="position of one finger when open, m")
-    open_tolerance: float = Field(0.004, gt=0.0, le=0.01, description="a finger this near to `opening` is open, m")
-    tip_clearance: float = Field(0.012, ge=0.0, le=0.03, description="TCP above the table so that the tips clear it, m")
-    tip_clearance_tilted: float = Field(0.018, ge=0.0, le=0.05, description="added times sin(tilt), m")
-    pad_centre: float = Field(0.017, ge=0.0, le=0.05, description="middle of the finger pads behind the TCP, m")
-    palm_depth: float = Field(0.045, ge=0.0, le=0.1, description="deepest an object may reach between the fingers, m")
-    palm_depth_tilted: float = Field(0.030, ge=0.0, le=0.1, description="taken off times sin(tilt), m")
+    opening: float = Field(default=0.044, gt=0.0, le=0.1, description="position of one finger when open, m")
+    open_tolerance: float = Field(
+        default=0.004, gt=0.0, le=0.01, description="a finger this near to `opening` is open, m"
+    )
+    tip_clearance: float = Field(
+        default=0.012, ge=0.0, le=0.03, description="TCP above the table so that the tips clear it, m"
+    )
+    tip_clearance_tilted: float = Field(default=0.018, ge=0.0, le=0.05, description="added times sin(tilt), m")
+    pad_centre: float = Field(default=0.017, ge=0.0, le=0.05, description="middle of the finger pads behind the TCP, m")
+    palm_depth: float = Field(
+        default=0.045, ge=0.0, le=0.1, description="deepest an object may reach between the fingers, m"
+    )
+    palm_depth_tilted: float = Field(default=0.030, ge=0.0, le=0.1, description="taken off times sin(tilt), m")
 
 
 class TimingConfig(Config):
     """Pauses of the grasp."""
 
-    pause_at_grasp: float = Field(0.5, ge=0.0, le=5.0, description="at the grasp before the hand closes, s")
-    after_close: float = Field(0.2, ge=0.0, le=5.0, description="after the hand has closed, before the lift, s")
-    after_release: float = Field(0.2, ge=0.0, le=5.0, description="after the hand has opened, before it leaves, s")
-    settle_limit: float = Field(1.0, gt=0.0, le=5.0, description="longest wait for the fingers to rest, s")
+    pause_at_grasp: float = Field(default=0.5, ge=0.0, le=5.0, description="at the grasp before the hand closes, s")
+    after_close: float = Field(default=0.2, ge=0.0, le=5.0, description="after the hand has closed, before the lift, s")
+    after_release: float = Field(
+        default=0.2, ge=0.0, le=5.0, description="after the hand has opened, before it leaves, s"
+    )
+    settle_limit: float = Field(default=1.0, gt=0.0, le=5.0, description="longest wait for the fingers to rest, s")
 
 
 class HeldConfig(Config):
     """What counts as holding an object."""
 
-    closed_below: float = Field(0.003, gt=0.0, le=0.02, description="a gap up to this is an empty hand, m")
-    width_tolerance: float = Field(0.005, gt=0.0, le=0.02, description="gap against the object's width, m")
-    max_speed: float = Field(0.001, gt=0.0, le=0.01, description="fingers slower than this rest, m/s")
-    min_effort: float = Field(5.0, gt=0.0, le=50.0, description="least closing force of the finger, N")
-    use_effort: bool = Field(True, description="false for drivers that report no effort: the gap alone decides")
-    max_tcp_error: float = Field(0.008, gt=0.0, le=0.05, description="TCP this far from the grasp hit something, m")
-    rise: float = Field(0.03, gt=0.0, le=0.2, description="an object seen this much higher has risen, m")
+    closed_below: float = Field(default=0.003, gt=0.0, le=0.02, description="a gap up to this is an empty hand, m")
+    width_tolerance: float = Field(default=0.005, gt=0.0, le=0.02, description="gap against the object's width, m")
+    max_speed: float = Field(default=0.001, gt=0.0, le=0.01, description="fingers slower than this rest, m/s")
+    min_effort: float = Field(default=5.0, gt=0.0, le=50.0, description="least closing force of the finger, N")
+    use_effort: bool = Field(default=True, description="false for drivers that report no effort: the gap alone decides")
+    max_tcp_error: float = Field(
+        default=0.008, gt=0.0, le=0.05, description="TCP this far from the grasp hit something, m"
+    )
+    rise: float = Field(default=0.03, gt=0.0, le=0.2, description="an object seen this much higher has risen, m")
 
 
 class DetectConfig(Config):
     """How detections become one trusted object."""
 
-    frames: int = Field(3, ge=2, le=30, description="frames that are averaged")
-    agree_within: float = Field(0.003, gt=0.0, le=0.02, description="largest spread of the object's position, m")
-    max_age: float = Field(0.5, gt=0.0, le=5.0, description="oldest detection that is acted on, s")
-    attempts: int = Field(3, ge=1, le=20, description="rounds of frames without the object before it is refused")
-    frame_timeout: float = Field(5.0, gt=0.0, le=60.0, description="wait for the frames of one round, wall clock, s")
-    match_radius: float = Field(0.03, gt=0.0, le=0.1, description="detections nearer than this are one object, m")
+    frames: int = Field(default=3, ge=2, le=30, description="frames that are averaged")
+    agree_within: float = Field(
+        default=0.003, gt=0.0, le=0.02, description="largest spread of the object's position, m"
+    )
+    max_age: float = Field(default=0.5, gt=0.0, le=5.0, description="oldest detection that is acted on, s")
+    attempts: int = Field(
+        default=3, ge=1, le=20, description="rounds of frames without the object before it is refused"
+    )
+    frame_timeout: float = Field(
+        default=5.0, gt=0.0, le=60.0, description="wait for the frames of one round, wall clock, s"
+    )
+    match_radius: float = Field(
+        default=0.03, gt=0.0, le=0.1, description="detections nearer than this are one object, m"
+    )
 
 
 class PlaceConfig(Config):
     """Where and how objects are put down."""
 
-    release_height: float = Field(0.001, ge=0.0, le=0.01, description="above touching the table at release, m")
-    tolerance: float = Field(0.02, gt=0.0, le=0.1, description="seen this near to the target counts as placed, m")
-    yaw_step_deg: float = Field(30.0, gt=0.0, le=180.0, description="turns of the object that are tried, deg")
-    region_x: tuple[float, float] = Field((0.16, 0.36), description="x of free spots, base frame, m")
-    region_abs_y: tuple[float, float] = Field((0.06, 0.42), description="|y| of free spots on the arm's side, m")
-    spot_step: float = Field(0.04, gt=0.0, le=0.2, description="grid of free spots, m")
-    spots: int = Field(6, ge=1, le=50, description="free spots that are offered to the planner")
-    neighbour_distance: float = Field(0.10, ge=0.0, le=0.5, description="least distance to other objects, m")
-    origin_distance: float = Field(0.08, ge=0.0, le=0.5, description="least distance to where the object came from, m")
+    release_height: float = Field(default=0.001, ge=0.0, le=0.01, description="above touching the table at release, m")
+    tolerance: float = Field(
+        default=0.02, gt=0.0, le=0.1, description="seen this near to the target counts as placed, m"
+    )
+    yaw_step_deg: float = Field(default=30.0, gt=0.0, le=180.0, description="turns of the object that are tried, deg")
+    region_x: tuple[float, float] = Field(default=(0.16, 0.36), description="x of free spots, base frame, m")
+    region_abs_y: tuple[float, float] = Field(
+        default=(0.06, 0.42), description="|y| of free spots on the arm's side, m"
+    )
+    spot_step: float = Field(default=0.04, gt=0.0, le=0.2, description="grid of free spots, m")
+    spots: int = Field(default=6, ge=1, le=50, description="free spots that are offered to the planner")
+    neighbour_distance: float = Field(default=0.10, ge=0.0, le=0.5, description="least distance to other objects, m")
+    origin_distance: float = Field(
+        default=0.08, ge=0.0, le=0.5, description="least distance to where the object came from, m"
+    )
 
     @model_validator(mode="after")
     def _ranges_ascend(self) -> Self:
@@ -105,23 +139,33 @@ class PlaceConfig(Config):
 class LimitsConfig(Config):
     """When to stop trying and when to stop waiting."""
 
-    max_attempts: int = Field(3, ge=1, le=10, description="physical attempts of one grasp")
-    plan_attempts: int = Field(2, ge=1, le=10, description="detections planned for in vain before the grasp is refused")
-    joint_state_timeout: float = Field(1.0, gt=0.0, le=10.0, description="silent joints = robot lost, wall clock, s")
-    ready_timeout: float = Field(3.0, ge=0.0, le=60.0, description="wait for the other nodes, wall clock, s")
-    answer_timeout: float = Field(5.0, gt=0.0, le=60.0, description="an action server accepts within, wall clock, s")
-    plan_timeout: float = Field(30.0, gt=0.0, le=300.0, description="one planning request, wall clock, s")
-    move_timeout: float = Field(60.0, gt=0.0, le=600.0, description="one motion, wall clock, s")
-    gripper_timeout: float = Field(20.0, gt=0.0, le=120.0, description="one gripper motion, wall clock, s")
+    max_attempts: int = Field(default=3, ge=1, le=10, description="physical attempts of one grasp")
+    plan_attempts: int = Field(
+        default=2, ge=1, le=10, description="detections planned for in vain before the grasp is refused"
+    )
+    joint_state_timeout: float = Field(
+        default=1.0, gt=0.0, le=10.0, description="silent joints = robot lost, wall clock, s"
+    )
+    ready_timeout: float = Field(default=3.0, ge=0.0, le=60.0, description="wait for the other nodes, wall clock, s")
+    answer_timeout: float = Field(
+        default=5.0, gt=0.0, le=60.0, description="an action server accepts within, wall clock, s"
+    )
+    plan_timeout: float = Field(default=30.0, gt=0.0, le=300.0, description="one planning request, wall clock, s")
+    move_timeout: float = Field(default=60.0, gt=0.0, le=600.0, description="one motion, wall clock, s")
+    gripper_timeout: float = Field(default=20.0, gt=0.0, le=120.0, description="one gripper motion, wall clock, s")
 
 
 class GraspConfig(Config):
     """Parameters of the grasp node."""
 
-    scene: str = Field("demo", description="scene file whose table the objects stand on")
-    home_state: str = Field("home", description="SRDF group state of both arms that keeps the camera's view free")
-    home_tolerance: float = Field(0.05, gt=0.0, le=0.5, description="joints this near to home are home, rad")
-    velocity_scale: float = Field(0.0, ge=0.0, le=1.0, description="of the motion limits; 0 = the planner's default")
+    scene: str = Field(default="demo", description="scene file whose table the objects stand on")
+    home_state: str = Field(
+        default="home", description="SRDF group state of both arms that keeps the camera's view free"
+    )
+    home_tolerance: float = Field(default=0.05, gt=0.0, le=0.5, description="joints this near to home are home, rad")
+    velocity_scale: float = Field(
+        default=0.0, ge=0.0, le=1.0, description="of the motion limits; 0 = the planner's default"
+    )
     approach: ApproachConfig = ApproachConfig()
     hand: HandConfig = HandConfig()
     timing: TimingConfig = TimingConfig()

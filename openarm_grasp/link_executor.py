@@ -169,7 +169,7 @@ class RobotLink:
             # Should it be accepted yet, it is withdrawn.
             sent.add_done_callback(lambda f: f.result().cancel_goal_async() if f.result().accepted else None)
             raise
-        handle = sent.result()
+        handle: Any = sent.result()
         if not handle.accepted:
             raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the goal was rejected")
         result = handle.get_result_async()

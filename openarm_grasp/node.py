@@ -15,6 +15,7 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
+from openarm_common.description import Side
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene import load_scene
@@ -161,7 +162,7 @@ class GraspNode(BaseNode[GraspConfig]):
             chosen = memory.candidate.id if memory.candidate else ""
             self._marker_topic.publish(convert.candidate_markers(memory.offered, chosen, t_ns))
 
-    def _shoulder(self, arm: str) -> tuple[float, float]:
+    def _shoulder(self, arm: Side) -> tuple[float, float]:
         """(x, y) of the arm's first joint, base frame, m."""
         first = self.description.joint(self.description.arm_joints(arm)[0])
         T_base_shoulder = self.description.link_pose(first.parent, {}) @ first.T_parent_joint

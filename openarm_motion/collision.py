@@ -51,11 +51,17 @@ class Box:
 class Clearance(Config):
     """Distances that pairs keep, m; nearer is a collision."""
 
-    own: float = Field(0.003, ge=0.0, le=0.05, description="between links of the arm, and to the robot's body, m")
-    world: float = Field(0.010, ge=0.0, le=0.1, description="arm to boxes and to the other arm, m")
-    hand: float = Field(0.010, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
-    touch: float = Field(0.002, ge=0.0, le=0.05, description="arm and palm to a box that the fingers may touch, m")
-    rest: float = Field(0.0, ge=-0.02, le=0.05, description="held box to what it stands on; < 0 allows overlap, m")
+    own: float = Field(
+        default=0.003, ge=0.0, le=0.05, description="between links of the arm, and to the robot's body, m"
+    )
+    world: float = Field(default=0.010, ge=0.0, le=0.1, description="arm to boxes and to the other arm, m")
+    hand: float = Field(default=0.010, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
+    touch: float = Field(
+        default=0.002, ge=0.0, le=0.05, description="arm and palm to a box that the fingers may touch, m"
+    )
+    rest: float = Field(
+        default=0.0, ge=-0.02, le=0.05, description="held box to what it stands on; < 0 allows overlap, m"
+    )
 
 
 @dataclass(frozen=True, eq=False)

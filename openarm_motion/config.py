@@ -19,11 +19,11 @@ _SEVEN_J = (60.0, 60.0, 80.0, 80.0, 120.0, 120.0, 120.0)
 class LimitsConfig(Config):
     """What the joints of an arm may do, from the shoulder to the wrist; plans use these times the velocity scale."""
 
-    velocity: tuple[float, ...] = Field(_SEVEN_V, description="rad/s, one number a joint")
-    acceleration: tuple[float, ...] = Field(_SEVEN_A, description="rad/s2, one number a joint")
-    jerk: tuple[float, ...] = Field(_SEVEN_J, description="rad/s3, one number a joint")
-    straight_speed: float = Field(0.25, gt=0.0, le=2.0, description="tool on straight lines at scale 1, m/s")
-    default_scale: float = Field(0.5, gt=0.0, le=1.0, description="velocity scale of a request that has none")
+    velocity: tuple[float, ...] = Field(default=_SEVEN_V, description="rad/s, one number a joint")
+    acceleration: tuple[float, ...] = Field(default=_SEVEN_A, description="rad/s2, one number a joint")
+    jerk: tuple[float, ...] = Field(default=_SEVEN_J, description="rad/s3, one number a joint")
+    straight_speed: float = Field(default=0.25, gt=0.0, le=2.0, description="tool on straight lines at scale 1, m/s")
+    default_scale: float = Field(default=0.5, gt=0.0, le=1.0, description="velocity scale of a request that has none")
 
     @model_validator(mode="after")
     def _positive_and_alike(self) -> LimitsConfig:
@@ -36,47 +36,61 @@ class LimitsConfig(Config):
 class StraightClearance(Clearance):
     """Clearance on straight parts, where the gripper works near surfaces."""
 
-    hand: float = Field(0.003, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
-    rest: float = Field(-0.004, ge=-0.02, le=0.05, description="held box to what it stands on; < 0 allows overlap, m")
+    hand: float = Field(default=0.003, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
+    rest: float = Field(
+        default=-0.004, ge=-0.02, le=0.05, description="held box to what it stands on; < 0 allows overlap, m"
+    )
 
 
 class PlanningConfig(Config):
     """How plans are searched for."""
 
-    joint_margin: float = Field(0.05, ge=0.0, le=0.5, description="kept from joint limits at goals and on lines, rad")
-    swivels: int = Field(48, ge=4, le=720, description="elbow angles tried a turn")
-    time_limit: float = Field(5.0, gt=0.0, le=120.0, description="of a search, s of wall clock")
-    seed: int = Field(1, ge=1, description="of random numbers; the same request gives the same plan")
-    edge_step: float = Field(0.05, gt=0.0, le=0.2, description="joint turn between two collision checks, rad")
-    edge_travel: float = Field(0.02, gt=0.0, le=0.1, description="travel of any point between two checks, m")
-    start_overlap: float = Field(0.005, ge=0.0, le=0.05, description="overlap at a start taken for an error, m")
-    estimate_overlap: float = Field(0.03, ge=0.0, le=0.2, description="the same with obstacles of a request, m")
-    score_step: float = Field(0.05, ge=0.0, description="targets whose scores differ by less count as equally good")
-    keep: int = Field(4, ge=1, le=64, description="configurations kept a target")
-    period: float = Field(0.02, ge=0.002, le=0.2, description="greatest time between trajectory samples, s")
-    gripper_open: float = Field(0.044, ge=0.0, description="position of the finger joints of an open gripper, m")
+    joint_margin: float = Field(
+        default=0.05, ge=0.0, le=0.5, description="kept from joint limits at goals and on lines, rad"
+    )
+    swivels: int = Field(default=48, ge=4, le=720, description="elbow angles tried a turn")
+    time_limit: float = Field(default=5.0, gt=0.0, le=120.0, description="of a search, s of wall clock")
+    seed: int = Field(default=1, ge=1, description="of random numbers; the same request gives the same plan")
+    edge_step: float = Field(default=0.05, gt=0.0, le=0.2, description="joint turn between two collision checks, rad")
+    edge_travel: float = Field(default=0.02, gt=0.0, le=0.1, description="travel of any point between two checks, m")
+    start_overlap: float = Field(default=0.005, ge=0.0, le=0.05, description="overlap at a start taken for an error, m")
+    estimate_overlap: float = Field(default=0.03, ge=0.0, le=0.2, description="the same with obstacles of a request, m")
+    score_step: float = Field(
+        default=0.05, ge=0.0, description="targets whose scores differ by less count as equally good"
+    )
+    keep: int = Field(default=4, ge=1, le=64, description="configurations kept a target")
+    period: float = Field(default=0.02, ge=0.002, le=0.2, description="greatest time between trajectory samples, s")
+    gripper_open: float = Field(
+        default=0.044, ge=0.0, description="position of the finger joints of an open gripper, m"
+    )
 
 
 class ExecutionConfig(Config):
     """How execution is watched."""
 
-    stale_after: float = Field(0.5, gt=0.05, le=5.0, description="age of /joint_states that counts as lost, s")
-    start_tolerance: float = Field(0.05, gt=0.0, le=0.5, description="a trajectory must begin this near, rad")
-    goal_tolerance: float = Field(0.02, gt=0.0, le=0.5, description="joints must end this near, rad")
-    settle: float = Field(1.0, ge=0.0, le=10.0, description="time to come within the goal tolerance, s of robot time")
-    overtime: float = Field(5.0, gt=0.0, description="robot time beyond the duration before a motion is given up, s")
+    stale_after: float = Field(default=0.5, gt=0.05, le=5.0, description="age of /joint_states that counts as lost, s")
+    start_tolerance: float = Field(default=0.05, gt=0.0, le=0.5, description="a trajectory must begin this near, rad")
+    goal_tolerance: float = Field(default=0.02, gt=0.0, le=0.5, description="joints must end this near, rad")
+    settle: float = Field(
+        default=1.0, ge=0.0, le=10.0, description="time to come within the goal tolerance, s of robot time"
+    )
+    overtime: float = Field(
+        default=5.0, gt=0.0, description="robot time beyond the duration before a motion is given up, s"
+    )
 
 
 class MotionConfig(Config):
     """Parameters of the motion node."""
 
-    arms: tuple[str, ...] = Field(("left", "right"), min_length=1, description="names of the arms")
-    tool_link: str = Field("openarm_{arm}_hand_tcp", description="link that is moved to poses")
-    group: str = Field("{arm}_arm", description="SRDF group of an arm's postures")
+    arms: tuple[str, ...] = Field(default=("left", "right"), min_length=1, description="names of the arms")
+    tool_link: str = Field(default="openarm_{arm}_hand_tcp", description="link that is moved to poses")
+    group: str = Field(default="{arm}_arm", description="SRDF group of an arm's postures")
     controller: str = Field(
-        "/{arm}_joint_trajectory_controller/follow_joint_trajectory", description="FollowJointTrajectory action"
+        default="/{arm}_joint_trajectory_controller/follow_joint_trajectory", description="FollowJointTrajectory action"
     )
-    scene: str = Field("demo", description="scene whose table is an obstacle: a name, a path, or empty for none")
+    scene: str = Field(
+        default="demo", description="scene whose table is an obstacle: a name, a path, or empty for none"
+    )
     limits: LimitsConfig = Field(default_factory=LimitsConfig, description="of the joints")
     clearance: Clearance = Field(default_factory=Clearance, description="on free paths")
     straight: StraightClearance = Field(default_factory=StraightClearance, description="clearance on straight parts")

@@ -123,7 +123,7 @@ class Follower:
             # should it be accepted yet, it is withdrawn
             sent.add_done_callback(lambda f: f.result().cancel_goal_async() if f.result().accepted else None)
             raise
-        handle = sent.result()
+        handle: Any = sent.result()
         if not handle.accepted:
             raise OpenArmError(Code.EXECUTION_FAILED, f"{self._topic} rejected the trajectory")
         result = handle.get_result_async()

@@ -54,7 +54,7 @@ def to_named(arm: Arm, now: Situation, posture: str, around: Around) -> Trajecto
         OpenArmError: INVALID_ARGUMENT, listing the postures there are; as `to_joints`.
     """
     state = arm.description.group_state(arm.config.group.format(arm=arm.name), posture)
-    start = dict(zip(arm.names, now.start.tolist(), strict=True))
+    start: dict[str, float] = dict(zip(arm.names, now.start.tolist(), strict=True))
     goal = [state.get(name, start[name]) for name in arm.names]
     return to_joints(arm, now, goal, around, f"posture {posture!r}")
 

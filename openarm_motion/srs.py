@@ -205,7 +205,9 @@ def _read_geometry(kinematics: ArmKinematics) -> tuple[Array, Array]:
 def _meet(origins: Array, axes: Array, what: str) -> Array:
     """Point where lines meet, least squares; refuses lines that miss it."""
     P = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
-    point = np.linalg.lstsq(P.reshape(-1, 3), (P @ origins[:, :, None]).reshape(-1), rcond=None)[0]
+    point: Array = np.linalg.lstsq(P.reshape(-1, 3), (P @ origins[:, :, None]).reshape(-1), rcond=None)[0].astype(
+        np.float64
+    )
     miss = float(np.max(np.linalg.norm(np.einsum("kij,kj->ki", P, point - origins), axis=1)))
     if miss > _MEET:
         raise _not_srs(f"the axes of {what} miss a common point by {miss * 1e3:.3g} mm")

@@ -16,19 +16,27 @@ from openarm_perception.localize import LocalizerConfig
 class DetectNodeConfig(Config):
     """Parameters of the node `detector`."""
 
-    camera: str = Field("overhead", description="camera of cameras.yaml; gives frame and depth limits")
-    color_topic: str = Field("/{camera}/color/image_raw", description="colour image; {camera} is filled in")
-    depth_topic: str = Field("/{camera}/depth/image_raw", description="aligned depth image; {camera} is filled in")
-    info_topic: str = Field("/{camera}/depth/camera_info", description="CameraInfo of both; {camera} is filled in")
-    colors: str = Field("", description="YAML of the colours; empty is config/params/detector.yaml")
-    scene: str = Field("demo", description="scene whose table the objects stand on: a name or a path")
-    table_height: float | None = Field(
-        None, ge=-1.0, le=2.0, description="of the table in the base frame, m; without one, the scene's"
+    camera: str = Field(default="overhead", description="camera of cameras.yaml; gives frame and depth limits")
+    color_topic: str = Field(default="/{camera}/color/image_raw", description="colour image; {camera} is filled in")
+    depth_topic: str = Field(
+        default="/{camera}/depth/image_raw", description="aligned depth image; {camera} is filled in"
     )
-    policy: Policy = Field("score", description="which detection comes first: most certain, or nearest to the centre")
-    label: str = Field("", description="only objects of this name; empty takes all")
-    max_rate: float = Field(10.0, gt=0.0, le=60.0, description="most frames processed a second of the stamps, Hz")
-    transform_wait: float = Field(0.5, ge=0.0, le=5.0, description="longest wait for the camera's pose, s")
+    info_topic: str = Field(
+        default="/{camera}/depth/camera_info", description="CameraInfo of both; {camera} is filled in"
+    )
+    colors: str = Field(default="", description="YAML of the colours; empty is config/params/detector.yaml")
+    scene: str = Field(default="demo", description="scene whose table the objects stand on: a name or a path")
+    table_height: float | None = Field(
+        default=None, ge=-1.0, le=2.0, description="of the table in the base frame, m; without one, the scene's"
+    )
+    policy: Policy = Field(
+        default="score", description="which detection comes first: most certain, or nearest to the centre"
+    )
+    label: str = Field(default="", description="only objects of this name; empty takes all")
+    max_rate: float = Field(
+        default=10.0, gt=0.0, le=60.0, description="most frames processed a second of the stamps, Hz"
+    )
+    transform_wait: float = Field(default=0.5, ge=0.0, le=5.0, description="longest wait for the camera's pose, s")
     localizer: LocalizerConfig = Field(default_factory=LocalizerConfig)
 
     def table_top_z(self) -> float:
@@ -43,11 +51,13 @@ class DetectNodeConfig(Config):
 class CloudNodeConfig(Config):
     """Parameters of the node `cloud`."""
 
-    cameras: tuple[str, ...] = Field(("overhead", "wrist"), min_length=1, description="cameras of cameras.yaml")
-    depth_topic: str = Field("/{camera}/depth/image_raw", description="depth image; {camera} is filled in")
-    info_topic: str = Field("/{camera}/depth/camera_info", description="CameraInfo; {camera} is filled in")
-    points_topic: str = Field("/{camera}/depth/points", description="the cloud; {camera} is filled in")
-    organised: bool = Field(True, description="a point for every pixel, NaN where invalid; false: valid points only")
+    cameras: tuple[str, ...] = Field(default=("overhead", "wrist"), min_length=1, description="cameras of cameras.yaml")
+    depth_topic: str = Field(default="/{camera}/depth/image_raw", description="depth image; {camera} is filled in")
+    info_topic: str = Field(default="/{camera}/depth/camera_info", description="CameraInfo; {camera} is filled in")
+    points_topic: str = Field(default="/{camera}/depth/points", description="the cloud; {camera} is filled in")
+    organised: bool = Field(
+        default=True, description="a point for every pixel, NaN where invalid; false: valid points only"
+    )
 
 
 def camera_of(name: str) -> CameraConfig:

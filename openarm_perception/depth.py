@@ -24,8 +24,8 @@ DepthImage = NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.uint16 | np.f
 class DepthLimits(Config):
     """Depths that a camera can be trusted with."""
 
-    near: float = Field(0.05, gt=0.0, description="nearest depth that counts, m")
-    far: float = Field(3.0, gt=0.0, description="farthest depth that counts, m")
+    near: float = Field(default=0.05, gt=0.0, description="nearest depth that counts, m")
+    far: float = Field(default=3.0, gt=0.0, description="farthest depth that counts, m")
 
     @model_validator(mode="after")
     def _ordered(self) -> DepthLimits:

@@ -74,8 +74,8 @@ class ColorClass(Config):
 
     label: str = Field(min_length=1, description="name of the detections")
     hue_deg: tuple[float, float] = Field(description="from, to, degrees 0..360; from > to wraps through 0 (red)")
-    saturation: tuple[float, float] = Field((0.45, 1.0), description="from, to, 0..1")
-    value: tuple[float, float] = Field((0.12, 1.0), description="from, to, 0..1; the lower end bounds shadow")
+    saturation: tuple[float, float] = Field(default=(0.45, 1.0), description="from, to, 0..1")
+    value: tuple[float, float] = Field(default=(0.12, 1.0), description="from, to, 0..1; the lower end bounds shadow")
 
     @field_validator("hue_deg")
     @classmethod
@@ -96,11 +96,15 @@ class ColorDetectorConfig(Config):
     """Colours to look for and how large an object must be."""
 
     classes: tuple[ColorClass, ...] = Field(min_length=1, description="colours that are looked for")
-    min_area: int = Field(120, ge=9, description="smallest object, pixels")
-    cleanup: int = Field(3, ge=1, le=31, description="edge of the morphological kernel, pixels; odd")
-    sure_saturation: float = Field(0.7, gt=0.0, le=1.0, description="a pixel as saturated as this counts in full, 0..1")
-    truncated_factor: float = Field(0.5, ge=0.0, le=1.0, description="factor on the score of what the border cuts")
-    min_score: float = Field(0.3, ge=0.0, le=1.0, description="detections below are dropped, 0..1")
+    min_area: int = Field(default=120, ge=9, description="smallest object, pixels")
+    cleanup: int = Field(default=3, ge=1, le=31, description="edge of the morphological kernel, pixels; odd")
+    sure_saturation: float = Field(
+        default=0.7, gt=0.0, le=1.0, description="a pixel as saturated as this counts in full, 0..1"
+    )
+    truncated_factor: float = Field(
+        default=0.5, ge=0.0, le=1.0, description="factor on the score of what the border cuts"
+    )
+    min_score: float = Field(default=0.3, ge=0.0, le=1.0, description="detections below are dropped, 0..1")
 
     @field_validator("cleanup")
     @classmethod

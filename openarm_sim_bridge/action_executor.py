@@ -103,7 +103,7 @@ class ArmActionServer:
                 self._simulation.call(self._follower.cancel)
             self._running = handle
             self._feedback_timer.reset()
-            outcome: TrajectoryOutcome = await waiting.future
+            outcome: Any = await waiting.future
         except OpenArmError as error:
             result = error.result if isinstance(error, TrajectoryError) else TrajectoryResult.INVALID_GOAL
             outcome = TrajectoryOutcome(End.ABORTED, result, f"{error.code}: {error.message}")

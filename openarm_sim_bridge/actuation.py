@@ -38,15 +38,19 @@ _MAX_DELAY_NS = 600_000_000_000
 class TrajectoryConfig(Config):
     """How arms follow trajectories and position commands."""
 
-    path_tolerance: float = Field(0.05, gt=0.0, description="default deviation from the path, rad")
-    goal_tolerance: float = Field(0.02, gt=0.0, description="default deviation from the goal, rad")
-    goal_time: float = Field(1.0, gt=0.0, description="default time after the end to reach the goal, s")
-    stopped_velocity: float = Field(0.05, gt=0.0, description="at the goal the joints are slower than this, rad/s")
-    stop_time: float = Field(0.15, gt=0.0, le=2.0, description="a cancelled arm comes to rest in this time, s")
-    blend_time: float = Field(0.2, gt=0.0, description="a small offset at the start fades in this time, s")
-    feed_forward: bool = Field(True, description="lead moving targets by the lag of the actuators")
-    command_velocity: float = Field(1.5, gt=0.0, description="largest speed towards a /joint_commands target, rad/s")
-    command_acceleration: float = Field(8.0, gt=0.0, description="and its largest acceleration, rad/s2")
+    path_tolerance: float = Field(default=0.05, gt=0.0, description="default deviation from the path, rad")
+    goal_tolerance: float = Field(default=0.02, gt=0.0, description="default deviation from the goal, rad")
+    goal_time: float = Field(default=1.0, gt=0.0, description="default time after the end to reach the goal, s")
+    stopped_velocity: float = Field(
+        default=0.05, gt=0.0, description="at the goal the joints are slower than this, rad/s"
+    )
+    stop_time: float = Field(default=0.15, gt=0.0, le=2.0, description="a cancelled arm comes to rest in this time, s")
+    blend_time: float = Field(default=0.2, gt=0.0, description="a small offset at the start fades in this time, s")
+    feed_forward: bool = Field(default=True, description="lead moving targets by the lag of the actuators")
+    command_velocity: float = Field(
+        default=1.5, gt=0.0, description="largest speed towards a /joint_commands target, rad/s"
+    )
+    command_acceleration: float = Field(default=8.0, gt=0.0, description="and its largest acceleration, rad/s2")
 
 
 class End(StrEnum):

@@ -16,17 +16,20 @@ from openarm_sim_bridge.model import PhysicsConfig
 class BridgeConfig(Config):
     """What is simulated and how it is told."""
 
-    scene: str = Field("demo", min_length=1, description="name or path of a scene, or random")
-    seed: int = Field(0, ge=0, description="of a random scene")
+    scene: str = Field(default="demo", min_length=1, description="name or path of a scene, or random")
+    seed: int = Field(default=0, ge=0, description="of a random scene")
     mount_seed: int = Field(
-        -1, ge=-1, description="of the errors of the simulated camera mounts; -1 or none: nominal mounts"
+        default=-1, ge=-1, description="of the errors of the simulated camera mounts; -1 or none: nominal mounts"
     )
-    cameras: str = Field("", description="path of a cameras YAML; empty: that of the suite")
-    depth_encoding: Literal["16UC1", "32FC1"] = Field("16UC1", description="whole millimetres, or metres")
-    speed: float = Field(1.0, ge=0.0, le=100.0, description="simulated seconds a second; 0: as fast as it can")
-    paused: bool = Field(False, description="start with simulated time standing still")
-    tf_rate: float = Field(50.0, gt=0.0, le=100.0, description="of /tf, Hz of simulated time")
-    ground_truth_rate: float = Field(20.0, gt=0.0, le=100.0, description="of the judge's topic, Hz of simulated time")
+    cameras: str = Field(default="", description="path of a cameras YAML; empty: that of the suite")
+    depth_encoding: Literal["16UC1", "32FC1"] = Field(default="16UC1", description="whole millimetres, or metres")
+    images: bool = Field(default=True, description="whether there are cameras; false saves their process")
+    speed: float = Field(default=1.0, ge=0.0, le=100.0, description="simulated seconds a second; 0: as fast as it can")
+    paused: bool = Field(default=False, description="start with simulated time standing still")
+    tf_rate: float = Field(default=50.0, gt=0.0, le=100.0, description="of /tf, Hz of simulated time")
+    ground_truth_rate: float = Field(
+        default=20.0, gt=0.0, le=100.0, description="of the judge's topic, Hz of simulated time"
+    )
     physics: PhysicsConfig = PhysicsConfig()
     trajectory: TrajectoryConfig = TrajectoryConfig()
     gripper: GripperConfig = GripperConfig()

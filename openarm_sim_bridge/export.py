@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import mujoco
@@ -101,7 +101,7 @@ def render(
         if leader in q:
             data.qpos[model.joint(name).qposadr[0]] = q[leader]
     mujoco.mj_forward(model, data)
-    camera: mujoco.MjvCamera | str = view
+    camera: Any = view
     if view in VIEWS:
         camera = mujoco.MjvCamera()
         camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = VIEWS[view]

@@ -26,12 +26,12 @@ _LIMIT_SLACK = 1e-4
 class GripperConfig(Config):
     """How grippers move and when they are done."""
 
-    velocity: float = Field(0.075, gt=0.0, description="largest speed of a finger, m/s: 0.044 m in 0.6 s")
-    acceleration: float = Field(1.0, gt=0.0, description="largest acceleration of a finger, m/s2")
-    goal_tolerance: float = Field(0.001, gt=0.0, description="a finger this near its goal has reached it, m")
-    stall_velocity: float = Field(0.001, gt=0.0, description="a finger slower than this does not move, m/s")
-    stall_time: float = Field(0.2, gt=0.0, description="for how long it must not move to have stalled, s")
-    timeout: float = Field(3.0, gt=0.0, description="after the ramp, neither reached nor stalled: aborted, s")
+    velocity: float = Field(default=0.075, gt=0.0, description="largest speed of a finger, m/s: 0.044 m in 0.6 s")
+    acceleration: float = Field(default=1.0, gt=0.0, description="largest acceleration of a finger, m/s2")
+    goal_tolerance: float = Field(default=0.001, gt=0.0, description="a finger this near its goal has reached it, m")
+    stall_velocity: float = Field(default=0.001, gt=0.0, description="a finger slower than this does not move, m/s")
+    stall_time: float = Field(default=0.2, gt=0.0, description="for how long it must not move to have stalled, s")
+    timeout: float = Field(default=3.0, gt=0.0, description="after the ramp, neither reached nor stalled: aborted, s")
 
 
 @dataclass(frozen=True)

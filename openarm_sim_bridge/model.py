@@ -54,30 +54,36 @@ class PhysicsConfig(Config):
     to `finger_force`.
     """
 
-    timestep: float = Field(0.002, gt=0.0, le=0.01, description="s; the control tick of 10 ms is a multiple of it")
-    integrator: Literal["euler", "implicit", "implicitfast"] = Field("implicitfast", description="of MuJoCo")
-    cone: Literal["pyramidal", "elliptic"] = Field("elliptic", description="friction cone")
-    impratio: float = Field(10.0, ge=1.0, le=1000.0, description="friction impedance over normal impedance")
-    iterations: int = Field(100, ge=1, le=1000, description="of the solver, at most")
-    noslip_iterations: int = Field(4, ge=0, le=100, description="of the no-slip pass")
-    jacobian: Literal["dense", "sparse", "auto"] = Field("dense", description="of the constraints")
-    contact_solref: tuple[float, float] = Field((0.005, 1.0), description="time constant (s) and damping ratio")
-    contact_solimp: tuple[float, float, float, float, float] = Field(
-        (0.95, 0.99, 0.001, 0.5, 2.0), description="impedance of contacts and of the finger coupling"
+    timestep: float = Field(
+        default=0.002, gt=0.0, le=0.01, description="s; the control tick of 10 ms is a multiple of it"
     )
-    pad_friction: Friction = Field((1.0, 0.01, 0.001), description="finger pads: sliding, torsional (m), rolling (m)")
-    pad_condim: Literal[1, 3, 4, 6] = Field(4, description="contact dimensions of the pads")
-    object_friction: Friction = Field((0.8, 0.005, 0.0001), description="objects, table: sliding, torsional, rolling")
-    object_condim: Literal[1, 3, 4, 6] = Field(4, description="contact dimensions of objects")
-    arm_kp: Seven = Field((230, 230, 190, 190, 100, 100, 100), description="N m/rad, joints 1 to 7")
-    arm_kv: Seven = Field((2.7, 2.7, 2.2, 2.2, 1.5, 1.5, 1.5), description="N m s/rad")
-    arm_armature: Seven = Field((0.0081, 0.0081, 0.16, 0.16, 0.01, 0.01, 0.01), description="kg m2")
-    finger_kp: float = Field(2000.0, gt=0.0, description="N/m")
-    finger_kv: float = Field(40.0, ge=0.0, description="N s/m")
-    finger_force: float = Field(30.0, gt=0.0, description="N; each pad presses with half of it")
-    finger_armature: float = Field(0.05, ge=0.0, description="kg")
+    integrator: Literal["euler", "implicit", "implicitfast"] = Field(default="implicitfast", description="of MuJoCo")
+    cone: Literal["pyramidal", "elliptic"] = Field(default="elliptic", description="friction cone")
+    impratio: float = Field(default=10.0, ge=1.0, le=1000.0, description="friction impedance over normal impedance")
+    iterations: int = Field(default=100, ge=1, le=1000, description="of the solver, at most")
+    noslip_iterations: int = Field(default=4, ge=0, le=100, description="of the no-slip pass")
+    jacobian: Literal["dense", "sparse", "auto"] = Field(default="dense", description="of the constraints")
+    contact_solref: tuple[float, float] = Field(default=(0.005, 1.0), description="time constant (s) and damping ratio")
+    contact_solimp: tuple[float, float, float, float, float] = Field(
+        default=(0.95, 0.99, 0.001, 0.5, 2.0), description="impedance of contacts and of the finger coupling"
+    )
+    pad_friction: Friction = Field(
+        default=(1.0, 0.01, 0.001), description="finger pads: sliding, torsional (m), rolling (m)"
+    )
+    pad_condim: Literal[1, 3, 4, 6] = Field(default=4, description="contact dimensions of the pads")
+    object_friction: Friction = Field(
+        default=(0.8, 0.005, 0.0001), description="objects, table: sliding, torsional, rolling"
+    )
+    object_condim: Literal[1, 3, 4, 6] = Field(default=4, description="contact dimensions of objects")
+    arm_kp: Seven = Field(default=(230, 230, 190, 190, 100, 100, 100), description="N m/rad, joints 1 to 7")
+    arm_kv: Seven = Field(default=(2.7, 2.7, 2.2, 2.2, 1.5, 1.5, 1.5), description="N m s/rad")
+    arm_armature: Seven = Field(default=(0.0081, 0.0081, 0.16, 0.16, 0.01, 0.01, 0.01), description="kg m2")
+    finger_kp: float = Field(default=2000.0, gt=0.0, description="N/m")
+    finger_kv: float = Field(default=40.0, ge=0.0, description="N s/m")
+    finger_force: float = Field(default=30.0, gt=0.0, description="N; each pad presses with half of it")
+    finger_armature: float = Field(default=0.05, ge=0.0, description="kg")
     gravity_compensation: float = Field(
-        1.0, ge=0.0, le=1.0, description="share of the arms' own weight that is carried"
+        default=1.0, ge=0.0, le=1.0, description="share of the arms' own weight that is carried"
     )
 
 
