@@ -63,6 +63,10 @@ class RobotStateBuffer:
             raise OpenArmError(Code.NOT_READY, "no /joint_states yet; is the bridge (or the robot driver) running?")
         return self._states[-1]
 
+    def between(self, start_ns: int, end_ns: int) -> list[tuple[int, dict[str, float]]]:
+        """Return the joint states from one stamp to another, both included, oldest first."""
+        return [state for state in self._states if start_ns <= state[0] <= end_ns]
+
     def joints_at(self, t_ns: int) -> dict[str, float]:
         """Joint positions at a stamp, rad or m by joint name.
 

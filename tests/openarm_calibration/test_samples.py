@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gate, sample set, session file, verdict."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from openarm_calibration.gate import GateConfig, match
+from openarm_calibration.refine import mount_error
+from openarm_calibration.samples import load_session, without
+from openarm_calibration.solve import solve
+from openarm_calibration.verdict import assess, estimate_delay, side_by_side
+from openarm_common.description import RobotDescription
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot_state import RobotStateBuffer
+
+MS = 1_000_000
+NAMES = ("openarm_right_joint1", "openarm_right_joint2")
+
+
+def buffer(until_ms: int = 1000, speed: float = 0.0) -> RobotStateBuffer:
+    out = RobotStateBuffer(RobotDescription.load())
+    for t in range(0, until_ms + 1, 10):
+        out.add_joint_state(t * MS, NAMES, (0.1, 0.2 + speed * t * 1e-3))
+    return out
+
+
+def test_a44_a72_an_image_6_ms_after_the_last_joint_state_is_rejected_and_4_ms_is_not() -> None:
+    """And 20 ms; an image between two joint states is interpolated."""
+    for late, accepted in ((4, True), (6, False), (20, False)):
+        if accepted:
+            assert match(buffer(), (1000 + late) * MS, NAMES, GateConfig()).t_joints_ns == 1000 * MS
+        else:
+            with pytest.raises(OpenArmError, match=rf"nearest is -{late}.0 ms away") as caught:
+                match(buffer(), (1000 + late) * MS, NAMES, GateConfig())
+            assert caught.value.code == Code.STALE_DATA
+    between = match(buffer(1000, 0.001), 503 * MS, NAMES, GateConfig())
+    assert between.joints[NAMES[1]] == pytest.approx(0.2 + 0.001 * 0.503)
+
+
+def test_a44_a_moving_robot_is_rejected_with_the_joint_and_its_speed() -> None:
+    with pytest.raises(OpenArmError, match=r"openarm_right_joint2 at 0\.10\d rad/s, at most 0\.005") as caught:
+        match(buffer(1000, 0.1), 900 * MS, NAMES, GateConfig())
+    assert caught.value.code == Code.MOVING
+    assert match(buffer(1000, 0.1), 900 * MS, NAMES, GateConfig(), moving=True).speed == pytest.approx(0.1, rel=0.1)
+
+
+def test_one_joint_state_does_not_say_whether_the_robot_stands() -> None:
+    with pytest.raises(OpenArmError, match=r"1 joint states in the 0.2 s before the image"):
+        match(buffer(0), 0, NAMES, GateConfig())
+
+
+@pytest.mark.parametrize("setup", ["in_hand", "to_hand"])
+def test_a33_a34_a_session_solves_to_the_true_mount_and_again_from_its_file(session, setup, tmp_path: Path) -> None:
+    """Wrist and overhead camera on the arm's own kinematics; bit-equal after saving and loading."""
+    known = session(setup)
+    solution = solve(known.samples.problem())
+    offset, angle = mount_error(solution.estimate.X[0], known.X)
+    assert offset < 0.3e-3
+    assert angle < math.radians(0.03)
+    path = tmp_path / "session.npz"
+    digest = known.samples.save(path)
+    again, read = load_session(path, known.description)
+    assert read == digest
+    assert [s.name for s in again.samples] == [s.name for s in known.samples.samples]
+    np.testing.assert_array_equal(solve(again.problem()).estimate.X, solution.estimate.X)
+
+
+def test_samples_are_removed_by_name_and_a_wrong_name_lists_them(session) -> None:
+    samples = session(count=3).samples
+    with pytest.raises(OpenArmError, match="no sample 's9'; samples: s001, s002, s003"):
+        samples.remove("s9")
+    assert samples.remove("s002").name == "s002"
+    assert samples.remove("").name == "s003"
+    assert len(samples) == 1
+
+
+@pytest.mark.parametrize("damage", ["cut", "text", "empty", "pickle", "missing"])
+def test_a_damaged_session_is_refused(session, tmp_path: Path, damage: str) -> None:
+    known = session(count=3)
+    path = tmp_path / "s.npz"
+    known.samples.save(path)
+    data = path.read_bytes()
+    if damage == "cut":
+        path.write_bytes(data[: len(data) // 2])
+    elif damage == "text":
+        path.write_text("hello")
+    elif damage == "empty":
+        path.write_bytes(b"")
+    elif damage == "pickle":
+        np.savez(path, head=np.array([{}], dtype=object))
+    else:
+        path.unlink()
+    with pytest.raises(OpenArmError, match=r"session file|no session file") as caught:
+        load_session(path, known.description)
+    assert caught.value.code == Code.CONFIG_INVALID
+
+
+def test_n09_a_delay_of_20_ms_is_estimated_to_1_ms(session) -> None:
+    """Images that are 20 ms old at their stamps, of a moving arm; a standing one says nothing of it."""
+    moving = session(count=15, delay=0.020, speed=0.3)
+    delay, sigma = estimate_delay(moving.samples)
+    assert delay == pytest.approx(0.020, abs=1e-3)
+    assert sigma < 1e-3
+    assert estimate_delay(session(count=5).samples) == (0.0, math.inf)
+
+
+def test_p28_the_verdict_has_held_out_errors_and_reasons(session) -> None:
+    """A good set passes; few samples, a wrong board size and a drift are told."""
+    known = session(px=0.05)
+    problem = known.samples.problem()
+    solution = solve(problem)
+    good = assess(problem, solution, stored=known.X)
+    assert good.grade == "pass", good.reasons
+    assert good.figures["leave_one_out"] < 0.5e-3
+    assert 0.0 < good.figures["five_fold_px"] < 0.5
+    assert abs(good.figures["scale"] - 1.0) < 0.003
+    moved = known.X.copy()
+    moved[0, 3] += 0.008
+    drifted = assess(problem, solution, stored=moved)
+    assert drifted.grade == "warn"
+    assert any("8." in reason and "from what is stored" in reason for reason in drifted.reasons)
+    few = without(known.samples, [s.name for s in known.samples.samples[5:]], known.description).problem()
+    assert any("5 poses, 10 are wanted" in reason for reason in assess(few, solve(few)).reasons)
+    table = side_by_side(problem, solution)
+    assert set(table) == {"TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS", "SHAH", "LI", "REFINED"}
+
+
+def test_an_unknown_link_in_a_session_lists_the_links(session) -> None:
+    known = session(count=3)
+    head = known.samples.head.model_copy(update={"carrier": "nowhere"})
+    with pytest.raises(OpenArmError, match=r"no link 'nowhere'; links: .*openarm_right_link7"):
+        type(known.samples)(head, known.description)
