@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from openarm_bringup import environment, report, runs
 from openarm_bringup.graph import Graph, load_graph
 from openarm_bringup.session import running_graph
-from openarm_bringup.trial import Ask, Trial, run_trial
+from openarm_bringup.trial import Ask, Trial, choose_target, run_trial
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import load_scene
 
@@ -98,13 +98,16 @@ def run_demo(options: DemoOptions, listeners: Listeners | None = None) -> DemoRe
     """Run the demonstration to its end; the graph is stopped whatever happens.
 
     Raises:
-        OpenArmError: What kept the graph from starting; a failed grasp is a result, not an error.
+        OpenArmError: What is wrong with the options; what happens later is in the result.
     """
     domain = free_domain() if options.domain is None else options.domain
     overrides = {"domain": domain, "scene": "random" if options.seeds else options.scene}
     if options.seeds:
         overrides["seed"] = options.seeds[0]
     graph = load_graph(options.graph, overrides=overrides, sets=options.sets)
+    # Faults of the call show before anything is started.
+    for seed in options.seeds or (graph.seed,):
+        choose_target(load_scene(graph.scene, seed), options.ask.label)
     result = DemoResult(runs.new_run_dir())
     try:
         asyncio.run(_demo(options, graph, result, listeners or Listeners()))
@@ -187,11 +190,13 @@ class Studio:
         self._folder = result.run_dir
         self._film = Film(result.run_dir / "grasp.mp4", load_cameras()["spectator"].rate)
         self.observer: Observer | None = None
+        self._filming = False
 
     def begin(self) -> None:
         """Start filming and take the picture before; called in the thread of the trials."""
         if self.observer is None:
             return
+        self._filming = True
         self.observer.look(SPECTATOR, self._film.add)
         self._save_next(SPECTATOR, "before.png")
         self.observer.look(DETECTION)
@@ -205,7 +210,7 @@ class Studio:
 
     def finish(self) -> None:
         """Take the last picture and finish the film."""
-        if self.observer is not None:
+        if self.observer is not None and self._filming:
             self._save_newest("after.png")
             self.observer.look_away(SPECTATOR)
         if self._film.close():

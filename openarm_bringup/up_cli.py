@@ -41,7 +41,9 @@ def up(
     overrides = {"scene": scene, "seed": seed, "mount_seed": mount_seed, "domain": domain, "discovery": discovery}
     loaded = load_graph(graph, overrides=overrides, sets=set_)
     from openarm_bringup.runs import new_run_dir
+    from openarm_common.scene import load_scene
 
+    load_scene(loaded.scene, loaded.seed)  # a scene that does not fit is refused before anything starts
     return asyncio.run(_up(loaded, new_run_dir()))
 
 
