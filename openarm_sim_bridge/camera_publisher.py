@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,15 +14,15 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from openarm_common.cameras import CameraConfig
 from openarm_common.convert import ENCODINGS, info_from_intrinsics, ns_to_stamp
-from openarm_common.errors import OpenArmError
 from openarm_common.node import QOS_SENSOR
-from openarm_sim_bridge.cameras import Colour, Depth, RenderThread
-from openarm_sim_bridge.pacing import RateDivider
-from openarm_sim_bridge.state_publisher import until_shutdown
-from openarm_sim_bridge.world import Snapshot, World
+from openarm_sim_bridge.cameras import SnapshotRenderer
+from openarm_sim_bridge.handover import CameraSetup
 
-#: The simulation begins after this long at the latest, images or not, s.
-_WARM_UP_S = 20.0
+
+def topic_names(camera: CameraConfig) -> tuple[str, ...]:
+    """Topics of a camera before any remapping."""
+    streams = ("color", "depth") if camera.depth else ("color",)
+    return tuple(f"/{camera.name}/{stream}/{kind}" for stream in streams for kind in ("image_raw", "camera_info"))
 
 
 @dataclass
@@ -39,7 +38,7 @@ class _Stream:
     wants_info: bool = False
 
     @classmethod
-    def make(cls, node: Node, camera: CameraConfig, topic: str, encoding: str) -> _Stream:
+    def make(cls, node: Node, setup: CameraSetup, camera: CameraConfig, stream: str, encoding: str) -> _Stream:
         dtype, channels = ENCODINGS[encoding]
         message = Image(height=camera.height, width=camera.width, encoding=encoding)
         message.is_bigendian = int(sys.byteorder == "big")
@@ -47,17 +46,19 @@ class _Stream:
         message.header.frame_id = camera.optical_frame
         message.data = bytes(message.step * camera.height)
         shape = (camera.height, camera.width, channels) if channels > 1 else (camera.height, camera.width)
+        image, info = (setup.topics[f"/{camera.name}/{stream}/{kind}"] for kind in ("image_raw", "camera_info"))
         return cls(
-            image=node.create_publisher(Image, f"/{camera.name}/{topic}/image_raw", QOS_SENSOR),
-            info=node.create_publisher(CameraInfo, f"/{camera.name}/{topic}/camera_info", QOS_SENSOR),
+            image=node.create_publisher(Image, image, QOS_SENSOR),
+            info=node.create_publisher(CameraInfo, info, QOS_SENSOR),
             message=message,
             info_message=info_from_intrinsics(camera.intrinsics, camera.optical_frame, 0),
             pixels=np.frombuffer(message.data, dtype=dtype).reshape(shape),
         )
 
-    def poll(self) -> None:
+    def poll(self) -> bool:
         self.wants_image = self.image.get_subscription_count() > 0
         self.wants_info = self.info.get_subscription_count() > 0
+        return self.wants_image or self.wants_info
 
     def publish(self, t_ns: int, *, image: bool) -> None:
         stamp = ns_to_stamp(t_ns)
@@ -73,7 +74,6 @@ class _Stream:
 class _Camera:
     colour: _Stream
     depth: _Stream | None
-    ticks: RateDivider
     streams: tuple[_Stream, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -81,74 +81,44 @@ class _Camera:
 
 
 class CameraPublisher:
-    """Topics of all cameras, and the thread that draws for them.
+    """Topics of all cameras.
 
     Args:
         node: Owner of the publishers.
-        cameras: By name.
-        first: A state of the world to warm up with; the constructor returns when that is done.
-        depth_encoding: 16UC1 (mm) or 32FC1 (m).
-        failed: Called (in the thread that draws) when it can't draw at all.
+        setup: The cameras, how depth is told, names of the topics.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        cameras: Mapping[str, CameraConfig],
-        first: Snapshot,
-        depth_encoding: str,
-        failed: Callable[[OpenArmError], None],
-    ) -> None:
-        self._context = node.context
+    def __init__(self, node: Node, setup: CameraSetup) -> None:
         self._cameras = {
-            name: _Camera(
-                _Stream.make(node, camera, "color", "rgb8"),
-                _Stream.make(node, camera, "depth", depth_encoding) if camera.depth else None,
-                RateDivider(camera.rate),
+            camera.name: _Camera(
+                _Stream.make(node, setup, camera, "color", "rgb8"),
+                _Stream.make(node, setup, camera, "depth", setup.depth_encoding) if camera.depth else None,
             )
-            for name, camera in cameras.items()
+            for camera in setup.cameras
         }
-        self._thread = RenderThread(cameras, first, self._buffers, self._deliver, failed)
-        self._thread.start()
-        self._thread.warm.wait(_WARM_UP_S)
 
-    @property
-    def rendered(self) -> dict[str, int]:
-        """Frames drawn so far, by camera."""
-        return dict(self._thread.rendered)
+    def poll(self) -> tuple[str, ...]:
+        """Look who listens; return the cameras that anyone listens to."""
+        watched = {name: [stream.poll() for stream in camera.streams] for name, camera in self._cameras.items()}
+        return tuple(name for name, streams in watched.items() if any(streams))
 
-    @property
-    def dropped(self) -> int:
-        """Frames that were not drawn because the machine was too slow."""
-        return self._thread.dropped
+    def wants_image(self, name: str) -> bool:
+        """Whether anyone listens to an image of the camera, not only to its CameraInfo."""
+        return any(stream.wants_image for stream in self._cameras[name].streams)
 
-    def poll(self) -> None:
-        """Look who listens; for a timer of a few hertz."""
-        for camera in self._cameras.values():
-            for stream in camera.streams:
-                stream.poll()
-
-    def tick(self, world: World) -> None:
-        """Hand the tick to the cameras that are due and watched; in the thread of the simulation, never waits."""
-        due = [camera for camera in self._cameras.items() if camera[1].ticks.due(world.t_ns)]
-        to_draw = [name for name, camera in due if any(stream.wants_image for stream in camera.streams)]
-        if to_draw:
-            self._thread.offer(world.snapshot(), to_draw)
-        for name, camera in due:
-            if name not in to_draw:
-                for stream in camera.streams:
-                    stream.publish(world.t_ns, image=False)
-
-    def close(self) -> None:
-        """Stop drawing."""
-        self._thread.stop()
-
-    def _buffers(self, name: str) -> tuple[Colour, Depth | None]:
+    def draw(self, renderer: SnapshotRenderer, name: str) -> None:
+        """Draw a camera's view of the loaded state into its messages."""
         camera = self._cameras[name]
         wants_depth = camera.depth is not None and camera.depth.wants_image
-        return camera.colour.pixels, camera.depth.pixels if camera.depth is not None and wants_depth else None
+        renderer.draw(name, camera.colour.pixels, camera.depth.pixels if camera.depth and wants_depth else None)
 
-    def _deliver(self, name: str, t_ns: int) -> None:
-        with until_shutdown(self._context):
-            for stream in self._cameras[name].streams:
-                stream.publish(t_ns, image=True)
+    def publish(self, name: str, t_ns: int, *, drawn: bool) -> None:
+        """Publish what listeners want of a camera.
+
+        Args:
+            name: Of the camera.
+            t_ns: Stamp.
+            drawn: False when there is a CameraInfo only.
+        """
+        for stream in self._cameras[name].streams:
+            stream.publish(t_ns, image=drawn)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drawing what the cameras see, in a thread of its own, from snapshots of single control ticks.
+"""Drawing what the cameras see, from snapshots of single control ticks.
 
 Depth is planar: the distance along the optical axis, not along the ray. It is given in whole millimetres (uint16) with
 0 where nothing lies between the near and far limit of the camera, as a RealSense camera does, or in metres (float32)
@@ -9,8 +9,7 @@ with NaN there. Row 0 of an image is the top.
 from __future__ import annotations
 
 import os
-import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -209,92 +208,3 @@ class _Drawn:
             near=float(model.vis.map.znear * extent),
             far=float(model.vis.map.zfar * extent),
         )
-
-
-class RenderThread:
-    """Draws the newest snapshot for the cameras that are due; a snapshot that comes too fast replaces the one before.
-
-    Setting up OpenGL takes a third of a second and keeps the interpreter from other threads meanwhile, so it is done at
-    the start, with a frame of every camera: `warm` says when that is over.
-
-    Args:
-        cameras: All cameras, by name.
-        first: Drawn for nobody, to warm up.
-        buffers: Asked for the arrays (colour, depth or None) to fill before each frame.
-        deliver: Called with the camera's name and the stamp when they are filled; in this thread.
-        failed: Called once when the thread ends because it can't draw; in this thread.
-    """
-
-    def __init__(
-        self,
-        cameras: Mapping[str, CameraConfig],
-        first: Snapshot,
-        buffers: Callable[[str], tuple[Colour, Depth | None]],
-        deliver: Callable[[str, int], None],
-        failed: Callable[[OpenArmError], None],
-    ) -> None:
-        self._cameras = dict(cameras)
-        self._buffers = buffers
-        self._deliver = deliver
-        self._failed = failed
-        self._first = first
-        self._waiting: tuple[Snapshot, frozenset[str]] | None = None
-        self._changed = threading.Condition()
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="render", daemon=True)
-        self.warm = threading.Event()
-        self.rendered = dict.fromkeys(cameras, 0)
-        self.dropped = 0
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop the thread and wait for it."""
-        with self._changed:
-            self._stopping = True
-            self._changed.notify()
-        if self._thread.is_alive():
-            self._thread.join()
-
-    def offer(self, snapshot: Snapshot, due: Iterable[str]) -> None:
-        """Hand over a snapshot to draw for some cameras; never waits for a frame to be drawn."""
-        names = frozenset(due)
-        with self._changed:
-            if self._waiting is not None:
-                self.dropped += len(self._waiting[1])
-                names |= self._waiting[1]
-            self._waiting = (snapshot, names)
-            self._changed.notify()
-
-    def _run(self) -> None:
-        renderer: SnapshotRenderer | None = None
-        try:
-            renderer = SnapshotRenderer(self._cameras)
-            renderer.load(self._first)
-            for name in self._cameras:
-                renderer.draw(name, *self._buffers(name))
-            self.warm.set()
-            while (work := self._next()) is not None:
-                snapshot, due = work
-                renderer.load(snapshot)
-                for name in sorted(due):
-                    renderer.draw(name, *self._buffers(name))
-                    self.rendered[name] += 1
-                    self._deliver(name, snapshot.t_ns)
-        except OpenArmError as error:
-            self._failed(error)
-        except Exception as error:  # a dead thread must not go unnoticed
-            self._failed(OpenArmError(Code.INTERNAL, f"drawing failed: {error!r}"))
-        finally:
-            self.warm.set()
-            if renderer is not None:
-                renderer.close()
-
-    def _next(self) -> tuple[Snapshot, frozenset[str]] | None:
-        """Wait for a snapshot; None when the thread shall end."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._stopping or self._waiting is not None)
-            work, self._waiting = self._waiting, None
-            return None if self._stopping else work

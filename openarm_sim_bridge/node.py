@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node `mujoco_bridge`: a simulated robot behind the topics and actions of the real one.
 
-Threads: physics (steps the world at 100 Hz, publishes its state), render (draws the cameras that are watched), and the
-executor (services, actions, commands). They share only what `Simulation.call` and `RenderThread.offer` hand over.
+Threads: physics (steps the world at 100 Hz, publishes its state) and the executor (services, actions, commands). They
+share only what `Simulation.call` hands over. The cameras are drawn and published by a process of their own, the node
+`mujoco_cameras`, which is handed the states to draw (`CameraFeed`).
 """
 
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import traceback
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +20,30 @@ import mujoco
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
-from openarm_common.cameras import load_cameras
+from openarm_common.cameras import CameraConfig, load_cameras
 from openarm_common.errors import OpenArmError
 from openarm_common.node import QOS_COMMAND, BaseNode, reliable, run
+from openarm_common.resources import config_dir
 from openarm_common.scene import Scene, load_scene
 from openarm_sim_bridge.action_executor import ArmActionServer, GripperActionServer
-from openarm_sim_bridge.camera_publisher import CameraPublisher
+from openarm_sim_bridge.camera_feed import CameraFeed
+from openarm_sim_bridge.camera_publisher import topic_names
 from openarm_sim_bridge.config import BridgeConfig
 from openarm_sim_bridge.controller import RobotController
+from openarm_sim_bridge.handover import CameraSetup
 from openarm_sim_bridge.service_executor import SimulationServices
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.stage import Stage
 from openarm_sim_bridge.state_publisher import StatePublisher, until_shutdown
-from openarm_sim_bridge.world import JointReadout
+from openarm_sim_bridge.world import JointReadout, Snapshot
 
 WATCH_PERIOD_S = 0.2
+#: The simulation begins after this long at the latest, images or not, s.
+WARM_UP_S = 20.0
+#: Variable with the file of Fast DDS settings.
+PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+#: Where `make` keeps the settings for large messages, which only the process of the cameras needs.
+LARGE_PROFILE = "OPENARM_LARGE_MESSAGES_PROFILE"
 REPORT_PERIOD_S = 1.0
 #: Slower than this share of the asked speed is told as a fault.
 _SLOW = 0.9
@@ -59,8 +71,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._states = StatePublisher(
             self, self.description, world.joint_names, config.tf_rate, config.ground_truth_rate
         )
-        self._render_fault = ""
-        self._images = CameraPublisher(self, cameras, world.snapshot(), config.depth_encoding, self._on_render_failure)
+        self._images = self._camera_feed(cameras, world.snapshot()) if config.images else None
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
 
         self.create_subscription(JointState, "/joint_commands", self._on_command, QOS_COMMAND)
@@ -71,10 +82,13 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._sim_services = SimulationServices(self, stage, scene, self._simulation, self._on_scene)
 
         self._warned: set[str] = set()
-        self._drawn: dict[str, int] = self._images.rendered
-        self.create_timer(WATCH_PERIOD_S, self._images.poll, clock=self.wall_clock)
+        self._drawn = dict.fromkeys(cameras, 0)
         self.create_timer(REPORT_PERIOD_S, self._report, clock=self.wall_clock)
 
+        if self._images is not None:
+            self.create_timer(WATCH_PERIOD_S, self._images.poll, clock=self.wall_clock)
+            if not self._images.wait_ready(WARM_UP_S):
+                self.get_logger().warning(f"no image yet after {WARM_UP_S:.0f} s; the simulation begins without")
         self._on_scene(scene)
         self._simulation.start()
         self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation is running")
@@ -82,7 +96,8 @@ class MujocoBridge(BaseNode[BridgeConfig]):
     def close(self) -> None:
         """Stop physics and drawing, then the rest."""
         self._simulation.stop()
-        self._images.close()
+        if self._images is not None:
+            self._images.close()
         for server in (*self._arms, *self._grippers):
             server.destroy()
         super().close()
@@ -91,7 +106,8 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         """End of a tick, in the thread of the simulation."""
         with until_shutdown(self.context):
             self._states.publish(state, self._simulation.world)
-            self._images.tick(self._simulation.world)
+            if self._images is not None:
+                self._images.tick(self._simulation.world)
 
     def _on_command(self, message: JointState) -> None:
         """Position targets; a part of the joints will do."""
@@ -114,9 +130,17 @@ class MujocoBridge(BaseNode[BridgeConfig]):
     def _on_scene(self, scene: Scene) -> None:
         self._states.publish_static(self.description, scene.table.top_z)
 
-    def _on_render_failure(self, error: OpenArmError) -> None:
-        self._render_fault = str(error)
-        self.get_logger().error(f"no images: {error}")
+    def _camera_feed(self, cameras: Mapping[str, CameraConfig], first: Snapshot) -> CameraFeed:
+        topics = [name for camera in cameras.values() for name in topic_names(camera)]
+        setup = CameraSetup(
+            cameras=tuple(cameras.values()),
+            depth_encoding=self.config.depth_encoding,
+            topics={name: self.resolve_topic_name(name) for name in topics},
+        )
+        environ = {**os.environ, "ROS_DOMAIN_ID": str(self.context.get_domain_id())}
+        if LARGE_PROFILE in environ:
+            environ[PROFILE] = environ[LARGE_PROFILE]
+        return CameraFeed(setup, environ, first, lambda fault: self.get_logger().error(f"no images: {fault}"))
 
     def _on_crash(self, error: Exception) -> None:
         """The physics ended by a fault of the program: end the process, so that it is started again."""
@@ -128,9 +152,10 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         simulation, config = self._simulation, self.config
         factor, period = simulation.real_time_factor.value, simulation.periods.figures()
         self._real_time_factor.publish(Float64(data=0.0 if simulation.paused else factor))
-        drawn, before = self._images.rendered, self._drawn
+        images = self._images
+        drawn, before = images.rendered if images is not None else {}, self._drawn
         self._drawn = drawn
-        fault = simulation.fault or self._render_fault
+        fault = simulation.fault or (images.fault if images is not None else "")
         slow = not simulation.paused and config.speed > 0.0 and period.n > 100 and factor < _SLOW * config.speed
         if not fault and slow:
             fault = f"slower than asked: {factor:.2f} simulated seconds a second, expected {config.speed:g}"
@@ -142,7 +167,9 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             joint_state_period_p99_ms=f"{period.p99_ms:.2f}",
             joint_state_period_max_ms=f"{period.max_ms:.2f}",
             wall_time_skipped_s=f"{simulation.skipped_s:.2f}",
-            frames_dropped=self._images.dropped,
+            frames_dropped=images.dropped if images is not None else 0,
+            draw_ms=f"{images.draw_ms:.1f}" if images is not None else "",
+            watched=" ".join(sorted(images.watched)) if images is not None else "",
             **{f"frames_{name}": count - before[name] for name, count in drawn.items()},
         )
 
@@ -151,6 +178,9 @@ def make() -> MujocoBridge:
     """Make the node for a process of its own."""
     # The physics thread must not wait 5 ms (the default) for another thread to let go of the interpreter.
     sys.setswitchinterval(0.0005)
+    if PROFILE in os.environ:
+        os.environ[LARGE_PROFILE] = os.environ[PROFILE]
+        os.environ[PROFILE] = str(config_dir() / "fastdds_small.xml")
     node = MujocoBridge()
     mujoco.set_mju_user_warning(lambda text: node.get_logger().warning(f"MuJoCo: {text}"))  # not into a file
     gc.collect()

@@ -107,6 +107,12 @@ class Bench:
 
 @pytest.fixture
 def bench(ros) -> Iterator[Bench]:
+    return Bench(ros, images=False)
+
+
+@pytest.fixture
+def seeing(ros) -> Iterator[Bench]:
+    """With cameras."""
     return Bench(ros)
 
 
@@ -139,9 +145,11 @@ def trajectory_goal(
 
 
 # --- state
-def test_a15_a16_a17_names_types_and_qos(bench: Bench) -> None:
-    node = bench.ros.node
+def test_a15_a16_a17_names_types_and_qos(seeing: Bench) -> None:
+    node = seeing.ros.node
     assert "mujoco_bridge" in node.get_node_names()
+    seeing.ros.spin_until(lambda: node.count_publishers("/spectator/color/image_raw"), 5.0, "the cameras' node")
+    seeing.spin_sim(0.5)  # and the rest of its topics
     offered = {
         "/clock": ("rosgraph_msgs/msg/Clock", False, False),
         "/joint_states": ("sensor_msgs/msg/JointState", True, False),
@@ -160,7 +168,8 @@ def test_a15_a16_a17_names_types_and_qos(bench: Bench) -> None:
         "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", True, False),
     }
     for topic, (kind, is_reliable, latched) in offered.items():
-        (info,) = [i for i in node.get_publishers_info_by_topic(topic) if i.node_name == "mujoco_bridge"]
+        owner = "mujoco_cameras" if topic.startswith(("/overhead", "/wrist", "/spectator")) else "mujoco_bridge"
+        (info,) = [i for i in node.get_publishers_info_by_topic(topic) if i.node_name == owner]
         assert info.topic_type == kind, topic
         assert (info.qos_profile.reliability == ReliabilityPolicy.RELIABLE) == is_reliable, topic
         assert (info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL) == latched, topic
@@ -176,10 +185,10 @@ def test_a15_a16_a17_names_types_and_qos(bench: Bench) -> None:
         ("spawn_object", "SpawnObject"),
     ):
         assert services[f"/sim/{name}"] == [f"openarm_interfaces/srv/{kind}"]
-    assert bench.joints[0].name == [
+    assert seeing.joints[0].name == [
         f"openarm_{s}_{j}" for s in ("left", "right") for j in (*(f"joint{i}" for i in range(1, 8)), "finger_joint1")
     ]
-    np.testing.assert_allclose([bench.position(name) for name in ARM], HOME, atol=0.01)
+    np.testing.assert_allclose([seeing.position(name) for name in ARM], HOME, atol=0.01)
 
 
 def test_a18_a19_hundred_hertz_in_step_with_the_wall_clock(bench: Bench) -> None:
@@ -250,12 +259,12 @@ def test_ground_truth_is_the_only_outlet_of_object_poses(bench: Bench) -> None:
 
 
 # --- cameras
-def test_a26_a28_a30_images_info_and_joint_states_belong_together(bench: Bench) -> None:
-    colour = bench.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
-    depth = bench.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
-    infos = bench.collect(CameraInfo, "/overhead/color/camera_info", QOS_SENSOR)
-    depth_infos = bench.collect(CameraInfo, "/overhead/depth/camera_info", QOS_SENSOR)
-    bench.ros.spin_until(lambda: len(colour) > 30 and len(depth) > 30, 20.0, "images")
+def test_a26_a28_a30_images_info_and_joint_states_belong_together(seeing: Bench) -> None:
+    colour = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
+    depth = seeing.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
+    infos = seeing.collect(CameraInfo, "/overhead/color/camera_info", QOS_SENSOR)
+    depth_infos = seeing.collect(CameraInfo, "/overhead/depth/camera_info", QOS_SENSOR)
+    seeing.ros.spin_until(lambda: len(colour) > 30 and len(depth) > 30, 20.0, "images")
     image, info = colour[-1], infos[-1]
     assert (image.width, image.height, image.encoding, image.header.frame_id) == (
         640,
@@ -268,10 +277,12 @@ def test_a26_a28_a30_images_info_and_joint_states_belong_together(bench: Bench) 
     assert info.k[0] == info.k[4]
     assert (info.k[2], info.k[5]) == (319.5, 239.5)
     assert list(info.k) == list(depth_infos[-1].k)
-    stamps = {stamp_to_ns(m.header.stamp) for m in bench.joints}
+    stamps = {stamp_to_ns(m.header.stamp) for m in seeing.joints}
     paired = [stamp_to_ns(m.header.stamp) in stamps for m in colour + depth]
     assert np.mean(paired) > 0.8  # a starved probe may miss some joint states
-    bench.ros.spin_until(lambda: any(m.header.stamp == image.header.stamp for m in infos), 5.0, "the info of the image")
+    seeing.ros.spin_until(
+        lambda: any(m.header.stamp == image.header.stamp for m in infos), 5.0, "the info of the image"
+    )
     pixels, z = image_to_array(image), depth_to_metres(depth[-1])
     assert pixels.std() > 10.0
     # The table top, seen by a camera whose mount is nominal: planar depth of a plane.
@@ -283,24 +294,50 @@ def test_a26_a28_a30_images_info_and_joint_states_belong_together(bench: Bench) 
     np.testing.assert_allclose(heights, 0.40, atol=1e-3)
 
 
-def test_p24_cameras_without_subscribers_draw_nothing(bench: Bench) -> None:
-    bench.spin_sim(0.5)
-    assert not any(bench.node._images.rendered.values())
-    subscription = bench.ros.node.create_subscription(Image, "/wrist/color/image_raw", lambda _m: None, QOS_SENSOR)
-    bench.ros.spin_until(lambda: bench.node._images.rendered["wrist"] > 3, 15.0, "wrist images")
-    assert bench.node._images.rendered["overhead"] == 0
-    bench.ros.node.destroy_subscription(subscription)
-    bench.spin_sim(0.8)
-    drawn = bench.node._images.rendered["wrist"]
-    bench.spin_sim(0.5)
-    assert bench.node._images.rendered["wrist"] == drawn
+def test_p24_cameras_without_subscribers_draw_nothing(seeing: Bench) -> None:
+    seeing.spin_sim(0.5)
+    assert not any(seeing.node._images.rendered.values())
+    subscription = seeing.ros.node.create_subscription(Image, "/wrist/color/image_raw", lambda _m: None, QOS_SENSOR)
+    seeing.ros.spin_until(lambda: seeing.node._images.rendered["wrist"] > 3, 15.0, "wrist images")
+    assert seeing.node._images.rendered["overhead"] == 0
+    seeing.ros.node.destroy_subscription(subscription)
+    seeing.spin_sim(0.8)
+    drawn = seeing.node._images.rendered["wrist"]
+    seeing.spin_sim(0.5)
+    assert seeing.node._images.rendered["wrist"] == drawn
 
 
-def test_camera_info_alone_needs_no_drawing(bench: Bench) -> None:
-    infos = bench.collect(CameraInfo, "/wrist/depth/camera_info", QOS_SENSOR)
-    bench.ros.spin_until(lambda: len(infos) > 10, 5.0, "camera info")
+def test_camera_info_alone_needs_no_drawing(seeing: Bench) -> None:
+    infos = seeing.collect(CameraInfo, "/wrist/depth/camera_info", QOS_SENSOR)
+    seeing.ros.spin_until(lambda: len(infos) > 10, 5.0, "camera info")
     assert infos[-1].header.frame_id == "wrist_color_optical_frame"
-    assert not any(bench.node._images.rendered.values())
+    assert not any(seeing.node._images.rendered.values())
+
+
+def test_images_come_again_after_their_process_was_killed(seeing: Bench) -> None:
+    images = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
+    seeing.ros.spin_until(lambda: len(images) > 3, 20.0, "images")
+    feed, before = seeing.node._images, seeing.t_ns
+    os.kill(feed.pid, signal.SIGKILL)
+    seeing.ros.spin_until(lambda: "code -9" in feed.fault, 5.0, "its death to be told")
+    n = len(images)
+    seeing.ros.spin_until(lambda: len(images) > n + 3, 20.0, "images again")
+    assert feed.fault == ""
+    stamps = [stamp_to_ns(m.header.stamp) for m in seeing.joints if stamp_to_ns(m.header.stamp) > before]
+    assert np.diff(stamps).max() < 50_000_000  # the robot went on meanwhile
+
+
+def test_the_drawn_world_is_the_one_that_was_loaded(seeing: Bench) -> None:
+    images = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
+    seeing.ros.spin_until(lambda: len(images) > 3, 20.0, "images")
+
+    def red() -> int:
+        pixels = image_to_array(images[-1]).astype(int)
+        return int(((pixels[..., 0] > 120) & (pixels[..., 1] < 60) & (pixels[..., 2] < 60)).sum())
+
+    assert red() > 100
+    assert seeing.call(ResetWorld, "/sim/reset_world", scene="empty").success
+    seeing.ros.spin_until(lambda: red() == 0, 5.0, "an image without the cube")
 
 
 def test_a47_depth_in_metres_by_parameter(ros) -> None:
@@ -563,9 +600,9 @@ def test_spawn_adds_an_object_and_names_what_is_wrong(bench: Bench) -> None:
     assert all(o.name != "extra" for o in got[-1].objects)
 
 
-def test_diagnostics_tell_how_well_it_keeps_up(bench: Bench) -> None:
-    got = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
-    bench.ros.spin_until(lambda: any(s.message == "running" for m in got for s in m.status), 5.0, "a status")
+def test_diagnostics_tell_how_well_it_keeps_up(seeing: Bench) -> None:
+    got = seeing.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    seeing.ros.spin_until(lambda: any(s.message == "running" for m in got for s in m.status), 5.0, "a status")
     values = {v.key: v.value for s in got[-1].status for v in s.values}
     assert {
         "real_time_factor",

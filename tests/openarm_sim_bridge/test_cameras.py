@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras: planar depth, geometry of the image, frame rate, and the thread that draws."""
+"""Cameras: planar depth, geometry of the image, and what is said where nothing can be drawn."""
 
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Iterator
 
 import mujoco
@@ -14,7 +13,7 @@ import pytest
 from openarm_common import se3
 from openarm_common.cameras import CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.cameras import RenderThread, SnapshotRenderer, create_gl_context, millimetres, planar_metres
+from openarm_sim_bridge.cameras import SnapshotRenderer, create_gl_context, millimetres, planar_metres
 from openarm_sim_bridge.world import Snapshot
 
 CAMERA = CameraConfig(
@@ -35,12 +34,6 @@ MODEL = """
 <geom type="plane" size="5 5 .1" rgba=".5 .5 .5 1"/>
 <body name="ball" pos="{x} {y} {z}"><freejoint/><geom type="sphere" size="{r}" rgba="1 0 0 1"/></body>
 <camera name="eye" pos="0 0 1" euler="{tilt} 0 0" fovy="60"/></worldbody></mujoco>"""
-
-
-FRAMES = {
-    "eye": (np.empty((240, 320, 3), np.uint8), np.empty((240, 320), np.uint16)),
-    "other": (np.empty((240, 320, 3), np.uint8), None),
-}
 
 
 def snapshot(
@@ -162,50 +155,8 @@ def test_without_opengl_the_error_says_what_to_install(monkeypatch: pytest.Monke
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr("openarm_sim_bridge.cameras._context_class", broken)
-    failures: list[OpenArmError] = []
-    thread = RenderThread({"eye": CAMERA}, snapshot(), lambda _n: FRAMES["eye"], lambda _n, _t: None, failures.append)
-    thread.start()
-    assert thread.warm.wait(10.0)
-    thread.offer(snapshot(), ["eye"])
-    thread.stop()
-    (failure,) = failures
-    assert failure.code is Code.ENVIRONMENT
+    with pytest.raises(OpenArmError) as caught:
+        SnapshotRenderer({"eye": CAMERA})
+    assert caught.value.code is Code.ENVIRONMENT
     for part in ("libEGL.so.1", "osmesa", "libosmesa6"):
-        assert part in failure.message
-
-
-def test_the_thread_draws_the_newest_snapshot_and_forgets_no_camera() -> None:
-    other = CAMERA.model_copy(update={"name": "other", "depth": False})
-    state = snapshot()
-    model = mujoco.MjModel.from_xml_string(
-        MODEL.format(tilt=0, x=9, y=0, z=1, r=0.1).replace(
-            "</worldbody>", '<camera name="other" pos="0 0 2"/></worldbody>'
-        )
-    )
-    busy, go, done = threading.Event(), threading.Event(), threading.Event()
-    delivered: list[tuple[str, int]] = []
-
-    def deliver(name: str, t_ns: int) -> None:
-        delivered.append((name, t_ns))
-        busy.set()
-        assert go.wait(10.0)
-        if t_ns == 30 and name == "other":
-            done.set()
-
-    thread = RenderThread(
-        {"eye": CAMERA, "other": other}, Snapshot(model, 0, state.qpos), FRAMES.__getitem__, deliver, pytest.fail
-    )
-    thread.start()
-    try:
-        thread.offer(Snapshot(model, 10, state.qpos), ["eye"])
-        assert busy.wait(20.0)
-        thread.offer(Snapshot(model, 20, state.qpos), ["other"])  # replaced before it is drawn
-        thread.offer(Snapshot(model, 30, state.qpos), ["eye"])
-        go.set()
-        assert done.wait(20.0)
-    finally:
-        go.set()
-        thread.stop()
-    assert delivered == [("eye", 10), ("eye", 30), ("other", 30)]
-    assert thread.dropped == 1
-    assert thread.rendered == {"eye": 2, "other": 1}
+        assert part in caught.value.message
