@@ -28,6 +28,8 @@ from openarm_common.errors import Code, OpenArmError
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+#: With fewer poses the others can't tell which one is wrong; a clean set would lose poses by chance.
+_FEWEST_TO_REJECT = 7
 
 
 class SolveConfig(Config):
@@ -139,7 +141,7 @@ def _robust(
     estimate = _refine(problem, used, px, config, None)
     limit = _limit(problem, used, config)
     tests = pose_tests(problem, used, estimate, limit, usable)
-    if not config.reject_outliers:
+    if not config.reject_outliers or _poses(problem, used) < _FEWEST_TO_REJECT:
         return used, estimate, tests
     suspect = any(tests[p].distance > limit for p in problem.pose[usable]) or _spoiled(problem, used, estimate)
     if not suspect:
