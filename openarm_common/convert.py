@@ -159,7 +159,8 @@ def array_to_image(pixels: NDArray[np.generic], encoding: str, frame_id: str, t_
 def byte_array(data: NDArray[np.generic]) -> array.array[int]:
     """Bytes of an array as `array.array('B')`, the one form that rclpy takes without a loop."""
     out = array.array("B")
-    out.frombytes(np.ascontiguousarray(data).data.cast("B"))
+    if data.size:  # an empty memoryview can't be cast
+        out.frombytes(np.ascontiguousarray(data).data.cast("B"))
     return out
 
 

@@ -15,4 +15,5 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
     ],
     install_requires=["setuptools"],
+    entry_points={"console_scripts": ["octomap = openarm_octomap.node:main"]},
 )

@@ -117,3 +117,9 @@ def test_trajectories_round_trip_and_ragged_ones_are_refused() -> None:
     message.points[1].velocities = [1.0]
     with pytest.raises(OpenArmError, match="point 1 has 1 velocities for 3 joints"):
         convert.trajectory_from_msg(message)
+
+
+def test_a_cloud_without_points_is_a_message_too() -> None:
+    cloud = convert.cloud_from_points(np.empty((0, 3), np.float32), "camera", 0)
+    assert (cloud.width, cloud.height, len(cloud.data)) == (0, 1, 0)
+    assert convert.points_from_cloud(cloud).shape == (0, 3)

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From frames to a map and all that is derived from it, one update at a time.
+
+A `Mapper` may be called from several threads; each call has the map to itself. Coordinates are in the base frame, m.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from openarm_common.description import RobotDescription
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.lattice import DEPTH, Lattice
+from openarm_common.octomap_codec import Payload, encode_states, read_file, write_file
+from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
+from openarm_octomap.distance import DistanceTransform
+from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
+from openarm_octomap.self_filter import HeldBox, SelfFilter, Shapes
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What a camera (or another source of points) saw, and the joints at that moment.
+
+    Attributes:
+        source: Name of the camera or cloud.
+        t_ns: Stamp.
+        scan: The image or cloud.
+        joints: Positions by joint name at the stamp; None when the robot is not cut out.
+    """
+
+    source: str
+    t_ns: int
+    scan: DepthScan | CloudScan
+    joints: Mapping[str, float] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The map for those who look at it.
+
+    Attributes:
+        lattice: Which cells.
+        binary: Octree of states.
+        full: Octree of log-odds, where it was wanted.
+        states: (nx, ny, nz) copy, where it was wanted.
+    """
+
+    lattice: Lattice
+    binary: Payload
+    full: Payload | None = None
+    states: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What an update did.
+
+    Attributes:
+        snapshot: The map afterwards.
+        changed: Flat indices of the cells whose state changed.
+        sources: Whose frames are in it.
+        removed: Pixels or points that each link (or held box) took, by source.
+        reset: Cells that the robot filled.
+        valid: Valid pixels or points.
+        ends: Cells that rays ended in.
+    """
+
+    snapshot: Snapshot
+    changed: NDArray[np.int32]
+    sources: tuple[str, ...]
+    removed: Mapping[str, Mapping[str, int]] = field(default_factory=dict[str, Mapping[str, int]])
+    reset: int = 0
+    valid: int = 0
+    ends: int = 0
+
+
+class Mapper:
+    """The map with its self-filter and its distance field.
+
+    Args:
+        description: The robot.
+        grid: Parameters of the map.
+        robot: Parameters of the self-filter.
+        distances: Parameters of the distance field.
+    """
+
+    def __init__(
+        self, description: RobotDescription, grid: GridConfig, robot: FilterConfig, distances: FieldConfig
+    ) -> None:
+        self._grid = OccupancyGrid(grid)
+        self._filter = SelfFilter(description, robot)
+        self._filtering = robot.enabled
+        self._transform = DistanceTransform(self._grid.lattice, distances.reach, distances.unknown)
+        self._lock = threading.Lock()
+
+    @property
+    def lattice(self) -> Lattice:
+        """Which cells the map has."""
+        return self._grid.lattice
+
+    def update(
+        self,
+        frames: Sequence[Frame],
+        held: Sequence[HeldBox] = (),
+        distances: Floats | None = None,
+        wanted: Collection[str] = (),
+    ) -> Report:
+        """Put the frames of one moment into the map.
+
+        Args:
+            frames: At least one.
+            held: What the hands hold.
+            distances: (nx, ny, nz), filled with the distance field; None leaves it out.
+            wanted: "full" and "states", where the snapshot needs them.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when frames are missing or lack a joint; the map is as it was.
+        """
+        if not frames:
+            raise OpenArmError(Code.INVALID_ARGUMENT, "an update needs at least one frame")
+        scans: list[DepthScan | CloudScan] = []
+        removed: dict[str, Mapping[str, int]] = {}
+        newest = max(frames, key=lambda frame: frame.t_ns)
+        shapes: Shapes | None = None
+        for frame in frames:
+            scan = frame.scan
+            if self._filtering:
+                body = self._filter.shapes(frame.joints or {}, held)
+                shapes = body if frame is newest else shapes
+                find = self._filter.label_depth if isinstance(scan, DepthScan) else self._filter.label_cloud
+                label, removed[frame.source] = find(scan, body)  # type: ignore[arg-type]
+                scan = replace(scan, label=label)
+            scans.append(scan)
+        with self._lock:
+            update = self._grid.integrate(scans, newest.t_ns)
+            changes = [update.changed, self._grid.decay(newest.t_ns)]
+            if shapes is not None:
+                changes.append(self._filter.reset(self._grid, shapes))
+            if distances is not None:
+                self._transform.compute(self._grid.states, distances)
+            return Report(
+                snapshot=self._snapshot(wanted),
+                changed=np.unique(np.concatenate(changes)),
+                sources=tuple(frame.source for frame in frames),
+                removed=removed,
+                reset=int(changes[-1].size) if shapes is not None else 0,
+                valid=update.valid,
+                ends=update.ends,
+            )
+
+    def snapshot(self, wanted: Collection[str] = ()) -> Snapshot:
+        """The map as it is; `wanted` as for `update`."""
+        with self._lock:
+            return self._snapshot(wanted)
+
+    def coarse(self, depth: int) -> tuple[Lattice, Payload]:
+        """The map at another depth as an octree whose smallest cells are of that depth.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, unless 1 <= depth <= 16.
+        """
+        with self._lock:
+            if depth == DEPTH:
+                return self._grid.lattice, self._grid.binary()
+            lattice, states = self._grid.coarse(depth)
+        return lattice, encode_states(lattice, states)
+
+    def compute_distances(self, out: Floats) -> None:
+        """Fill (nx, ny, nz) with the distance field of the map as it is."""
+        with self._lock:
+            self._transform.compute(self._grid.states, out)
+
+    def counts(self, t_ns: int) -> dict[str, float]:
+        """Cells by state, and the longest time an occupied cell was not looked at, s."""
+        with self._lock:
+            return self._grid.counts() | {"oldest_s": self._grid.oldest_s(t_ns)}
+
+    def reset(self) -> None:
+        """Forget everything."""
+        with self._lock:
+            self._grid.reset()
+
+    def clear_box(self, lower: ArrayLike, upper: ArrayLike, state: int) -> int:
+        """Make a box FREE or UNKNOWN; see `OccupancyGrid.clear_box`."""
+        with self._lock:
+            return self._grid.clear_box(lower, upper, state)
+
+    def save(self, path: Path) -> int:
+        """Write the map: .bt has occupied and free, .ot the log-odds.
+
+        Returns:
+            Nodes written.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for another suffix or a folder that can't be written.
+        """
+        if path.suffix not in (".bt", ".ot"):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{str(path)!r} needs the suffix .bt or .ot")
+        with self._lock:
+            payload = self._grid.full() if path.suffix == ".ot" else self._grid.binary()
+        write_file(path, payload, self._grid.lattice.resolution)
+        return payload.nodes
+
+    def load(self, path: Path) -> int:
+        """Replace the map by that of a file.
+
+        Returns:
+            How many of its leaves lie outside of the workspace.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when the file is damaged or has cells of another size; the map is as it was.
+        """
+        leaves = read_file(path)
+        with self._lock:
+            try:
+                return self._grid.load(leaves)
+            except OpenArmError as error:
+                raise OpenArmError(error.code, f"{path}: {error.message}") from error
+
+    def _snapshot(self, wanted: Collection[str]) -> Snapshot:
+        grid = self._grid
+        return Snapshot(
+            lattice=grid.lattice,
+            binary=grid.binary(),
+            full=grid.full() if "full" in wanted else None,
+            states=grid.states.copy() if "states" in wanted else None,
+        )

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `octomap`: the surroundings of the robot as an octree, from depth images, under octomap_server's names.
+
+Publishes octomap_binary, octomap_full (latched), centres, markers, projected map, and the distance field in shared
+memory (`openarm_common.distance_field`). Everything is in the base frame.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from octomap_msgs.srv import BoundingBoxQuery, GetOctomap
+from sensor_msgs.msg import Image, PointCloud2
+from std_srvs.srv import Empty, Trigger
+from visualization_msgs.msg import MarkerArray
+
+from openarm_common.cameras import load_cameras
+from openarm_common.convert import xyz
+from openarm_common.distance_field import CameraMoment, DistanceFieldWriter, field_path
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
+from openarm_common.tf import RobotStateListener
+from openarm_octomap import convert
+from openarm_octomap.camera_client import CloudSource, DepthSource, Source
+from openarm_octomap.config import OctomapNodeConfig
+from openarm_octomap.kernels import FREE, UNKNOWN
+from openarm_octomap.map_publisher import MapPublisher
+from openarm_octomap.mapper import Frame, Mapper, Report
+from openarm_octomap.self_filter import HeldBox
+
+
+class OctomapNode(BaseNode[OctomapNodeConfig]):
+    """Keeps the map, publishes it, answers what it knows."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("octomap", OctomapNodeConfig, **kwargs)
+        config = self.config
+        self._mapper = Mapper(self.description, config.grid, config.filter, config.field)
+        self._cameras = [DepthSource(self, c, config.depth_topic, config.info_topic) for c in _cameras(config.cameras)]
+        self._sources: list[Source[Image] | Source[PointCloud2]] = [*self._cameras]
+        if config.cloud_topic:
+            self._sources.append(CloudSource(self, config.cloud_topic))
+        self._states = RobotStateListener(self, self.description)
+        self._held: tuple[HeldBox, ...] = ()
+        self._t_ns = 0
+        self._busy = False
+        self._edition = 0
+        self._updates = self._overruns = 0
+        self._elapsed_ms = 0.0
+        self._last: Report | None = None
+        self._fault = ""
+        self._field = self._open_field() if config.field.enabled else None
+        self._publisher = MapPublisher(self, full=config.publish_full)
+        # not read-only, unlike the others: ~/save and ~/load take the file from here
+        self.declare_parameter("file", config.map_file)
+        self.create_subscription(MarkerArray, config.held_topic, self._on_held, QOS_LATCHED)
+        self.create_service(GetOctomap, "octomap_binary", self._on_binary)
+        self.create_service(GetOctomap, "octomap_full", self._on_full)
+        for depth in config.coarse_depths:
+            self.create_service(GetOctomap, f"~/depth_{depth}/octomap_binary", self._answer_at(depth))
+        self.create_service(BoundingBoxQuery, "~/clear_bbox", self._clear_to(FREE))
+        self.create_service(BoundingBoxQuery, "~/forget_bbox", self._clear_to(UNKNOWN))
+        self.create_service(Empty, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/save", self._on_save)
+        self.create_service(Trigger, "~/load", self._on_load)
+        self.create_timer(config.period, self._on_timer, clock=self.wall_clock)
+        self.create_timer(1.0, self._report, clock=self.wall_clock)
+        if config.map_file:
+            self._mapper.load(Path(config.map_file).expanduser())
+            self._show()
+
+    def close(self) -> None:
+        """Wait for a running update, then take the distance field away."""
+        super().close()
+        if self._field is not None:
+            self._field.close()
+
+    # --- updates
+    async def _on_timer(self) -> None:
+        if self._busy:
+            self._overruns += 1
+            return
+        found = [source.take(self._states.buffer, filtering=self.config.filter.enabled) for source in self._sources]
+        frames = [frame for frame in found if frame is not None]
+        if not frames:
+            return
+        self._busy, edition = True, self._edition
+        try:
+            report: Report = await self.in_thread(self._update, frames, self._held, self._publisher.wanted())
+        except OpenArmError as error:
+            self._fault = error.message
+            return
+        finally:
+            self._busy = False
+        self._fault, self._last = "", report
+        self._updates += 1
+        self._t_ns = max(frame.t_ns for frame in frames)
+        if edition == self._edition:
+            self._publisher.publish(report.snapshot, self._t_ns, report.changed)
+        else:  # the map was reset, loaded or edited meanwhile: what the update saw is out of date
+            self._show()
+
+    def _update(self, frames: list[Frame], held: tuple[HeldBox, ...], wanted: set[str]) -> Report:
+        """One update, in a worker thread."""
+        begin = time.thread_time()
+        slot = self._field.begin() if self._field is not None else None
+        report = self._mapper.update(frames, held, slot, wanted)
+        by_name = {source.name: source for source in self._sources}
+        for frame in frames:
+            by_name[frame.source].took(frame.t_ns)
+        if self._field is not None:
+            self._field.commit(max(frame.t_ns for frame in frames), time.monotonic_ns(), self._moments())
+        self._elapsed_ms = (time.thread_time() - begin) * 1e3
+        return report
+
+    def _show(self) -> None:
+        """Make a map that did not come from an image visible everywhere, at once."""
+        self._edition += 1
+        self._publisher.publish(self._mapper.snapshot(self._publisher.wanted(everything=True)), self._t_ns)
+        if self._field is not None and not self._busy:
+            self._mapper.compute_distances(self._field.begin())
+            self._field.commit(self._t_ns, time.monotonic_ns(), self._moments())
+
+    def _moments(self) -> dict[str, CameraMoment]:
+        return {camera.name: CameraMoment(camera.used_t_ns, camera.used_at_ns) for camera in self._cameras}
+
+    def _on_held(self, message: MarkerArray) -> None:
+        try:
+            self._held = convert.held_from_msg(message)
+        except OpenArmError as error:
+            self.get_logger().warning(f"{self.config.held_topic}: {error.message}")
+
+    # --- services
+    def _on_binary(self, _: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
+        snapshot = self._mapper.snapshot()
+        response.map = convert.octomap_msg(snapshot.binary, snapshot.lattice.resolution, self._t_ns)
+        return response
+
+    def _on_full(self, _: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
+        snapshot = self._mapper.snapshot({"full"})
+        if snapshot.full is not None:
+            response.map = convert.octomap_msg(snapshot.full, snapshot.lattice.resolution, self._t_ns)
+        return response
+
+    def _answer_at(self, depth: int) -> Any:
+        def answer(_: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
+            lattice, payload = self._mapper.coarse(depth)
+            response.map = convert.octomap_msg(payload, lattice.resolution, self._t_ns)
+            return response
+
+        return answer
+
+    def _clear_to(self, state: int) -> Any:
+        def clear(request: BoundingBoxQuery.Request, response: BoundingBoxQuery.Response) -> BoundingBoxQuery.Response:
+            try:
+                self._mapper.clear_box(xyz(request.min), xyz(request.max), state)
+                self._show()
+            except OpenArmError as error:  # the service has no field for a reason
+                self.get_logger().error(str(error))
+            return response
+
+        return clear
+
+    def _on_reset(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
+        self._mapper.reset()
+        self._show()
+        return response
+
+    def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            path = self._file()
+            nodes = self._mapper.save(path)
+            response.success, response.message = True, f"{path}: {nodes} nodes"
+        except OpenArmError as error:
+            response.message = str(error)
+        return response
+
+    def _on_load(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            path = self._file()
+            outside = self._mapper.load(path)
+            self._show()
+            response.success, response.message = True, f"{path} loaded; {outside} leaves outside of the workspace"
+        except OpenArmError as error:
+            response.message = str(error)
+        return response
+
+    def _file(self) -> Path:
+        name = str(self.get_parameter("file").value)
+        if not name:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, "no file: set the parameter `file` to a path that ends in .bt or .ot"
+            )
+        return Path(name).expanduser()
+
+    # --- health
+    def _report(self) -> None:
+        limit = self.config.stale_after
+        faults = [self._fault] if self._fault else []
+        values: dict[str, object] = {"updates": self._updates, "overruns": self._overruns}
+        for source in self._sources:
+            camera = source in self._cameras
+            age = source.age_s()
+            if camera and age > limit:
+                since = "never used" if age == float("inf") else f"not used for {age:.1f} s"
+                faults.append(f"{source.name} {since}" + (f" ({source.fault})" if source.fault else ""))
+            elif source.fault:
+                faults.append(source.fault)
+            values |= {f"{source.name}_used": source.used, f"{source.name}_refused": source.refused}
+            values |= {f"{source.name}_late": source.late, f"{source.name}_age_s": f"{age:.2f}"}
+        if self._last is not None:
+            values |= {"changed": self._last.changed.size, "robot_cells": self._last.reset, "ends": self._last.ends}
+            values |= self._mapper.counts(self._t_ns)
+            for source_name, links in self._last.removed.items():
+                values |= {f"{source_name}_removed/{link}": n for link, n in links.items()}
+        values |= {"update_ms": f"{self._elapsed_ms:.1f}", "held": ", ".join(b.name for b in self._held) or "nothing"}
+        self.diagnose(not faults, "; ".join(faults) or f"map of {', '.join(self.config.cameras)}", **values)
+
+    def _open_field(self) -> DistanceFieldWriter:
+        domain = str(self.context.get_domain_id())
+        path = field_path(self.config.field.name or domain)
+        names = [camera.name for camera in self._cameras]
+        return DistanceFieldWriter(path, self._mapper.lattice, self.config.field.reach, BASE_FRAME, names)
+
+
+def _cameras(names: tuple[str, ...]) -> list[Any]:
+    cameras = load_cameras()
+    for name in names:
+        if name not in cameras or not cameras[name].depth:
+            there = ", ".join(key for key, camera in cameras.items() if camera.depth)
+            raise OpenArmError(Code.CONFIG_INVALID, f"camera {name!r} is unknown or has no depth; cameras: {there}")
+    return [cameras[name] for name in names]
+
+
+def main() -> None:
+    """Run the node."""
+    run(OctomapNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,355 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `octomap` in process: images in, maps out, services, faults."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Point
+from nav_msgs.msg import OccupancyGrid
+from octomap_msgs.msg import Octomap
+from octomap_msgs.srv import BoundingBoxQuery, GetOctomap
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
+from std_srvs.srv import Empty, Trigger
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker, MarkerArray
+
+from openarm_common import se3
+from openarm_common.cameras import T_LINK_OPTICAL, load_cameras
+from openarm_common.convert import (
+    array_to_image,
+    cloud_from_points,
+    info_from_intrinsics,
+    matrix_to_pose,
+    matrix_to_transform,
+    ns_to_stamp,
+    points_from_cloud,
+)
+from openarm_common.description import RobotDescription
+from openarm_common.distance_field import DistanceFieldReader, field_path
+from openarm_common.errors import OpenArmError
+from openarm_common.lattice import Lattice
+from openarm_common.node import BASE_FRAME, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF
+from openarm_common.octomap_codec import decode
+from openarm_octomap.node import OctomapNode
+
+CAMERA = load_cameras()["overhead"]
+K, FRAME = CAMERA.intrinsics, CAMERA.optical_frame
+ROBOT = RobotDescription.load()
+JOINTS = sorted(name for name, joint in ROBOT.joints.items() if joint.type != "fixed" and joint.mimic is None)
+T_BASE_CAMERA = CAMERA.T_parent_optical
+
+
+def sheet(z: float, hole: tuple[float, float, float] | None = None) -> np.ndarray:
+    """Depth image (mm) of a horizontal plane at height z; around `hole` x, y within its radius nothing returns."""
+    pixels = np.stack(np.meshgrid(np.arange(K.width), np.arange(K.height)), axis=-1)
+    rays = K.deproject(pixels, np.ones(pixels.shape[:2]))
+    direction = rays @ T_BASE_CAMERA[:3, :3].T
+    depth = (z - T_BASE_CAMERA[2, 3]) / np.where(direction[..., 2] < -1e-3, direction[..., 2], np.nan)
+    depth[~((depth > 0.2) & (depth < 3.0))] = np.nan
+    if hole is not None:
+        at = T_BASE_CAMERA[:3, 3] + direction * depth[..., None]
+        depth[np.hypot(at[..., 0] - hole[0], at[..., 1] - hole[1]) < hole[2]] = np.nan
+    return np.nan_to_num(depth * 1e3).round().astype(np.uint16)
+
+
+class Bench:
+    """A camera, joint states, and somebody who looks at the map."""
+
+    def __init__(self, ros, tmp_path: Path, **params) -> None:
+        self.ros = ros
+        node = ros.node
+        self.depth = node.create_publisher(Image, "/overhead/depth/image_raw", QOS_SENSOR)
+        self.info = node.create_publisher(CameraInfo, "/overhead/depth/camera_info", QOS_SENSOR)
+        self.joints = node.create_publisher(JointState, "/joint_states", QOS_COMMAND)
+        self.held = node.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
+        self.static = node.create_publisher(TFMessage, "/tf_static", QOS_STATIC_TF)
+        self.static.publish(
+            TFMessage(
+                transforms=[
+                    matrix_to_transform(CAMERA.parent, CAMERA.link_frame, CAMERA.T_parent_link, 0),
+                    matrix_to_transform(CAMERA.link_frame, FRAME, T_LINK_OPTICAL, 0),
+                ]
+            )
+        )
+        self.field = field_path(f"test_{tmp_path.name}")
+        all_params = {
+            "cameras": ["overhead"], "period": 0.05, "field.name": f"test_{tmp_path.name}", "cloud_topic": "", **params
+        }  # fmt: skip
+        self.node = ros.add(OctomapNode(parameter_overrides=[Parameter(k, value=v) for k, v in all_params.items()]))
+        self.maps: list[Octomap] = []
+        self.said: list[DiagnosticArray] = []
+        node.create_subscription(Octomap, "octomap_binary", self.maps.append, QOS_LATCHED)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self.said.append, 10)
+        self.t_ns = 1_000_000_000
+
+    def send(self, image: Image, *, joints: bool = True, info: CameraInfo | None = None) -> None:
+        if joints:
+            state = JointState(name=list(JOINTS), position=[0.0] * len(JOINTS))
+            state.header.stamp = ns_to_stamp(self.t_ns)
+            self.joints.publish(state)
+        self.info.publish(info or info_from_intrinsics(K, FRAME, self.t_ns))
+        self.depth.publish(image)
+
+    def show(self, pixels: np.ndarray, condition, what: str, encoding: str = "16UC1", **kwargs) -> None:
+        """Publish the same view with new stamps until `condition` holds."""
+        due = 0.0
+
+        def step() -> bool:
+            nonlocal due
+            if time.monotonic() >= due:
+                due = time.monotonic() + 0.1
+                self.t_ns += 100_000_000
+                self.send(
+                    array_to_image(pixels, encoding, kwargs.get("frame", FRAME), self.t_ns), **kwargs.get("send", {})
+                )
+            return bool(condition())
+
+        self.ros.spin_until(step, 20.0, what)
+
+    def state(self, point: tuple[float, float, float], message: Octomap | None = None) -> str:
+        """What a map (the newest one) says of a point."""
+        if message is None:
+            if not self.maps:
+                return "no map"
+            message = self.maps[-1]
+        corner = np.asarray(point) - message.resolution
+        box = Lattice.from_bounds(message.resolution, corner, np.asarray(point) + message.resolution)
+        leaves = decode(np.frombuffer(message.data, np.uint8), message.resolution, binary=message.binary)
+        value = leaves.on(box)[0][tuple(box.indices(point))]
+        return "unknown" if np.isnan(value) else "occupied" if value > 0 else "free"
+
+    def call(self, kind, name: str, request=None):
+        return self.ros.call(self.ros.node.create_client(kind, name), request or kind.Request())
+
+    def heard(self, text: str) -> bool:
+        return any(text in s.message and s.level == b"\x02" for m in self.said for s in m.status if "octomap" in s.name)
+
+    def value(self, key: str) -> str:
+        statuses = [s for m in self.said for s in m.status if "octomap" in s.name]
+        return next((v.value for s in reversed(statuses) for v in s.values if v.key == key), "")
+
+
+@pytest.fixture
+def bench(ros, tmp_path) -> Bench:
+    return Bench(ros, tmp_path)
+
+
+ON_TABLE = (0.45, 0.25, 0.41)
+ABOVE = (0.45, 0.25, 0.51)
+
+
+def test_a53_a54_a57_images_become_a_latched_octree(bench) -> None:
+    """In the base frame, with the stamp of the image, 2 cm, readable as OctoMap; a late subscriber gets it too."""
+    bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
+    assert bench.state(ABOVE) == "free"
+    newest = bench.maps[-1]
+    assert (newest.header.frame_id, newest.id, newest.binary, newest.resolution) == (BASE_FRAME, "OcTree", True, 0.02)
+    late: list[Octomap] = []
+    bench.ros.node.create_subscription(Octomap, "octomap_full", late.append, QOS_LATCHED)
+    bench.ros.spin_until(lambda: late, 10.0, "the full map")
+    assert bench.state(ON_TABLE, late[0]) == "occupied"
+    assert not late[0].binary
+    for name, full in (("octomap_binary", False), ("octomap_full", True)):
+        answer = bench.call(GetOctomap, name).map
+        assert answer.binary != full
+        assert bench.state(ON_TABLE, answer) == "occupied"
+
+
+def test_a56_a55_what_moves_away_is_gone_and_what_arrives_is_there(bench) -> None:
+    bench.show(sheet(0.51), lambda: bench.state(ABOVE) == "occupied", "an obstacle")
+    bench.show(sheet(0.41), lambda: bench.state(ABOVE) == "free", "it is gone")
+    bench.show(sheet(0.51), lambda: bench.state(ABOVE) == "occupied", "it is back")
+
+
+def test_a47_metres_and_millimetres_are_the_same(bench) -> None:
+    metres = (sheet(0.41) * 1e-3).astype(np.float32)
+    metres[metres == 0] = np.nan
+    bench.show(metres, lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map", "32FC1")
+
+
+def test_a75_coarse_maps_are_answered(bench) -> None:
+    bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
+    for depth, edge in ((15, 0.04), (14, 0.08), (13, 0.16)):
+        answer = bench.call(GetOctomap, f"/octomap/depth_{depth}/octomap_binary").map
+        assert answer.resolution == pytest.approx(edge)
+        assert bench.state(ON_TABLE, answer) == "occupied"
+
+
+def test_p06_reset_is_visible_at_once_and_boxes_are_cleared(bench) -> None:
+    bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
+    box = BoundingBoxQuery.Request(min=Point(x=0.4, y=0.2, z=0.38), max=Point(x=0.5, y=0.3, z=0.44))
+    bench.call(BoundingBoxQuery, "/octomap/clear_bbox", box)
+    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", 5.0, "the box is free")
+    bench.call(BoundingBoxQuery, "/octomap/forget_bbox", box)
+    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", 5.0, "the box is unknown")
+    bench.call(Empty, "/octomap/reset")
+    bench.ros.spin_until(lambda: len(bench.maps[-1].data) == 0, 5.0, "the map is empty")
+    wrong = BoundingBoxQuery.Request(min=Point(x=1.0), max=Point(x=0.0))
+    bench.call(BoundingBoxQuery, "/octomap/clear_bbox", wrong)
+
+
+def test_maps_are_saved_and_loaded_and_damaged_files_leave_the_map_alone(bench, tmp_path) -> None:
+    bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
+    assert "no file" in bench.call(Trigger, "/octomap/save").message
+
+    def file(path: Path) -> None:
+        bench.node.set_parameters([Parameter("file", value=str(path))])
+
+    for suffix in (".bt", ".ot"):
+        file(tmp_path / f"map{suffix}")
+        answer = bench.call(Trigger, "/octomap/save")
+        assert answer.success, answer.message
+    (tmp_path / "damaged.bt").write_bytes((tmp_path / "map.bt").read_bytes()[:-5])
+    (tmp_path / "map.pcd").write_text("VERSION .7")
+    before = bytes(bench.call(GetOctomap, "octomap_full").map.data)
+    for name, text in (("damaged.bt", "octree is damaged"), ("map.pcd", "not an octree"), ("none.bt", "can't be read")):
+        file(tmp_path / name)
+        answer = bench.call(Trigger, "/octomap/load")
+        assert not answer.success
+        assert text in answer.message
+    assert bytes(bench.call(GetOctomap, "octomap_full").map.data) == before
+    for suffix in (".bt", ".ot"):
+        bench.call(Empty, "/octomap/reset")
+        bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", 5.0, "the map is empty")
+        file(tmp_path / f"map{suffix}")
+        assert bench.call(Trigger, "/octomap/load").success
+        bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "occupied", 5.0, "the map is back")
+
+
+def test_p05_the_robot_and_what_it_holds_are_not_in_the_map(bench) -> None:
+    """A sheet of cells across the left tool, then a held box around it: its cells vanish with the next update."""
+    tool = ROBOT.link_pose("openarm_left_hand_tcp", dict.fromkeys(JOINTS, 0.0))
+    near = tuple(tool[:3, 3] + (0.06, 0.12, 0.0))
+    bench.show(sheet(tool[2, 3]), lambda: bench.state(near) == "occupied", "the sheet is in the map")
+    hand = ROBOT.link_pose("openarm_left_hand", dict.fromkeys(JOINTS, 0.0))[:3, 3]
+    assert bench.state(tuple(hand)) != "occupied"
+    marker = Marker(ns="left/tray", type=Marker.CUBE, action=Marker.ADD)
+    marker.header.frame_id = "openarm_left_hand_tcp"
+    marker.pose = matrix_to_pose(se3.identity())
+    marker.scale.x = marker.scale.y = marker.scale.z = 0.4
+    bench.held.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL), marker]))
+    bench.show(sheet(tool[2, 3]), lambda: bench.state(near) != "occupied", "the held tray is cut out")
+    bench.ros.spin_until(
+        lambda: int(bench.value("overhead_removed/held/left/tray") or 0) > 100, 5.0, "its pixels counted"
+    )
+    bench.held.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL)]))
+    bench.show(sheet(tool[2, 3]), lambda: bench.state(near) == "occupied", "it was let go")
+
+
+def test_the_distance_field_is_shared_with_version_and_age(bench) -> None:
+    """And taken away with the node."""
+    reader = DistanceFieldReader(bench.field)
+    bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
+    field = reader.latest()
+    assert field.at([ON_TABLE, (0.45, 0.25, 0.61)]) == pytest.approx([0.0, 0.2], abs=1e-6)
+    assert field.frame == BASE_FRAME
+    field.require_fresh(time.monotonic_ns(), 10.0)
+    bench.call(Empty, "/octomap/reset")
+    newer = reader.latest()
+    assert newer.version > field.version
+    assert newer.at([ON_TABLE]) == pytest.approx([0.4])
+    bench.node.close()
+    assert not bench.field.exists()
+
+
+def test_clouds_are_a_second_input(ros, tmp_path) -> None:
+    """cloud_in, in any known frame."""
+    bench = Bench(ros, tmp_path, cloud_topic="cloud_in")
+    clouds = ros.node.create_publisher(PointCloud2, "cloud_in", QOS_SENSOR)
+    at = np.array([ON_TABLE], np.float64)
+    points = se3.apply(se3.inverse(T_BASE_CAMERA), at).astype(np.float32)
+    points = np.concatenate([points, [[np.nan] * 3]]).astype(np.float32)
+
+    due = 0.0
+
+    def step() -> bool:
+        nonlocal due
+        if time.monotonic() < due:
+            return bench.state(ON_TABLE) == "occupied"
+        due = time.monotonic() + 0.1
+        bench.t_ns += 100_000_000
+        state = JointState(name=list(JOINTS), position=[0.0] * len(JOINTS))
+        state.header.stamp = ns_to_stamp(bench.t_ns)
+        bench.joints.publish(state)
+        clouds.publish(cloud_from_points(points, FRAME, bench.t_ns))
+        return bench.state(ON_TABLE) == "occupied"
+
+    ros.spin_until(step, 20.0, "the point is in the map")
+    assert bench.state(ABOVE) in ("free", "unknown")
+
+
+def test_pictures_of_the_map_while_somebody_looks(bench) -> None:
+    """Centres, coloured cubes, the projection, and what changed."""
+    got: dict[str, list] = {"c": [], "m": [], "p": [], "d": []}
+    node = bench.ros.node
+    node.create_subscription(PointCloud2, "octomap_point_cloud_centers", got["c"].append, QOS_LATCHED)
+    node.create_subscription(MarkerArray, "occupied_cells_vis_array", got["m"].append, QOS_LATCHED)
+    node.create_subscription(OccupancyGrid, "projected_map", got["p"].append, QOS_LATCHED)
+    node.create_subscription(PointCloud2, "octomap_changes", got["d"].append, QOS_LATCHED)
+    bench.show(sheet(0.41), lambda: all(got.values()) and got["p"][-1].data.count(100), "all pictures")
+    centres = points_from_cloud(got["c"][-1])
+    assert np.abs(centres - np.array(ON_TABLE)).sum(axis=1).min() < 0.02
+    assert len(got["m"][-1].markers[0].points) == len(got["m"][-1].markers[0].colors) > 100
+    grid = got["p"][-1]
+    column = int((ON_TABLE[0] - grid.info.origin.position.x) / 0.02)
+    row = int((ON_TABLE[1] - grid.info.origin.position.y) / 0.02)
+    assert grid.data[row * grid.info.width + column] == 100
+    assert got["d"][-1].fields[3].name == "state"
+
+
+@pytest.mark.parametrize(
+    ("pixels", "encoding", "frame", "k", "text"),
+    [
+        (np.zeros((480, 640), np.uint8), "mono8", FRAME, K, "'mono8' is not supported"),
+        (np.zeros((240, 320), np.uint16), "16UC1", FRAME, K, "320x240"),
+        (np.zeros((1, 1), np.float32), "32FC1", FRAME, K, "1x1"),
+        (np.zeros((480, 640), np.uint16), "16UC1", "overhead_link", K, "expected the optical frame"),
+        (np.zeros((480, 640), np.uint16), "16UC1", "nowhere", K, "'nowhere' is not connected"),
+    ],
+)
+def test_b28_b30_b34_b60_what_does_not_fit_is_named_and_the_map_unharmed(
+    bench, pixels, encoding, frame, k, text
+) -> None:
+    bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
+    bench.show(pixels, lambda: bench.heard(text), f"diagnostics with {text!r}", encoding, frame=frame)
+    assert bench.state(ON_TABLE) == "occupied"
+
+
+def test_b59_b60_a_frame_without_a_joint_state_at_its_stamp_is_skipped(bench) -> None:
+    """Here 20 s ahead of the robot."""
+    bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
+    bench.t_ns += 20_000_000_000
+    dark = np.zeros((480, 640), np.uint16)
+    ahead = {"send": {"joints": False}}
+    bench.show(dark, lambda: bench.heard("no joint state at stamp"), "the gap is named", **ahead)
+    assert bench.state(ON_TABLE) == "occupied"
+    assert int(bench.value("overhead_late")) > 0
+
+
+def test_zero_focal_length_is_named(bench) -> None:
+    info = info_from_intrinsics(K, FRAME, 0)
+    info.k = [0.0] * 9
+    bench.show(sheet(0.41), lambda: bench.heard("not calibrated"), "it is named", send={"info": info})
+    assert bench.maps == []
+
+
+def test_a_camera_that_falls_silent_is_named(ros, tmp_path) -> None:
+    """The other one goes on."""
+    bench = Bench(ros, tmp_path, cameras=["overhead", "wrist"], stale_after=0.5)
+    bench.show(sheet(0.41), lambda: bench.heard("wrist never used"), "the silent camera is named")
+    assert bench.state(ON_TABLE) == "occupied"
+    field = DistanceFieldReader(bench.field).latest()
+    with pytest.raises(OpenArmError, match="'wrist' has not contributed"):
+        field.require_fresh(time.monotonic_ns(), 1.0)
+
+
+def test_unknown_cameras_and_wrong_parameters_are_refused(ros) -> None:
+    for params, text in (({"cameras": ["spectator"]}, "has no depth"), ({"grid.resolution": 0.0}, "grid.resolution")):
+        with pytest.raises(OpenArmError, match=text):
+            OctomapNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()])
