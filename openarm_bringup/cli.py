@@ -28,7 +28,17 @@ Exit code 0: what was asked happened. 1: it did not; a code and a sentence say w
 
 def build_app() -> App:
     """Return the application with all its commands."""
-    from openarm_bringup import checks_cli, demo_cli, doctor_cli, graph_cli, inspect_cli, model_cli, pick_cli, up_cli
+    from openarm_bringup import (
+        calibrate_cli,
+        checks_cli,
+        demo_cli,
+        doctor_cli,
+        graph_cli,
+        inspect_cli,
+        model_cli,
+        pick_cli,
+        up_cli,
+    )
 
     app = App(
         name="openarm",
@@ -48,6 +58,7 @@ def build_app() -> App:
     app.command(inspect_cli.logs)
     app.command(model_cli.model)
     app.command(graph_cli.app)
+    app.command(calibrate_cli.app)
     return app
 
 

@@ -74,7 +74,7 @@ def judge(
 
     Args:
         track: Samples in the order of time, the first from before anything moved.
-        target_xy: Where the footprint centre should be, m, world.
+        target_xy: Where the footprint centre should be, m, world; NaN when no place was chosen.
         claimed: Whether the run reported success.
         config: Tolerances.
 
@@ -95,7 +95,9 @@ def judge(
     reasons: list[str] = []
     if rise < rules.lift:
         reasons.append(f"never lifted: it rose {1e3 * rise:.0f} mm, at least {1e3 * rules.lift:.0f} were expected")
-    if not error <= rules.place_tolerance:  # a target of NaN (none was chosen) is not met
+    if math.isnan(error):
+        reasons.append("no place was chosen for it")
+    elif error > rules.place_tolerance:
         reasons.append(
             f"stands {1e3 * error:.1f} mm from the target, at most {1e3 * rules.place_tolerance:.0f} are allowed"
         )

@@ -118,3 +118,13 @@ def _locked(path: Path) -> bool:
     except (BlockingIOError, PermissionError):
         return True
     return False
+
+
+def main() -> None:
+    """`python -m openarm_bringup.shm DOMAIN`: clean up after a graph whose supervisor is dead."""
+    clean_shm()
+    sweep(ports_of(int(sys.argv[1])))
+
+
+if __name__ == "__main__":
+    main()

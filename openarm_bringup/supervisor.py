@@ -101,7 +101,7 @@ class Supervisor:
             "-I",
             "-S",
             guard.__file__,
-            *(shm.clean_command() or []),
+            *(sys.executable, "-m", shm.__name__, str(environment.domain_id(self.graph))),
             stdin=asyncio.subprocess.PIPE,
             start_new_session=True,
         )

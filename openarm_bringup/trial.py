@@ -199,6 +199,7 @@ def run_trial(
     wall_s = time.monotonic() - began
     target_xy = _target(result, ask)
     _wait_rest(observer, item.name, rules)
+    _wait_idle(observer)
     claimed = not isinstance(result, OpenArmError) and result.success
     verdict = judge(observer.track(item.name), target_xy, claimed=claimed, config=rules)
     steps = observer.steps()
@@ -227,6 +228,11 @@ def _target(result: GraspResult | OpenArmError, ask: Ask) -> tuple[float, float]
     if isinstance(result, OpenArmError) or not any(result.place_position):
         return (math.nan, math.nan)
     return (result.place_position[0], result.place_position[1])
+
+
+def _wait_idle(observer: Observer) -> None:
+    """Wait until no grasp runs any more, also after a request whose answer never came: the next trial resets the world."""
+    observer.wait(lambda: not observer.steps() or observer.steps()[-1].state == "IDLE", 90.0, "the end of the grasp")
 
 
 def _wait_rest(observer: Observer, name: str, rules: JudgeConfig) -> None:

@@ -260,7 +260,8 @@ def test_p34_grandchildren_end_with_their_node(tmp_path: Path) -> None:
     async def run_it() -> list[int]:
         async with running(tmp_path, {"parent": toy(tmp_path, "parent", body)}) as run:
             await run.supervisor.wait_ready()
-            await run.until(lambda: (tmp_path / "parent.child").exists())
+            child = tmp_path / "parent.child"
+            await run.until(lambda: child.exists() and child.read_text() != "")
             return [run.supervisor.pid("parent"), int((tmp_path / "parent.child").read_text())]
 
     wait_gone(asyncio.run(run_it()), 2.0)

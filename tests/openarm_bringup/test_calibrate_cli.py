@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm calibrate` typed as a user would, with what can be wrong."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+from openarm_bringup import cli
+
+_spec = importlib.util.spec_from_file_location(
+    "calibration_sessions", Path(__file__).parents[1] / "openarm_calibration" / "conftest.py"
+)
+assert _spec is not None
+assert _spec.loader is not None
+sessions = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(sessions)
+
+
+@pytest.fixture(scope="module")
+def session_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("session") / "wrist.npz"
+    sessions.make_session("in_hand", 12).samples.save(path)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _own_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
+
+
+def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
+    code = cli.run(["calibrate", *argv])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_p28_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_path: Path) -> None:
+    """From a session file to a stored calibration and a page, and back."""
+    code, out, _ = run(capsys, "solve", str(session_file))
+    assert code == 0
+    assert "predicted" in out
+    assert "DANIILIDIS" in out
+    assert run(capsys, "list")[1].startswith("0 stored")
+    code, out, _ = run(capsys, "save", str(session_file))
+    assert code == 0
+    assert "Stored in" in out
+    assert run(capsys, "save", str(session_file), "--algorithm", "park", "--force")[0] == 0
+    code, out, _ = run(capsys, "list")
+    assert "2 in its history" in out
+    assert "mount seed 1" in out
+    assert run(capsys, "rollback", "wrist")[0] == 0
+    code, _, err = run(capsys, "rollback", "wrist")
+    assert code == 1
+    assert "going back needs one before" in err
+    page = tmp_path / "report.html"
+    assert run(capsys, "report", str(session_file), str(page))[0] == 0
+    text = page.read_text()
+    assert text.count("<svg") == 4
+    assert "http" not in text.replace("http-equiv", "")
+    code, out, _ = run(capsys, "check", str(session_file), "--json")
+    data = json.loads(out)
+    assert code == 0
+    assert data["grade"] == "pass"
+    assert data["figures"]["drift"] < 1e-6
+
+
+@pytest.mark.parametrize("name", ["board.png", "board.pdf", "board.xml"])
+@pytest.mark.parametrize("kind", ["circles", "charuco"])
+def test_a43_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) -> None:
+    path = tmp_path / "new" / name
+    code, out, _ = run(capsys, "board", str(path), "--kind", kind)
+    assert code == 0
+    assert path.stat().st_size > 500
+    assert "mm" in out
+
+
+@pytest.mark.parametrize(
+    ("argv", "code", "words"),
+    [
+        (["board"], 2, "out"),
+        (["board", "b.gif"], 2, "written as .png, .pdf, .xml"),
+        (["board", "b.png", "--rows", "10"], 2, "odd"),
+        (["board", "b.png", "--kind", "dots"], 2, "dots"),
+        (["board", "b.png", "--dpi", "7"], 2, "expected 50 to 2400"),
+        (["solve"], 2, "session"),
+        (["solve", "nowhere.npz"], 1, "does not exist"),
+        (["solve", "SESSION", "--algorithm", "tsay"], 2, "algorithms: REFINED, TSAI"),
+        (["solve", "SESSION", "--exclude", "s999"], 2, "samples: s001"),
+        (["solve", __file__], 1, "no session file, or damaged"),
+        (["report", "SESSION", "page.doc"], 2, "written as .html"),
+        (["rollback", "../wrist"], 2, "camera name"),
+        (["rollback", "wrist"], 1, "has 0 stored"),
+        (["frobnicate"], 2, "frobnicate"),
+    ],
+)
+def test_wrong_calls_say_what_is_wrong(
+    capsys, session_file: Path, tmp_path: Path, monkeypatch, argv: list[str], code: int, words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    got, _, err = run(capsys, *[str(session_file) if word == "SESSION" else word for word in argv])
+    assert got == code, err
+    assert words in err
+    assert "Traceback" not in err
+    assert list(tmp_path.glob("b.*")) == []
+
+
+def test_a41_a_degenerate_session_is_exit_code_1_with_advice(capsys, session_file: Path) -> None:
+    names = [f"s{k:03d}" for k in range(3, 13)]
+    code, _, err = run(capsys, "solve", str(session_file), *[word for n in names for word in ("--exclude", n)])
+    assert code == 1
+    assert "DEGENERATE: too few poses: 2" in err
