@@ -2,8 +2,8 @@
 """Calibration boards: an asymmetric circle grid, or ChArUco.
 
 Board frame: origin in the middle of the marks, x right and y down as the board is read, z into the board, away from
-who looks at it; metres. A board lies in an image so that its axes turn as those of the image do: a mirrored one is no
-board.
+who looks at it; metres. A board lies in an image so that its axes turn as those of the image do. (The mirror image of
+a circle grid is the grid itself after half a turn, so that a mirrored camera is told by ChArUco only.)
 """
 
 from __future__ import annotations
@@ -92,10 +92,10 @@ class Charuco(Config):
     """A chessboard with markers in its white squares; a part of it is enough."""
 
     kind: Literal["charuco"] = "charuco"
-    columns: int = Field(9, ge=3, le=40, description="squares in a row")
-    rows: int = Field(7, ge=3, le=40, description="rows of squares")
-    spacing: float = Field(0.024, gt=0.001, le=0.5, description="edge of a square, m")
-    diameter: float = Field(0.018, gt=0.0, le=0.5, description="edge of a marker, m")
+    columns: int = Field(7, ge=3, le=40, description="squares in a row")
+    rows: int = Field(5, ge=3, le=40, description="rows of squares")
+    spacing: float = Field(0.034, gt=0.001, le=0.5, description="edge of a square, m")
+    diameter: float = Field(0.026, gt=0.0, le=0.5, description="edge of a marker, m")
     border: float = Field(0.012, ge=0.0, le=0.5, description="of white around the squares, m")
     dictionary: str = Field("DICT_5X5_100", description="of the markers")
 

@@ -3,27 +3,19 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 
 import pytest
 
 from openarm_bringup import cli
-
-_spec = importlib.util.spec_from_file_location(
-    "calibration_sessions", Path(__file__).parents[1] / "openarm_calibration" / "conftest.py"
-)
-assert _spec is not None
-assert _spec.loader is not None
-sessions = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(sessions)
+from openarm_calibration.synthetic_session import make_session
 
 
 @pytest.fixture(scope="module")
 def session_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("session") / "wrist.npz"
-    sessions.make_session("in_hand", 12).samples.save(path)
+    make_session("in_hand", 12).samples.save(path)
     return path
 
 

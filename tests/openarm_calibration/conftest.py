@@ -1,87 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A session of the real arm's kinematics with a known mount."""
+"""A session of the arm's own kinematics with a known mount."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
-import numpy as np
 import pytest
 
-from openarm_calibration.board import CircleGrid
-from openarm_calibration.detect import Detection
-from openarm_calibration.projection import project
-from openarm_calibration.samples import Sample, SampleSet, SessionHead
-from openarm_common import se3
-from openarm_common.cameras import T_LINK_OPTICAL, load_cameras, true_mount
-from openarm_common.description import RobotDescription
-
-BOARD = CircleGrid()
-
-
-@dataclass(frozen=True, eq=False)
-class Known:
-    """Samples and the true mount (optical frame)."""
-
-    samples: SampleSet
-    X: np.ndarray
-    description: RobotDescription
-
-
-def make_session(
-    setup: str = "in_hand",
-    count: int = 15,
-    px: float = 0.05,
-    *,
-    delay: float = 0.0,
-    speed: float = 0.0,
-    spread: float = 0.35,
-    seed: int = 0,
-) -> Known:
-    """Samples at random joints around a view of the board; with `speed` (rad/s) the arm moves at every image."""
-    rng = np.random.default_rng(seed)
-    description = RobotDescription.load()
-    cameras = load_cameras()
-    camera = cameras["wrist" if setup == "in_hand" else "overhead"]
-    carrier = camera.parent if setup == "in_hand" else "openarm_right_link7"
-    k = camera.intrinsics
-    head = SessionHead(
-        camera=camera.name, setup=setup, parent=camera.parent, carrier=carrier, mount_seed=1,
-        intrinsics=(k.width, k.height, k.fx, k.fy, k.cx, k.cy), board=BOARD.model_dump(),
-    )  # fmt: skip
-    samples = SampleSet(head, description)
-    names = samples.joint_names
-    home = description.group_state("right_arm", "home")
-    middle = np.array([home[name] for name in names])
-    X = true_mount(camera, 1) @ T_LINK_OPTICAL
-    A = samples.pose(dict(zip(names, middle, strict=True)))
-    seen = se3.make(se3.rot_x(0.3) @ se3.rot_z(0.2), (0.0, 0.0, 0.36 if setup == "in_hand" else 0.6))
-    Z = A @ X @ seen if setup == "in_hand" else se3.inverse(A) @ X @ seen
-    row = np.array([k.fx, k.fy, k.cx, k.cy])
-
-    def view(q: np.ndarray) -> np.ndarray:
-        A = samples.pose(dict(zip(names, q, strict=True)))
-        T = se3.inverse(X) @ (se3.inverse(A) if setup == "in_hand" else A) @ Z
-        if not T[2, 2] > 0.4:
-            return np.full((1, 2), np.nan)
-        return project(BOARD.points, BOARD.radius, T, row), T
-
-    while len(samples) < count:
-        q = middle + rng.uniform(-spread, spread, len(names))
-        v = rng.uniform(-1.0, 1.0, len(names)) * speed
-        got = view(q - v * delay)
-        if len(got) == 1 or not ((got[0] > 5) & (got[0] < (634, 474))).all():
-            continue
-        pixels, T = got
-        t = 10**9 * (1 + len(samples))
-        track = tuple(
-            (t + 10**7 * j, dict(zip(names, (q + v * 0.01 * j).tolist(), strict=True))) for j in range(-10, 11)
-        )
-        detection = Detection(np.arange(len(BOARD.points)), pixels + rng.normal(0.0, px, pixels.shape), px)
-        joints = dict(zip(names, q.tolist(), strict=True))
-        samples.add(Sample(f"s{len(samples) + 1:03d}", t, t, joints, speed, detection, T, b"", track if speed else ()))
-    return Known(samples, X, description)
+from openarm_calibration.synthetic_session import Known, make_session
 
 
 @pytest.fixture

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Boards, their files, and finding them in images, also in MuJoCo's."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import mujoco
+import numpy as np
+import pytest
+
+from openarm_calibration.board import Board, Charuco, CircleGrid, parse_board
+from openarm_calibration.board_files import TEXTURE_SCALE, png, write_board
+from openarm_calibration.detect import detect, guess_pose
+from openarm_calibration.projection import project
+from openarm_common import se3
+from openarm_common.cameras import Intrinsics
+from openarm_common.errors import Code, OpenArmError
+
+K = Intrinsics.from_fovy(640, 480, 60.0)
+ROW = np.array([K.fx, K.fy, K.cx, K.cy])
+BOARDS = (CircleGrid(), Charuco())
+
+
+def pose(rng: np.random.Generator, far: float = 0.7) -> np.ndarray:
+    tilt = se3.exp_so3((*rng.normal(0.0, 0.35, 2), 0.0))
+    return se3.make(tilt @ se3.rot_z(rng.uniform(-3.1, 3.1)), (*rng.uniform(-0.04, 0.04, 2), rng.uniform(0.3, far)))
+
+
+def photograph(board: Board, T: np.ndarray, rng: np.random.Generator, mirrored: bool = False) -> np.ndarray:
+    """Picture of a board: 16 samples a pixel, grey noise of 2."""
+    scale, zoom = 4000.0, 4
+    w, h = board.size
+    to_board = np.array([[1 / scale, 0, 0.5 / scale - w / 2], [0, 1 / scale, 0.5 / scale - h / 2], [0, 0, 1]])
+    camera = K.matrix
+    camera[:2] *= zoom
+    camera[:2, 2] += (zoom - 1) / 2
+    H = camera @ np.stack([T[:3, 0], T[:3, 1], T[:3, 3]], axis=1) @ to_board
+    picture = board.draw(scale)
+    image = cv2.warpPerspective(picture[:, ::-1] if mirrored else picture, H, (640 * zoom, 480 * zoom), borderValue=130)
+    image = cv2.resize(image, (640, 480), interpolation=cv2.INTER_AREA) + rng.normal(0.0, 2.0, (480, 640))
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
+def test_a42_boards_are_found_in_at_least_95_percent_of_views_and_never_in_a_wrong_order(board: Board) -> None:
+    """Any turn in the image, tilts to 40°: every mark is within a pixel of its own place."""
+    rng = np.random.default_rng(1)
+    found = seen = 0
+    while seen < 20:
+        T = pose(rng)
+        true = project(board.points, board.radius, T, ROW)
+        if not ((true > 10) & (true < (629, 469))).all():
+            continue
+        seen += 1
+        try:
+            detection = detect(board, photograph(board, T, rng))
+        except OpenArmError:
+            continue
+        found += 1
+        away = np.linalg.norm(detection.pixels - true[detection.ids], axis=1)
+        assert away.max() < (0.1 if board.kind == "circles" else 1.0)
+        T_found, _ = guess_pose(board.points[detection.ids], detection.pixels, board.radius, K)
+        assert np.linalg.norm(T_found[:3, 3] - T[:3, 3]) < 2e-3
+    assert found >= 0.95 * seen
+
+
+def test_a42_a_mirrored_board_is_not_read_as_one() -> None:
+    """The mirror image of a circle grid is the grid itself after half a turn: there only ChArUco can tell."""
+    rng = np.random.default_rng(2)
+    T = se3.make(se3.rot_x(0.2), (0.0, 0.0, 0.4))
+    with pytest.raises(OpenArmError) as caught:
+        detect(Charuco(), photograph(Charuco(), T, rng, mirrored=True))
+    assert caught.value.code == Code.NOTHING_DETECTED
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
+def test_an_image_without_the_board_says_what_was_seen(board: Board) -> None:
+    with pytest.raises(OpenArmError, match=r"expected; is all of the board|are needed; is the board") as caught:
+        detect(board, np.full((480, 640), 128, np.uint8))
+    assert caught.value.code == Code.NOTHING_DETECTED
+    with pytest.raises(OpenArmError, match="grey 8-bit"):
+        detect(board, np.zeros((4, 4, 3), np.uint8))
+
+
+def test_a43_the_board_in_mujoco_is_found_to_a_twentieth_of_a_pixel(tmp_path: Path) -> None:
+    """Its MJCF, rendered as the suite's cameras are; no bias, so pixel conventions agree."""
+    board = CircleGrid()
+    write_board(board, tmp_path / "board.xml")
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "board.xml"))
+    spec.worldbody.add_camera(name="c", fovy=60.0)
+    spec.visual.headlight.ambient = (0.6, 0.6, 0.6)
+    spec.visual.quality.offsamples = 0
+    spec.visual.map.znear, spec.stat.extent = 0.02, 1.0
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(3)
+    errors = []
+    with mujoco.Renderer(model, 480, 640) as renderer:
+        while len(errors) < 6:
+            T = pose(rng)
+            true = project(board.points, board.radius, T, ROW)
+            if not ((true > 10) & (true < (629, 469))).all():
+                continue
+            placed = se3.make(se3.rot_x(np.pi)) @ T
+            model.body("calibration_board").pos[:] = placed[:3, 3]
+            model.body("calibration_board").quat[:] = np.roll(se3.quat_xyzw_from_matrix(placed[:3, :3]), 1)
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, "c")
+            errors.append(detect(board, cv2.cvtColor(renderer.render(), cv2.COLOR_RGB2GRAY)).pixels - true)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.05
+    assert np.abs(np.mean(np.concatenate(errors), axis=0)).max() < 0.01
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
+def test_png_and_pdf_are_true_to_scale(board: Board, tmp_path: Path) -> None:
+    """The PNG carries its resolution and has as many pixels as its size asks for; the PDF page holds the board."""
+    data = png(board, 300)
+    at = data.index(b"pHYs") + 4
+    per_metre, _, unit = struct.unpack(">IIB", data[at : at + 9])
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert unit == 1
+    assert image.shape[1] / per_metre == pytest.approx(board.size[0], abs=2e-4)
+    write_board(board, tmp_path / "board.pdf")
+    page = (tmp_path / "board.pdf").read_bytes()
+    assert page.startswith(b"%PDF-1.4")
+    assert page.rstrip().endswith(b"%%EOF")
+    box = page[page.index(b"/MediaBox [") + 11 :].split(b"]")[0].split()
+    assert float(box[2]) / 72 * 0.0254 >= board.size[0]
+    assert TEXTURE_SCALE > 4000
+
+
+def test_drawn_marks_are_where_points_say() -> None:
+    """Centroids of the drawn circles."""
+    board = CircleGrid()
+    image = board.draw(5000.0)
+    count, _, _, centroids = cv2.connectedComponentsWithStats((image < 128).astype(np.uint8))
+    assert count == 45
+    middle = np.array(image.shape[::-1]) / 2.0 - 0.5
+    drawn = (centroids[1:] - middle) / 5000.0
+    for x, y in board.points[:, :2]:
+        assert np.linalg.norm(drawn - (x, y), axis=1).min() < 5e-5
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        ({"rows": 10}, "looks the same after half a turn"),
+        ({"diameter": 0.03}, "touch"),
+        ({"border": 0.001}, "cuts the outer circles"),
+        ({"kind": "chess"}, "no board 'chess'; boards: circles, charuco"),
+        ({"size": 3}, "unknown key"),
+        ({"kind": "charuco", "dictionary": "DICT_X"}, "unknown dictionary; dictionaries: DICT_4X4_100"),
+        ({"kind": "charuco", "diameter": 0.034}, "expected 0.4 to 0.9"),
+        ({"spacing": float("nan")}, "spacing"),
+    ],
+)
+def test_boards_that_cant_work_are_refused(data: dict[str, object], words: str) -> None:
+    with pytest.raises(OpenArmError, match=words):
+        parse_board(data)
