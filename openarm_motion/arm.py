@@ -212,12 +212,25 @@ class Arm:
             OpenArmError: NO_PLAN, saying what is in the way of the straight joint line; CANCELLED.
         """
         search = self.config.planning
+        query = self.query(scene, now, goals, time_limit)
+        try:
+            return self._planner.plan(query)
+        except OpenArmError as error:
+            if error.code != Code.NO_PLAN:
+                raise
+            hit = scene.first_hit(now.start, goals[0], search.edge_step, search.edge_travel)
+            blocked = "" if hit is None else f"; on the direct way {scene.contacts(hit)[0]}"
+            raise OpenArmError(Code.NO_PLAN, error.message + blocked) from error
+
+    def query(self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float) -> PlanQuery:
+        """What a planner is asked for a path to one of several configurations (k, n)."""
+        search = self.config.planning
         limits = self.limits(now.scale)
 
         def edge_free(a: Array, b: Array) -> bool:
             return scene.edge_free(a, b, search.edge_step, search.edge_travel)
 
-        query = PlanQuery(
+        return PlanQuery(
             start=now.start,
             goals=goals,
             lower=self.kinematics.lower,
@@ -229,14 +242,6 @@ class Arm:
             seed=search.seed,
             stopped=now.stopped,
         )
-        try:
-            return self._planner.plan(query)
-        except OpenArmError as error:
-            if error.code != Code.NO_PLAN:
-                raise
-            hit = scene.first_hit(now.start, goals[0], search.edge_step, search.edge_travel)
-            blocked = "" if hit is None else f"; on the direct way {scene.contacts(hit)[0]}"
-            raise OpenArmError(Code.NO_PLAN, error.message + blocked) from error
 
     def time_free(self, path: PlannedPath, scale: float) -> Trajectory:
         """Timed free path, at rest in its corners."""

@@ -121,7 +121,7 @@ def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float], o
     Raises:
         OpenArmError: IN_COLLISION, with the pair and the time.
     """
-    keep = Clearance(world=_PAIR_CLEARANCE)
+    keep = Clearance(arms=_PAIR_CLEARANCE)
     scene = CollisionScene(arm.robot, Surroundings(state=state, clearance=keep, own=False))
     if scene.relax(motion.q[0], arm.config.planning.start_overlap) is not None:
         return  # it is in contact already: any way out is better than none, and the plan has looked at it

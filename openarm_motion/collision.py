@@ -54,7 +54,8 @@ class Clearance(Config):
     own: float = Field(
         default=0.003, ge=0.0, le=0.05, description="between links of the arm, and to the robot's body, m"
     )
-    world: float = Field(default=0.010, ge=0.0, le=0.1, description="arm to boxes and to the other arm, m")
+    world: float = Field(default=0.010, ge=0.0, le=0.1, description="arm to boxes, m")
+    arms: float = Field(default=0.010, ge=0.0, le=0.1, description="arm to the other arm, m")
     hand: float = Field(default=0.010, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
     touch: float = Field(
         default=0.002, ge=0.0, le=0.05, description="arm and palm to a box that the fingers may touch, m"
@@ -162,7 +163,7 @@ class CollisionScene:
         difference = b - a
         size = np.abs(difference)
         n = int(np.ceil(max(float(size.max()) / step, float(size @ self.levers) / travel, 1.0)))
-        for u in _spread(n):
+        for u in spread(n):
             q = a + u * difference
             if self.collides(q):
                 return q
@@ -202,6 +203,10 @@ class CollisionScene:
         """Move the robot's other joints."""
         self._q = self._robot.configuration(state)
 
+    def put_other(self, other: CollisionScene, q: ArrayLike) -> None:
+        """Move the arm of another scene of the same robot to its configuration (n,)."""
+        other._robot.put(self._q, q)
+
     def _colliding(self, q: ArrayLike) -> list[int]:
         self._robot.put(self._q, q)
         pin.computeCollisions(self._robot.model, self._data, self._geometry, self._geometry_data, self._q, False)
@@ -226,7 +231,7 @@ class CollisionScene:
         robot, around, keep = self._robot, self._around, self._around.clearance
         own = robot.arm.fixed | robot.arm.moving
         pairs = [pair for pair in robot.pairs if around.own or robot.links[pair[1]] not in own]
-        required = [keep.own if robot.links[j] in own else keep.world for _, j in pairs]
+        required = [keep.own if robot.links[j] in own else keep.arms for _, j in pairs]
         tool = robot.joints[-1]
         held = [self._add(self._held_name(box.id), tool, robot.kinematics.tip @ box.T, box) for box in around.held]
         for h in held:
@@ -234,7 +239,9 @@ class CollisionScene:
             for i, link in enumerate(robot.links):
                 if link not in robot.arm.hand and (around.own or link not in own):
                     pairs.append((h, i))
-                    required.append(keep.own if link in robot.arm.moving else keep.world)
+                    required.append(
+                        keep.own if link in robot.arm.moving else keep.arms if link not in own else keep.world
+                    )
         for box in around.boxes:
             b = self._add(box.id, 0, box.T, box)
             touchable = box.id in around.touchable
@@ -272,7 +279,7 @@ def box_from(id: str, p: ArrayLike, size: ArrayLike, R: Array | None = None) -> 
 
 
 @lru_cache(maxsize=512)
-def _spread(n: int) -> tuple[float, ...]:
+def spread(n: int) -> tuple[float, ...]:
     """0, 1/n, ..., 1 with the ends and far-apart points first, so that a collision is found early."""
     order: list[int] = [n, 0]
     gap = n

@@ -17,7 +17,7 @@ from openarm_motion.collision import Box, Clearance, CollisionScene, Surrounding
 from openarm_motion.collision_robot import CollisionRobot
 from openarm_motion.kinematics import ArmKinematics
 
-BARE = Clearance(own=0.0, world=0.0, hand=0.0, touch=0.0, rest=0.0)
+BARE = Clearance(own=0.0, world=0.0, arms=0.0, hand=0.0, touch=0.0, rest=0.0)
 
 
 def q_of(arm: Arm, state: dict[str, float]) -> np.ndarray:

@@ -32,7 +32,7 @@ def query(arm: Arm, scene: CollisionScene, start: np.ndarray, goals: np.ndarray,
 
 def assert_free(arm: Arm, state: dict[str, float], path: PlannedPath) -> None:
     """Nothing touches anywhere on the path, looked at more finely than the planner did; the table counts."""
-    touch = Clearance(own=0.0, world=0.0, hand=0.0, touch=0.0, rest=0.0)
+    touch = Clearance(own=0.0, world=0.0, arms=0.0, hand=0.0, touch=0.0, rest=0.0)
     scene = CollisionScene(arm.robot, Surroundings(state, arm.static, clearance=touch))
     for a, b in itertools.pairwise(path.waypoints):
         assert scene.edge_free(a, b, 0.01, 0.004)

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Planning problems on a table, in a shelf and for both arms, drawn from seeds. Base frame, m, rad."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_motion.arm import Arm
+from openarm_motion.collision import Box, box_from
+
+Array = NDArray[np.float64]
+#: Whether configurations collide that are free of everything else is asked of this.
+Collides = Callable[[Array], bool]
+
+TABLE_TOP = 0.40
+_TRIES = 400
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """One query: boxes around the robot, a start (n,) and goals (k, n); `state` has all the robot's joints."""
+
+    boxes: tuple[Box, ...]
+    state: Mapping[str, float]
+    start: Array
+    goals: Array
+
+
+def table_boxes(rng: np.random.Generator, count: int = 8) -> tuple[Box, ...]:
+    """Boxes that stand on the table, some of them over each other's edges."""
+    sizes = rng.uniform([0.04, 0.04, 0.08], [0.10, 0.12, 0.25], (count, 3))
+    x, y = rng.uniform(0.28, 0.62, count), rng.uniform(-0.45, 0.45, count)
+    return tuple(
+        box_from(f"box{i}", (x[i], y[i], TABLE_TOP + 0.5 * sizes[i, 2] + 0.001), sizes[i]) for i in range(count)
+    )
+
+
+def shelf(rng: np.random.Generator) -> tuple[tuple[Box, ...], Array]:
+    """A shelf of three by two cells on the table, open to the robot: its boards and the cells' middles (6, 3)."""
+    thick, depth, height = 0.015, 0.22, float(rng.uniform(0.24, 0.30))
+    x0 = 0.40 + float(rng.uniform(-0.02, 0.02))
+    y = np.array([-0.48, -0.16, 0.16, 0.48]) + rng.uniform(-0.03, 0.03, 4)
+    z0 = TABLE_TOP + 0.002
+    width, middle = float(y[-1] - y[0]), float(0.5 * (y[-1] + y[0]))
+    boards = [
+        box_from(f"upright{i}", (x0 + depth / 2, yi, z0 + height), (depth, thick, 2 * height)) for i, yi in enumerate(y)
+    ]
+    boards += [box_from(f"board{k}", (x0 + depth / 2, middle, z0 + k * height), (depth, width, thick)) for k in (1, 2)]
+    boards.append(box_from("back", (x0 + depth, middle, z0 + height), (thick, width, 2 * height)))
+    cells = [(x0 + 0.10, 0.5 * (y[i] + y[i + 1]), z0 + (k + 0.5) * height) for i in range(3) for k in range(2)]
+    return tuple(boards), np.array(cells)
+
+
+def around_box(arm: Arm, box: Box, rng: np.random.Generator, collides: Collides, want: int = 4) -> list[Array]:
+    """Free configurations with the hand 8 cm from a box, from above or from aside."""
+    found: list[Array] = []
+    for _ in range(20):
+        yaw, tilt = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.5 * math.pi)
+        R = se3.rot_z(yaw) @ se3.rot_x(math.pi - tilt)
+        pose = se3.make(R, box.T[:3, 3] - R[:, 2] * (0.08 + 0.5 * float(box.size.max())))
+        found += _free(arm, pose, rng, collides, 2)
+        if len(found) >= want:
+            break
+    return found[:want]
+
+
+def in_cell(arm: Arm, cell: Array, rng: np.random.Generator, collides: Collides, want: int = 4) -> list[Array]:
+    """Free configurations with the hand in a cell of the shelf."""
+    found: list[Array] = []
+    for _ in range(40):
+        yaw, pitch, roll = rng.uniform(-0.7, 0.7), 0.5 * math.pi + rng.uniform(-0.5, 0.5), rng.uniform(-np.pi, np.pi)
+        R = se3.rot_z(yaw) @ se3.rot_y(pitch) @ se3.rot_z(roll)
+        found += _free(arm, se3.make(R, cell + rng.uniform(-0.03, 0.03, 3)), rng, collides, 2)
+        if len(found) >= want:
+            break
+    return found[:want]
+
+
+def table_problems(arms: Sequence[Arm], home: Mapping[str, float], count: int, seed: int = 0) -> list[Problem]:
+    """From a random free configuration to one of several beside a box; the arms take turns."""
+    rng = np.random.default_rng(seed)
+    out: list[Problem] = []
+    while len(out) < count:
+        arm, boxes = arms[len(out) % len(arms)], table_boxes(rng)
+        collides = arm.scene(home, boxes).collides
+        goals = around_box(arm, boxes[int(rng.integers(len(boxes)))], rng, collides)
+        if goals:
+            out.append(Problem(boxes, home, random_free(arm, rng, collides), np.array(goals)))
+    return out
+
+
+def shelf_problems(arms: Sequence[Arm], home: Mapping[str, float], count: int, seed: int = 1) -> list[Problem]:
+    """From one cell of a shelf into another one; the arms take turns."""
+    rng = np.random.default_rng(seed)
+    out: list[Problem] = []
+    while len(out) < count:
+        arm = arms[len(out) % len(arms)]
+        boards, cells = shelf(rng)
+        # the other arm is where it hangs clear of the shelf
+        state = dict.fromkeys(home, 0.0)
+        collides = arm.scene(state, boards).collides
+        a, b = rng.choice(len(cells), 2, replace=False)
+        starts, goals = in_cell(arm, cells[a], rng, collides, 1), in_cell(arm, cells[b], rng, collides)
+        if starts and goals:
+            out.append(Problem(boards, state, starts[0], np.array(goals)))
+    return out
+
+
+def random_free(arm: Arm, rng: np.random.Generator, collides: Collides) -> Array:
+    """A random configuration that is free."""
+    for _ in range(_TRIES):
+        q = rng.uniform(arm.kinematics.lower, arm.kinematics.upper)
+        if not collides(q):
+            return q
+    raise RuntimeError(f"{_TRIES} random configurations collide, all of them")
+
+
+def _free(arm: Arm, pose: Array, rng: np.random.Generator, collides: Collides, want: int) -> list[Array]:
+    solutions = arm.inverse.solutions(pose, arm.config.planning.joint_margin)
+    order = rng.permutation(len(solutions))
+    found: list[Array] = []
+    for i in order[:12]:
+        if not collides(solutions[i].q):
+            found.append(solutions[i].q)
+            if len(found) == want:
+                break
+    return found
