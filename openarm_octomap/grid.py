@@ -173,7 +173,9 @@ class OccupancyGrid:
     def oldest_s(self, t_ns: int) -> float:
         """Seconds since the occupied cell was looked at that has waited longest; 0 without occupied cells."""
         seen = self.seen[self.states == OCCUPIED]
-        return float(self._milliseconds(t_ns) - seen.min()) / 1e3 if seen.size else 0.0
+        if not seen.size or self._epoch_ns is None:
+            return 0.0
+        return max(0.0, (t_ns - self._epoch_ns) * 1e-9 - float(seen.min()) * 1e-3)
 
     def counts(self) -> dict[str, int]:
         """How many cells are occupied, free and unknown."""

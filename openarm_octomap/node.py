@@ -20,6 +20,7 @@ from openarm_common.cameras import load_cameras
 from openarm_common.convert import xyz
 from openarm_common.distance_field import CameraMoment, DistanceFieldWriter, field_path
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.housings import with_housings
 from openarm_common.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
 from openarm_common.tf import RobotStateListener
 from openarm_octomap import convert
@@ -37,7 +38,8 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("octomap", OctomapNodeConfig, **kwargs)
         config = self.config
-        self._mapper = Mapper(self.description, config.grid, config.filter, config.field)
+        body = with_housings(self.description, load_cameras().values())
+        self._mapper = Mapper(body, config.grid, config.filter, config.field)
         self._cameras = [DepthSource(self, c, config.depth_topic, config.info_topic) for c in _cameras(config.cameras)]
         self._sources: list[Source[Image] | Source[PointCloud2]] = [*self._cameras]
         if config.cloud_topic:

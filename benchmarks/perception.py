@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth to cloud and to octree, beside the usual ways of doing it on the same images in the same run.
+
+    python benchmarks/perception.py [--quick] [--pyoctomap PYTHON] [--json PATH]
+
+Images are those of both cameras of the simulated robot (640 x 480, 16UC1, noise and dropouts) over demo and random
+scenes. Times are CPU times of one thread, median; a cycle is one update from the images of both cameras.
+
+    cloud_ms               depth image to organised points; peer: numpy with a meshgrid for every image
+    octree_cycle_ms        end cells, rays, log-odds and the binary octree of two cameras; peer: liboctomap (C++)
+    octree_cycle_full_ms   the same with self-filter, distance field and the reset of the robot's cells
+    octree_python_ratio    pyoctomap's time for a cycle over ours
+    distance_field_ms      of that: the distance field
+    self_filter_ms         of that: the labels of both images
+    voxel_mismatch         cells that differ from liboctomap's after all frames, cleared ones among them
+    map_iou, map_ghosts, map_missed   the map against the geometry of the simulator, true mounts, noisy depth
+    clear_ms, mark_ms      simulated time from an object's removal (arrival) to the map without (with) it, worst phase
+
+liboctomap is compiled from benchmarks/liboctomap_peer.cpp when g++ and its headers are there: those of Debian's
+liboctomap-dev, or those that come with the wheel cmeel-octomap (a dependency of pin). pyoctomap is used when this
+Python has it, or another one given by --pyoctomap.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.map_scene import MapScene
+from benchmarks.report import Row, write_report
+from openarm_common.octomap_codec import read_file
+from openarm_common.scene import load_scene, random_scene
+from openarm_octomap.accuracy import compare
+from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
+from openarm_octomap.distance import DistanceTransform
+from openarm_octomap.grid import DepthScan, OccupancyGrid
+from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN
+from openarm_octomap.mapper import Frame, Mapper
+from openarm_octomap.self_filter import SelfFilter
+from openarm_perception.depth import Deprojector, DepthLimits
+
+PERIOD_NS = 500_000_000
+#: liboctomap's numbers, so that its map and ours can be compared cell by cell.
+THEIRS = {
+    "hit": float(np.float32(np.log(0.7 / 0.3))),
+    "miss": float(np.float32(np.log(0.4 / 0.6))),
+    "clamp_min": float(np.float32(np.log(0.1192 / 0.8808))),
+    "clamp_max": float(np.float32(np.log(0.971 / 0.029))),
+    "max_range": -1.0,
+    "clear_without_return": False,
+}
+
+_PYOCTOMAP = """
+import sys, time
+import numpy as np, pyoctomap
+data = np.load(sys.argv[1])
+tree = pyoctomap.OcTree(0.02)
+cycles = []
+for i in range(0, int(data["n"]), 2):
+    begin = time.process_time()
+    for k in (i, i + 1):
+        tree.insertPointCloud(data[f"p{k}"].astype(np.float64), data[f"o{k}"].astype(np.float64), discretize=True)
+    cycles.append(time.process_time() - begin)
+print(1e3 * float(np.median(cycles)))
+"""
+
+
+def cpu_ms(work: Callable[[], object], repeats: int) -> float:
+    """Median CPU time of a call, ms; one call before does not count."""
+    work()
+    times: list[float] = []
+    for _ in range(repeats):
+        begin = time.process_time()
+        work()
+        times.append(time.process_time() - begin)
+    return float(np.median(times)) * 1e3
+
+
+def meshgrid_cloud(scan: DepthScan) -> np.ndarray:
+    """As tutorials do it."""
+    k = scan.intrinsics
+    z = scan.depth / 1000.0
+    u, v = np.meshgrid(np.arange(k.width), np.arange(k.height))
+    points = np.stack([(u - k.cx) * z / k.fx, (v - k.cy) * z / k.fy, z], axis=-1)
+    points[z == 0] = np.nan
+    return points
+
+
+def record(quick: bool) -> list[list[Frame]]:
+    """Pairs of images over changing scenes, arms in changing postures."""
+    rng = np.random.default_rng(5)
+    out: list[list[Frame]] = []
+    for seed in range(2 if quick else 5):
+        scene = MapScene(random_scene(seed) if seed else load_scene("demo"))
+        for i in range(3 if quick else 4):
+            for side in ("left", "right"):
+                for joint in (1, 2, 4, 6):
+                    scene.joints[f"openarm_{side}_joint{joint}"] += float(rng.uniform(-0.15, 0.15))
+            out.append(scene.frames((4 * seed + i) * PERIOD_NS, rng))
+        scene.close()
+    return out
+
+
+def cloud_rows(frames: Sequence[Frame], repeats: int) -> list[Row]:
+    """The organised cloud of one image."""
+    scan = frames[0].scan
+    if not isinstance(scan, DepthScan):
+        raise TypeError("a camera gives depth images")
+    deprojector = Deprojector(DepthLimits(near=scan.near, far=scan.far))
+    out = np.empty((*scan.depth.shape, 3), np.float32)
+    ours = cpu_ms(lambda: deprojector.organised(scan.depth, scan.intrinsics, out), repeats)
+    peer = cpu_ms(lambda: meshgrid_cloud(scan), max(5, repeats // 5))
+    return [Row("cloud_ms", ours, "ms", "lower", 1.0, "numpy meshgrid", peer, repeats)]
+
+
+def octree_rows(pairs: Sequence[Sequence[Frame]], repeats: int, python: str) -> list[Row]:
+    """The octree, exact, beside liboctomap and pyoctomap on the same points."""
+    grid = OccupancyGrid(GridConfig(**THEIRS))
+    times: list[float] = []
+    for turn in range(max(1, repeats // len(pairs)) + 1):
+        grid.reset()
+        for pair in pairs:
+            begin = time.process_time()
+            for frame in pair:
+                grid.integrate([frame.scan], frame.t_ns)
+            grid.binary()
+            times += [time.process_time() - begin] if turn else []
+    ours = float(np.median(times)) * 1e3
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder:
+        clouds = [frame.scan for pair in pairs for frame in pair]
+        cpp = liboctomap(clouds, Path(folder))
+        if cpp is not None:
+            cycle, states = cpp[0] / len(pairs), read_file(Path(folder) / "peer.bt").on(grid.lattice)[0]
+            theirs = np.where(np.isnan(states), UNKNOWN, np.where(states > 0, OCCUPIED, FREE))
+            different = int(np.count_nonzero(theirs != grid.states))
+            rows.append(Row("octree_cycle_ms", ours, "ms", "lower", 25.0, "liboctomap C++", cycle, len(times)))
+            rows.append(Row("voxel_mismatch", different, "", "lower", 0.0, n=int(np.count_nonzero(theirs))))
+        else:
+            rows.append(Row("octree_cycle_ms", ours, "ms", "lower", 25.0, n=len(times)))
+        binding = pyoctomap(clouds, Path(folder), python)
+        if binding is not None:
+            rows.append(
+                Row("octree_python_ratio", binding / ours, "x", "higher", None, "pyoctomap ms", binding, len(pairs))
+            )
+    return rows
+
+
+def liboctomap(scans: Sequence[DepthScan], folder: Path) -> tuple[float, float] | None:
+    """Insert frames with liboctomap; CPU time of insertion and encoding together and of encoding, ms."""
+    prefix = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix"
+    system = Path("/usr/include/octomap/octomap.h").is_file()
+    if shutil.which("g++") is None or not (system or (prefix / "include/octomap/octomap.h").is_file()):
+        print("liboctomap: no g++ or no headers (Debian: apt-get install g++ liboctomap-dev); left out")
+        return None
+    where = [] if system else [f"-I{prefix}/include", f"-L{prefix}/lib", f"-Wl,-rpath,{prefix}/lib"]
+    source, program = Path(__file__).with_name("liboctomap_peer.cpp"), folder / "peer"
+    # without contraction to fused operations, which make liboctomap differ from itself by a few cells
+    flags = ["-O3", "-march=native", "-ffp-contract=off", "-std=c++17"]
+    subprocess.run(["g++", *flags, str(source), "-o", str(program), *where, "-loctomap", "-loctomath"], check=True)
+    with (folder / "frames").open("wb") as file:
+        np.array([len(scans)], np.int32).tofile(file)
+        for scan in scans:
+            points = scan.points()
+            scan.T_base_camera[:3, 3].astype(np.float32).tofile(file)
+            np.array([len(points)], np.int32).tofile(file)
+            points.tofile(file)
+    arguments = [str(program), str(folder / "frames"), str(folder / "peer.bt"), "1"]
+    answer = subprocess.run(arguments, check=True, capture_output=True, text=True).stdout.split()
+    return float(answer[0]) + float(answer[1]), float(answer[1])
+
+
+def pyoctomap(scans: Sequence[DepthScan], folder: Path, python: str) -> float | None:
+    """Insert frames with pyoctomap; CPU time of a pair, ms, without encoding."""
+    if subprocess.run([python, "-c", "import pyoctomap"], capture_output=True).returncode:
+        print(f"pyoctomap: {python} does not have it (pip install pyoctomap, or --pyoctomap PYTHON); left out")
+        return None
+    some = scans[:4]
+    arrays = {f"p{i}": scan.points() for i, scan in enumerate(some)}
+    arrays |= {f"o{i}": scan.T_base_camera[:3, 3].astype(np.float32) for i, scan in enumerate(some)}
+    np.savez(folder / "frames.npz", n=len(some), **arrays)
+    arguments = [python, "-c", _PYOCTOMAP, str(folder / "frames.npz")]
+    return float(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout)
+
+
+def full_rows(scene: MapScene, pairs: Sequence[Sequence[Frame]], repeats: int) -> list[Row]:
+    """What the node does in an update, and its parts."""
+    mapper = Mapper(scene.body, GridConfig(), FilterConfig(), FieldConfig())
+    distances = np.empty(mapper.lattice.shape, np.float32)
+    times: list[float] = []
+    for turn in range(max(1, repeats // len(pairs)) + 1):
+        for pair in pairs:
+            begin = time.process_time()
+            report = mapper.update(pair, distances=distances, wanted={"states"})
+            times += [time.process_time() - begin] if turn else []
+    states = report.snapshot.states
+    if states is None:
+        raise TypeError("the states were asked for")
+    transform = DistanceTransform(mapper.lattice, FieldConfig().reach)
+    robot = SelfFilter(scene.body, FilterConfig())
+
+    def label() -> None:
+        for frame in pairs[0]:
+            robot.label_depth(frame.scan, robot.shapes(frame.joints or {}))
+
+    n = len(times)
+    return [
+        Row("octree_cycle_full_ms", float(np.median(times)) * 1e3, "ms", "lower", 40.0, n=n),
+        Row(
+            "distance_field_ms", cpu_ms(lambda: transform.compute(states, distances), repeats), "ms", "lower", 13.0, n=n
+        ),
+        Row("self_filter_ms", cpu_ms(label, repeats), "ms", "lower", None, n=n),
+    ]
+
+
+def accuracy_rows(quick: bool) -> list[Row]:
+    """The map against the geometry, and how long changes take to show; noisy depth, true mounts."""
+    ious, ghosts, missed, clear, mark = [], 0, 0, [], []
+    seeds = range(2 if quick else 10)
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        world = random_scene(seed)
+        scene = MapScene(world)
+        mapper = Mapper(scene.body, GridConfig(), FilterConfig(), FieldConfig())
+        homes = {item.name: item.centre(world.table) for item in world.objects}
+
+        def put(there: bool, scene: MapScene = scene, homes: dict[str, tuple[float, float, float]] = homes) -> None:
+            for i, (name, home) in enumerate(homes.items()):
+                scene.put(name, home if there else (3.0 + i, 3.0, 0.5))
+
+        t_ns = 0
+        for there, times in ((True, None), (False, clear), (True, mark)):
+            put(there)
+            truth = scene.truth(mapper.lattice)
+            # the change happens right after an update: the worst moment
+            for cycle in range(1, 9):
+                t_ns += PERIOD_NS
+                states = mapper.update(scene.frames(t_ns, rng), wanted={"states"}).snapshot.states
+                if states is None:
+                    raise TypeError("the states were asked for")
+                result = compare(states, truth.surface, truth.solid)
+                if times is not None and result.ghosts == 0 and result.missed <= 0.01 * result.surface:
+                    times.append(cycle * PERIOD_NS * 1e-6)
+                    break
+        ious.append(result.iou)
+        ghosts, missed = ghosts + result.ghosts, missed + result.missed
+        scene.close()
+    n = len(seeds)
+    return [
+        Row("map_iou", min(ious), "", "higher", 0.95, n=n),
+        Row("map_ghosts", ghosts, "", "lower", 0.0, n=n),
+        Row("map_missed", missed, "", "lower", None, n=n),
+        Row("clear_ms", max(clear) if len(clear) == n else float("inf"), "ms", "lower", 1000.0, n=n),
+        Row("mark_ms", max(mark) if len(mark) == n else float("inf"), "ms", "lower", 1000.0, n=n),
+    ]
+
+
+def main() -> None:
+    """Run all parts."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="fewer scenes and repetitions")
+    parser.add_argument("--pyoctomap", default=sys.executable, metavar="PYTHON", help="a Python that has pyoctomap")
+    parser.add_argument("--json", type=Path, default=None, help="also write the report there")
+    args = parser.parse_args()
+    repeats = 20 if args.quick else 100
+    pairs = record(args.quick)
+    scene = MapScene(load_scene("demo"))
+    rows = cloud_rows(pairs[0], repeats) + octree_rows(pairs, repeats, args.pyoctomap)
+    rows += full_rows(scene, pairs, repeats)
+    scene.close()
+    rows += accuracy_rows(args.quick)
+    write_report(rows, args.json)
+
+
+if __name__ == "__main__":
+    main()

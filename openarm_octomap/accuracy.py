@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well a map tells what is there: cells compared with the geometry that a simulator knows.
+
+Serves judges and tests; nothing that controls the robot reads it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, generate_binary_structure
+
+from openarm_octomap.kernels import OCCUPIED
+
+Bytes = NDArray[np.uint8]
+Cells = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MapAccuracy:
+    """A map against the truth.
+
+    Attributes:
+        occupied: Occupied cells of the map.
+        surface: Cells that have a surface which a camera sees.
+        iou: Cells in both over cells in one of them, where a cell beside the other's counts as in both: a surface on
+            the border of two cells belongs to either.
+        iou_strict: The same without that tolerance.
+        ghosts: Occupied cells with nothing solid in them or beside them.
+        missed: Cells of seen surfaces with nothing occupied in them or beside them.
+    """
+
+    occupied: int
+    surface: int
+    iou: float
+    iou_strict: float
+    ghosts: int
+    missed: int
+
+
+def compare(states: Bytes, surface: Cells, solid: Cells) -> MapAccuracy:
+    """Judge a map.
+
+    Args:
+        states: (nx, ny, nz) of the map.
+        surface: Cells that have a surface which a camera sees.
+        solid: Cells that have something solid, seen or not.
+    """
+    occupied = states == OCCUPIED
+    beside = generate_binary_structure(3, 3)
+    ghosts = occupied & ~np.asarray(binary_dilation(solid, beside))
+    missed = surface & ~np.asarray(binary_dilation(occupied, beside))
+    hits, found = int(occupied.sum() - ghosts.sum()), int(surface.sum() - missed.sum())
+    union = int(ghosts.sum()) + int(missed.sum()) + max(hits, found)
+    strict = int((occupied | surface).sum())
+    return MapAccuracy(
+        occupied=int(occupied.sum()),
+        surface=int(surface.sum()),
+        iou=max(hits, found) / union if union else 1.0,
+        iou_strict=int((occupied & surface).sum()) / strict if strict else 1.0,
+        ghosts=int(ghosts.sum()),
+        missed=int(missed.sum()),
+    )

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map against the geometry of the simulator: surfaces, ghosts, the sweeping arm and what it holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+
+from benchmarks.map_scene import MapScene, Visible
+from openarm_common import se3
+from openarm_common.scene import load_scene
+from openarm_octomap.accuracy import compare
+from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
+from openarm_octomap.kernels import OCCUPIED
+from openarm_octomap.mapper import Mapper
+from openarm_octomap.self_filter import HeldBox
+
+PERIOD_NS = 500_000_000
+DEMO = load_scene("demo")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Iterator[MapScene]:
+    out = MapScene(DEMO)
+    yield out
+    out.close()
+
+
+@pytest.fixture(scope="module")
+def truth(scene: MapScene) -> Visible:
+    return scene.truth(mapper(scene).lattice)
+
+
+def mapper(scene: MapScene, **robot: float) -> Mapper:
+    return Mapper(scene.body, GridConfig(), FilterConfig(**robot), FieldConfig())
+
+
+def states_after(target: Mapper, scene: MapScene, t_ns: int, rng=None, held=()) -> np.ndarray:
+    states = target.update(scene.frames(t_ns, rng), held, wanted={"states"}).snapshot.states
+    assert states is not None
+    return states
+
+
+def test_compare_counts_what_it_says() -> None:
+    """A surface seen one cell beside itself is neither a ghost nor missed."""
+    states, surface = np.zeros((9, 9, 9), np.uint8), np.zeros((9, 9, 9), bool)
+    surface[2:5, 4, 4] = True
+    states[2:5, 4, 5] = OCCUPIED
+    beside = compare(states, surface, surface)
+    assert (beside.iou, beside.iou_strict, beside.ghosts, beside.missed) == (1.0, 0.0, 0, 0)
+    states[8, 8, 8] = OCCUPIED
+    surface[0, 0, 0] = True
+    worse = compare(states, surface, surface)
+    assert (worse.ghosts, worse.missed, worse.occupied, worse.surface) == (1, 1, 4, 4)
+    assert worse.iou == pytest.approx(3 / 5)
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+def test_n10_a46_the_map_is_the_visible_geometry(scene: MapScene, truth: Visible, noisy: bool) -> None:
+    """Both cameras, clean and noisy: no ghost, hardly anything missed, the robot itself not in it."""
+    target, rng = mapper(scene), np.random.default_rng(1) if noisy else None
+    for i in range(4):
+        states = states_after(target, scene, i * PERIOD_NS, rng)
+    result = compare(states, truth.surface, truth.solid)
+    assert result.surface > 2500
+    assert result.ghosts == 0
+    assert result.missed <= 0.005 * result.surface
+    assert result.iou >= 0.98
+
+
+def test_a55_a56_an_object_is_gone_and_back_within_a_second_at_two_hertz(scene: MapScene, truth: Visible) -> None:
+    """It moves right after an update, so that the next one is half a second away."""
+    target, name = mapper(scene), DEMO.objects[0].name
+    home = DEMO.objects[0].centre(DEMO.table)
+    near = target.lattice.range_of(np.array(home) - [0.03, 0.03, 0.0], np.array(home) + [0.03, 0.03, 0.05])
+    rng = np.random.default_rng(2)
+    for i in range(10):
+        states = states_after(target, scene, i * PERIOD_NS, rng)
+    assert (states[near] == OCCUPIED).any()
+    try:
+        scene.put(name, (3.0, 3.0, 0.5))
+        for i in range(2):
+            states = states_after(target, scene, (10 + i) * PERIOD_NS, rng)
+        assert not (states[near] == OCCUPIED).any()
+    finally:
+        scene.put(name, home)
+    for i in range(2):
+        states = states_after(target, scene, (12 + i) * PERIOD_NS, rng)
+    assert (states[near] == OCCUPIED).any()
+
+
+def test_p05_no_cell_of_the_arm_or_of_what_it_holds_in_thirty_seconds_of_sweeping(
+    scene: MapScene, truth: Visible
+) -> None:
+    """At 2 Hz; the second half with an object in the hand."""
+    solid = binary_dilation(truth.solid, np.ones((3, 3, 3)))
+    home, item = dict(scene.joints), DEMO.objects[0]
+    rng, target = np.random.default_rng(3), mapper(scene)
+    tool = scene.description.tcp_link("left")
+    ghosts, seen = 0, 0
+    try:
+        for i in range(60):
+            swing = np.sin(i / 4.0)
+            for side in ("left", "right"):
+                for joint, reach in ((1, 0.35), (2, 0.15), (4, 0.4), (7, 0.8)):
+                    name = f"openarm_{side}_joint{joint}"
+                    lower, upper = (float(v[0]) for v in scene.description.limits([name]))
+                    scene.joints[name] = float(np.clip(home[name] + reach * swing, lower, upper))
+            held = []
+            if i >= 30:
+                box = HeldBox("left/it", tool, se3.make(None, (0.0, 0.0, 0.02)), item.size)
+                T = scene.description.link_pose(tool, scene.joints) @ box.T_link_box
+                scene.put(item.name, tuple(T[:3, 3]))
+                # the object keeps upright in this scene, the box turns with the hand: the padding has to bear it
+                turned = se3.make(scene.description.link_pose(tool, scene.joints)[:3, :3].T, box.T_link_box[:3, 3])
+                held = [HeldBox(box.name, tool, turned, item.size)]
+            report = target.update(scene.frames(i * PERIOD_NS, rng), held, wanted={"states"})
+            seen += sum(sum(links.values()) for links in report.removed.values())
+            assert report.snapshot.states is not None
+            ghosts = max(ghosts, int(((report.snapshot.states == OCCUPIED) & ~solid).sum()))
+    finally:
+        scene.joints = home
+        scene.put(item.name, item.centre(DEMO.table))
+    assert seen > 60 * 5000  # the arms were in the pictures
+    assert ghosts == 0
+
+
+def test_without_the_self_filter_the_arm_is_in_the_map(scene: MapScene, truth: Visible) -> None:
+    """So the tests above can fail."""
+    states = states_after(mapper(scene, enabled=False), scene, 0)
+    assert compare(states, truth.surface, truth.solid).ghosts > 100
