@@ -75,7 +75,7 @@ def test_a55_a56_an_object_is_gone_and_back_within_a_second_at_two_hertz(scene: 
     """It moves right after an update, so that the next one is half a second away."""
     target, name = mapper(scene), DEMO.objects[0].name
     home = DEMO.objects[0].centre(DEMO.table)
-    near = target.lattice.range_of(np.array(home) - [0.03, 0.03, 0.0], np.array(home) + [0.03, 0.03, 0.05])
+    near = target.lattice.range_of(np.add(home, (-0.03, -0.03, 0.0)), np.add(home, (0.03, 0.03, 0.05)))
     rng = np.random.default_rng(2)
     for i in range(10):
         states = states_after(target, scene, i * PERIOD_NS, rng)
