@@ -16,9 +16,9 @@ from openarm_common.errors import OpenArmError
 
 @pytest.fixture
 def three(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Only three domains exist."""
-    monkeypatch.setattr(domains, "DOMAINS", [95, 96, 97])
-    return [95, 96, 97]
+    """Only three domains exist, none of those that others are given."""
+    monkeypatch.setattr(domains, "DOMAINS", [220, 221, 222])
+    return [220, 221, 222]
 
 
 def test_no_domain_is_given_twice_until_it_is_given_back(three: list[int]) -> None:
@@ -36,7 +36,7 @@ def test_no_domain_is_given_twice_until_it_is_given_back(three: list[int]) -> No
 
 def test_another_process_gets_another_domain_until_this_one_ends(three: list[int]) -> None:
     script = (
-        "from openarm_common import domain as d; d.DOMAINS = [95, 96, 97]\n"
+        "from openarm_common import domain as d; d.DOMAINS = [220, 221, 222]\n"
         "print(d.reserve_domain(), flush=True); input()"
     )
     with subprocess.Popen(
@@ -55,8 +55,8 @@ def test_another_process_gets_another_domain_until_this_one_ends(three: list[int
 
 def test_a_domain_whose_discovery_port_is_held_is_not_given(three: list[int]) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
-        held.bind(("0.0.0.0", 7400 + 250 * 96))
+        held.bind(("0.0.0.0", 7400 + 250 * 221))
         ours = [reserve_domain(), reserve_domain()]
-        assert sorted(ours) == [95, 97]
+        assert sorted(ours) == [220, 222]
     for domain in ours:
         release_domain(domain)
