@@ -231,7 +231,7 @@ def _target(result: GraspResult | OpenArmError, ask: Ask) -> tuple[float, float]
 
 
 def _wait_idle(observer: Observer) -> None:
-    """Wait until no grasp runs any more, also after a request whose answer never came: the next trial resets the world."""
+    """Wait until no grasp runs any more, also after a request whose answer never came: the next trial resets."""
     observer.wait(lambda: not observer.steps() or observer.steps()[-1].state == "IDLE", 90.0, "the end of the grasp")
 
 

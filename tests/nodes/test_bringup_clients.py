@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The probe of the supervisor and the observer of the demo, against real publishers and servers in this process."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from openarm_interfaces.msg import GraspStatus, ObjectState, ObjectStateArray
+from openarm_interfaces.srv import ResetWorld
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from openarm_bringup.graph import Ready
+from openarm_bringup.observer_client import Observer, Step
+from openarm_bringup.readiness_client import ReadinessClient
+from openarm_common.errors import Code, OpenArmError
+
+DOMAIN = {"ROS_DOMAIN_ID": os.environ["ROS_DOMAIN_ID"], "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+LATCHED = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+@pytest.fixture
+def probe() -> Iterator[ReadinessClient]:
+    client = ReadinessClient(DOMAIN)
+    yield client
+    client.close()
+
+
+def until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "not within the time"
+        time.sleep(0.02)
+
+
+def test_probe_sees_topics_services_and_first_messages(ros, probe: ReadinessClient) -> None:
+    conditions = (Ready(topic="/said"), Ready(service="/do"), Ready(message="/said"), Ready(message="/kept"))
+    assert probe.unmet(conditions, frozenset()) == ("topic /said", "service /do", "message /said", "message /kept")
+    publisher = ros.node.create_publisher(String, "/said", 1)
+    kept = ros.node.create_publisher(String, "/kept", LATCHED)
+    kept.publish(String(data="early"))
+    ros.node.create_service(Trigger, "/do", lambda request, response: response)
+    until(lambda: probe.unmet(conditions, frozenset()) == ("message /said",))
+
+    def heard() -> bool:
+        publisher.publish(String(data="now"))
+        return probe.unmet(conditions, frozenset()) == ()
+
+    until(heard)
+
+
+def test_probe_tells_a_new_server_from_the_one_before(ros, probe: ReadinessClient) -> None:
+    conditions = (Ready(service="/do"),)
+    first = ros.add(Node("first"))
+    first.create_service(Trigger, "/do", lambda request, response: response)
+    until(lambda: probe.unmet(conditions, frozenset()) == ())
+    old = probe.known(conditions)
+    assert len(old) == 1
+    assert probe.unmet(conditions, old) == ("service /do",)
+    ros.add(Node("second")).create_service(Trigger, "/do", lambda request, response: response)
+    until(lambda: probe.unmet(conditions, old) == ())
+
+
+def test_probe_lists_parameters_and_says_who_does_not_answer(ros, probe: ReadinessClient) -> None:
+    node = ros.add(Node("arm"))
+    node.declare_parameter("speed.max", 1.0)
+    spinning = threading.Event()
+    spinner = threading.Thread(target=lambda: ros.spin_until(spinning.is_set, timeout=20.0))
+    spinner.start()
+    try:
+        assert "speed.max" in probe.parameters("arm")
+    finally:
+        spinning.set()
+        spinner.join()
+    with pytest.raises(OpenArmError, match="/nobody/list_parameters did not answer") as caught:
+        probe.parameters("nobody", timeout_s=0.2)
+    assert caught.value.code == Code.TIMEOUT
+
+
+class World:
+    """A stand-in for bridge and grasp node: publishes truth at its own pace, answers resets."""
+
+    def __init__(self, ros) -> None:
+        self.node = ros.add(Node("world"))
+        self.truth = self.node.create_publisher(ObjectStateArray, "/sim/ground_truth/objects", 10)
+        self.status = self.node.create_publisher(GraspStatus, "/grasp/status", LATCHED)
+        self.node.create_service(ResetWorld, "/sim/reset_world", self.reset)
+        self.node.create_timer(0.02, self.tell)
+        self.tick = 0
+
+    def tell(self) -> None:
+        self.tick += 1
+        message = ObjectStateArray(objects=[ObjectState(name="cube", label="red")])
+        message.header.stamp.nanosec = self.tick
+        message.objects[0].pose.position.x = 0.5
+        message.objects[0].pose.orientation.w = 1.0
+        self.truth.publish(message)
+
+    def reset(self, request: ResetWorld.Request, response: ResetWorld.Response) -> ResetWorld.Response:
+        response.success = request.scene == "random"
+        response.message = "" if response.success else "no such scene"
+        return response
+
+
+def test_observer_keeps_tracks_states_and_resets_the_world(ros) -> None:
+    world = World(ros)
+    world.status.publish(GraspStatus(state="IDLE", reason="waiting"))
+    steps: list[Step] = []
+    done = threading.Event()
+    spinner = threading.Thread(target=lambda: ros.spin_until(done.is_set, timeout=30.0))
+    spinner.start()
+    try:
+        with Observer(int(DOMAIN["ROS_DOMAIN_ID"]), steps.append) as observer:
+            observer.wait(lambda: len(observer.track("cube")) >= 3 or None, 10.0, "truth")
+            observer.wait(lambda: observer.steps() or None, 10.0, "the latched state")
+            track = observer.track("cube")
+            assert track[0].p_world[0] == 0.5
+            assert all(a.t_ns < b.t_ns for a, b in itertools.pairwise(track))
+            assert (steps[0].state, steps[0].reason) == ("IDLE", "waiting")
+            assert observer.reset_world("random", 3) >= track[-1].t_ns
+            with pytest.raises(OpenArmError, match="refused: no such scene") as caught:
+                observer.reset_world("nowhere", 0)
+            assert caught.value.code == Code.SCENE_INVALID
+            observer.forget()
+            assert observer.steps() == []
+            with pytest.raises(OpenArmError, match=r"a unicorn was not there within 0.2 s"):
+                observer.wait(lambda: None, 0.2, "a unicorn")
+    finally:
+        done.set()
+        spinner.join()

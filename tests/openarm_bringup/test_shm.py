@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shared memory: what nobody uses goes, what anybody uses stays."""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from openarm_bringup.environment import node_arguments, node_environment
+from openarm_bringup.graph import Graph, NodeSpec
+from openarm_bringup.shm import mapped_by, ports_of, shm_need_mib, sweep
+
+
+def make(folder: Path, name: str, *, lock: bool) -> Path:
+    (folder / name).write_bytes(b"x" * 4096)
+    (folder / f"sem.{name}_mutex").touch()
+    if lock:
+        (folder / f"{name}_el").touch()
+    return folder / name
+
+
+def test_sweep_removes_only_what_is_neither_mapped_nor_locked(tmp_path: Path) -> None:
+    dead = make(tmp_path, "fastrtps_port7411", lock=False)
+    zombie = make(tmp_path, "fastrtps_port7413", lock=True)
+    locked = make(tmp_path, "fastrtps_port7415", lock=True)
+    mapped = make(tmp_path, "fastrtps_0123456789abcdef", lock=False)
+    stranger = make(tmp_path, "fastrtps_port9999", lock=False)
+    with (
+        (tmp_path / "fastrtps_port7415_el").open("rb") as lock,
+        mapped.open("r+b") as file,
+        mmap.mmap(file.fileno(), 4096),
+    ):
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert mapped_by(os.getpid(), tmp_path) == {mapped.name}
+        names = {*ports_of(0, tmp_path), mapped.name, "fastrtps_port7599"}
+        assert sweep(names, tmp_path) == [dead.name, zombie.name]
+    assert sorted(p.name for p in tmp_path.iterdir() if not p.name.startswith("sem.")) == sorted(
+        [locked.name, f"{locked.name}_el", mapped.name, stranger.name]
+    )
+    assert not (tmp_path / f"sem.{dead.name}_mutex").exists()
+
+
+def test_ports_of_a_domain(tmp_path: Path) -> None:
+    for port in (7400, 7649, 7650, 24161):
+        make(tmp_path, f"fastrtps_port{port}", lock=False)
+    assert ports_of(0, tmp_path) == {"fastrtps_port7400", "fastrtps_port7649"}
+    assert ports_of(67, tmp_path) == {"fastrtps_port24161"}
+
+
+def test_mapped_by_a_process_that_has_ended_is_nothing() -> None:
+    assert mapped_by(2**22 + 1) == set()
+
+
+@pytest.fixture
+def graph() -> Graph:
+    nodes = {
+        "eye": NodeSpec(module="toy.eye", large_messages=True, segment_mib=8, params={"a.b": 1, "none": None}),
+        "arm": NodeSpec(command=("python", "arm.py"), remaps={"/a": "/b"}, env={"MODE": "slow"}),
+    }
+    return Graph(name="toy", domain=9, nodes=nodes)
+
+
+def test_only_publishers_of_large_messages_get_the_large_segment(graph: Graph, tmp_path: Path) -> None:
+    eye = node_environment(graph, "eye", tmp_path, {"ROS_LOCALHOST_ONLY": "1"})
+    arm = node_environment(graph, "arm", tmp_path, {})
+    profile = Path(eye["FASTRTPS_DEFAULT_PROFILES_FILE"]).read_text()
+    assert re.search(r"<segment_size>8388608</segment_size>", profile)
+    assert "<maxMessageSize>4194304</maxMessageSize>" in profile
+    assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in arm
+    assert eye["ROS_DOMAIN_ID"] == arm["ROS_DOMAIN_ID"] == "9"
+    assert eye["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+    assert "ROS_LOCALHOST_ONLY" not in eye
+    assert arm["MODE"] == "slow"
+    assert shm_need_mib(graph) == pytest.approx(8 + 2.2 + 0.65 + 0.65)
+
+
+def test_command_line_of_a_node_carries_name_remaps_and_parameters(graph: Graph, tmp_path: Path) -> None:
+    eye, arm = node_arguments(graph, "eye", tmp_path), node_arguments(graph, "arm", tmp_path)
+    assert eye[1:3] == ["-m", "toy.eye"]
+    assert "__node:=eye" in eye
+    assert "/a:=/b" in arm
+    assert "--params-file" not in arm
+    written = Path(eye[eye.index("--params-file") + 1]).read_text()
+    assert "a.b: 1" in written
+    assert "none" not in written
