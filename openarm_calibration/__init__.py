@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mounts of the cameras on the robot."""
+"""Hand-eye calibration of the cameras, and their mounts on the robot."""

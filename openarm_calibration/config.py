@@ -7,6 +7,9 @@ from typing import Any
 
 from pydantic import Field, field_validator
 
+from openarm_calibration.gate import GateConfig
+from openarm_calibration.offline import ALGORITHMS
+from openarm_calibration.verdict import Limits
 from openarm_common.config import Config
 
 
@@ -37,3 +40,25 @@ class PublisherConfig(StoreConfig):
     """Parameters of the node `calibration_publisher`."""
 
     period: float = Field(0.5, gt=0.0, le=60.0, description="between looks at the store, s of wall clock")
+
+
+class CalibrationConfig(StoreConfig):
+    """Parameters of the node `calibration`."""
+
+    camera: str = Field("wrist", min_length=1, description="name of the camera to calibrate")
+    board: str = Field("", description="keys of the board as YAML, such as {kind: circles, rows: 11}; empty: defaults")
+    carrier: str = Field(
+        "openarm_right_link7", min_length=1, description="link that holds the board when the camera stands still"
+    )
+    algorithm: str = Field("REFINED", description="what compute_calibration uses at first")
+    image_timeout: float = Field(2.0, gt=0.0, le=60.0, description="longest wait for an image, s of wall clock")
+    state_timeout: float = Field(1.0, gt=0.0, le=60.0, description="longest wait for joint states, s of wall clock")
+    gate: GateConfig = GateConfig()
+    limits: Limits = Limits()
+
+    @field_validator("algorithm")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value.upper() not in ALGORITHMS:
+            raise ValueError(f"unknown algorithm; algorithms: {', '.join(ALGORITHMS)}")
+        return value.upper()

@@ -15,5 +15,10 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
     ],
     install_requires=["setuptools"],
-    entry_points={"console_scripts": ["publisher = openarm_calibration.publisher:main"]},
+    entry_points={
+        "console_scripts": [
+            "calibration = openarm_calibration.node:main",
+            "publisher = openarm_calibration.publisher:main",
+        ]
+    },
 )

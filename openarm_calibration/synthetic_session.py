@@ -65,7 +65,7 @@ def make_session(
     def view(q: Array) -> tuple[Array, Array] | None:
         A = samples.pose(dict(zip(names, q, strict=True)))
         T = se3.inverse(X) @ (se3.inverse(A) if setup == "in_hand" else A) @ Z
-        if not T[2, 2] > 0.4:
+        if not T[2, 2] > 0.6:
             return None
         return project(BOARD.points, BOARD.radius, T, row), T
 
@@ -73,7 +73,7 @@ def make_session(
         q = middle + rng.uniform(-spread, spread, len(names))
         v = rng.uniform(-1.0, 1.0, len(names)) * speed
         got = view(q - v * delay)
-        if got is None or not ((got[0] > 5) & (got[0] < (634, 474))).all():
+        if got is None or not ((got[0] > 16) & (got[0] < (623, 463))).all():
             continue
         pixels, T = got
         t = 10**9 * (1 + len(samples))
