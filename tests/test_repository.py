@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the repository ships, and what its parts depend on."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = sorted(path.name for path in ROOT.glob("openarm_*") if (path / "__init__.py").exists())
+#: Message packages that a wheel of ROS 2 brings, and those that `interfaces/` brings.
+FROM_WHEELS = {
+    "action_msgs",
+    "builtin_interfaces",
+    "diagnostic_msgs",
+    "geometry_msgs",
+    "nav_msgs",
+    "rcl_interfaces",
+    "rosgraph_msgs",
+    "sensor_msgs",
+    "std_msgs",
+    "std_srvs",
+    "trajectory_msgs",
+    "visualization_msgs",
+}
+FROM_INTERFACES = {path.parent.name for path in (ROOT / "interfaces").glob("*/package.xml")}
+
+
+def _message_packages(package: str) -> set[str]:
+    """Message packages that the modules of a package import."""
+    found: set[str] = set()
+    for path in (ROOT / package).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                top, _, kind = node.module.partition(".")
+                if kind in ("msg", "srv", "action") and top != "rclpy":
+                    found.add(top)
+    return found
+
+
+def test_a02_sources_parameters_descriptions_messages_and_graphs_are_all_here() -> None:
+    assert len(PACKAGES) >= 7
+    for package in PACKAGES:
+        assert (ROOT / package / "package.xml").is_file(), package
+    assert {"openarm_interfaces", "tf2_msgs", "control_msgs", "vision_msgs", "octomap_msgs"} <= FROM_INTERFACES
+    for pattern in ("models/openarm/*.xacro", "models/scenes/*.yaml", "config/params/*.yaml", "config/graphs/*.yaml"):
+        assert list(ROOT.glob(pattern)), pattern
+
+
+def test_a03_ros_2_jazzy_on_the_pythons_it_has_wheels_for() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["requires-python"] == ">=3.11,<3.14"
+    assert {"ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"} <= set(
+        project["dependencies"]
+    )
+    assert (3, 11) <= sys.version_info[:2] <= (3, 13)
+    rclpy = importlib.metadata.version("ros-jazzy-rclpy")
+    assert rclpy.split(".")[0] == "7", f"rclpy {rclpy} is not Jazzy's"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a09_messages_come_from_wheels_or_from_interfaces(package: str) -> None:
+    unknown = _message_packages(package) - FROM_WHEELS - FROM_INTERFACES
+    assert unknown == set(), f"{package} needs an apt ROS for {', '.join(sorted(unknown))}"
+
+
+def test_a14_the_viewer_example_steps_a_thousand_times_without_a_display() -> None:
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / "view_world.py"), "empty", "--headless"],
+        capture_output=True,
+        text=True,
+        timeout=60.0,
+        check=True,
+    )
+    match = re.fullmatch(r"1000 steps, 2\.00 s simulated in .* s \((\d+) times real time\)\n", done.stdout)
+    assert match, done.stdout
+    assert int(match[1]) >= 2
+
+
+def test_b02_the_readme_states_who_offers_what() -> None:
+    """tests/graph/test_contract.py holds these tables against the running graph."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    for part in ("/overhead/color/image_raw", "/detections_3d", "/tf_static", "/motion/execute", "gripper_cmd"):
+        assert part in readme, part
