@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 
+from openarm_sim_bridge.faults import Fault
 from openarm_sim_bridge.handover import CameraReport, CameraSetup, StateSender, pair
 from openarm_sim_bridge.pacing import RateDivider
 from openarm_sim_bridge.world import Snapshot, World
@@ -47,6 +48,7 @@ class CameraFeed:
         self._earlier: dict[str, int] = {camera.name: 0 for camera in setup.cameras}
         self._drawn: dict[str, int] = dict(self._earlier)
         self._died_at: float | None = None
+        self._faults: tuple[Fault, ...] = ()
         self.lost = 0
         self.fault = ""
         self.report = CameraReport()
@@ -88,6 +90,16 @@ class CameraFeed:
         """Mean time of a frame, lately."""
         return self.report.draw_ms
 
+    def set_faults(self, faults: tuple[Fault, ...]) -> None:
+        """Hand over all faults that are active from now on.
+
+        Raises:
+            OpenArmError: BUSY, when the process does not take them at present.
+        """
+        with self._lock:
+            self._faults = faults
+            self._sender.faults(faults)
+
     def tick(self, world: World) -> None:
         """Hand the tick over for the cameras that are due and watched; in the thread of the simulation, never waits."""
         watched = self.report.watched
@@ -125,6 +137,8 @@ class CameraFeed:
         with self._lock:
             self._sender = StateSender(ours, self._setup)
             self._sender.offer(self._first, ())
+            if self._faults:
+                self._sender.faults(self._faults)
         self._process = subprocess.Popen(
             [sys.executable, "-m", _MODULE, str(theirs.fileno())],
             pass_fds=[theirs.fileno()],

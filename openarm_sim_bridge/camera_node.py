@@ -46,6 +46,7 @@ class CameraNode(Node):
         self._drawn = 0
         self._ready = False
         self._fault = ""
+        self._faults = receiver.faults
         self._report_at = 0.0
 
     def work(self) -> None:
@@ -55,7 +56,10 @@ class CameraNode(Node):
             EOFError: The bridge has ended.
         """
         while True:
-            work = self._receiver.take(_REPORT_S)
+            work = self._receiver.take(min(_REPORT_S, self._images.publish_late()))
+            if self._receiver.faults is not self._faults:
+                self._faults = self._receiver.faults
+                self._images.set_faults(self._faults)
             if work is not None and not self._fault:
                 self._attempt(work)
             if time.monotonic() >= self._report_at:
@@ -87,6 +91,7 @@ class CameraNode(Node):
         began = time.monotonic()
         wanted = [name for name in self._cameras if name in work.names and self._images.wants_image(name)]
         if wanted:
+            self._images.faults.apply(work.snapshot.model)
             self._renderer.load(work.snapshot)
         for name in work.names:
             if name in wanted:

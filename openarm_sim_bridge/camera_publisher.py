@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import copy
+import math
 import sys
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,10 +16,12 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, Image
 
-from openarm_common.cameras import CameraConfig
+from openarm_common.cameras import CameraConfig, Intrinsics
 from openarm_common.convert import ENCODINGS, info_from_intrinsics, ns_to_stamp
 from openarm_common.node import QOS_SENSOR
+from openarm_sim_bridge.camera_faults import CameraFaults
 from openarm_sim_bridge.cameras import SnapshotRenderer
+from openarm_sim_bridge.faults import Fault
 from openarm_sim_bridge.handover import CameraSetup
 
 
@@ -60,14 +66,18 @@ class _Stream:
         self.wants_info = self.info.get_subscription_count() > 0
         return self.wants_image or self.wants_info
 
-    def publish(self, t_ns: int, *, image: bool) -> None:
+    def due(self, t_ns: int, *, image: bool) -> Iterator[tuple[Publisher, Image | CameraInfo]]:
+        """What is to be published now; the messages are used again for the next frame."""
         stamp = ns_to_stamp(t_ns)
         if image and self.wants_image:
             self.message.header.stamp = stamp
-            self.image.publish(self.message)
+            yield self.image, self.message
         if self.wants_info:
             self.info_message.header.stamp = stamp
-            self.info.publish(self.info_message)
+            yield self.info, self.info_message
+
+    def tell_intrinsics(self, intrinsics: Intrinsics) -> None:
+        self.info_message = info_from_intrinsics(intrinsics, self.info_message.header.frame_id, 0)
 
 
 @dataclass
@@ -89,6 +99,9 @@ class CameraPublisher:
     """
 
     def __init__(self, node: Node, setup: CameraSetup) -> None:
+        self.faults = CameraFaults()
+        self._late: list[tuple[float, Publisher, Image | CameraInfo]] = []
+        self._configs = {camera.name: camera for camera in setup.cameras}
         self._cameras = {
             camera.name: _Camera(
                 _Stream.make(node, setup, camera, "color", "rgb8"),
@@ -108,9 +121,13 @@ class CameraPublisher:
 
     def draw(self, renderer: SnapshotRenderer, name: str) -> None:
         """Draw a camera's view of the loaded state into its messages."""
+        if self.faults.frozen(name):
+            return
         camera = self._cameras[name]
-        wants_depth = camera.depth is not None and camera.depth.wants_image
-        renderer.draw(name, camera.colour.pixels, camera.depth.pixels if camera.depth and wants_depth else None)
+        depth = camera.depth.pixels if camera.depth is not None and camera.depth.wants_image else None
+        renderer.draw(name, camera.colour.pixels, depth)
+        if depth is not None:
+            self.faults.spoil_depth(name, depth)
 
     def publish(self, name: str, t_ns: int, *, drawn: bool) -> None:
         """Publish what listeners want of a camera.
@@ -120,5 +137,31 @@ class CameraPublisher:
             t_ns: Stamp.
             drawn: False when there is a CameraInfo only.
         """
+        if self.faults.drops(name):
+            return
+        delay_s = self.faults.delay_s(name)
+        stamp_ns = self.faults.stamp_ns(name, t_ns)
         for stream in self._cameras[name].streams:
-            stream.publish(t_ns, image=drawn)
+            for publisher, message in stream.due(stamp_ns, image=drawn):
+                if delay_s > 0.0:
+                    self._late.append((time.monotonic() + delay_s, publisher, copy.deepcopy(message)))
+                else:
+                    publisher.publish(message)
+
+    def set_faults(self, faults: tuple[Fault, ...]) -> None:
+        """Take the faults that are active from now on."""
+        self.faults.set(faults)
+        for name, config in self._configs.items():
+            for stream in self._cameras[name].streams:
+                stream.tell_intrinsics(self.faults.intrinsics(name, config.intrinsics))
+
+    def publish_late(self) -> float:
+        """Publish what was delayed until now; return in how many seconds the next is due."""
+        now = time.monotonic()
+        waiting, self._late = self._late, []
+        for item in waiting:
+            if item[0] <= now:
+                item[1].publish(item[2])
+            else:
+                self._late.append(item)
+        return min((due - now for due, _, _ in self._late), default=math.inf)

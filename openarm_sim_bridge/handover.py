@@ -9,13 +9,14 @@ Nothing here waits for the other side: a frame that can't be handed over is drop
 
 from __future__ import annotations
 
+import json
 import os
 import select
 import socket
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -23,9 +24,11 @@ from pydantic import Field
 
 from openarm_common.cameras import CameraConfig
 from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+from openarm_sim_bridge.faults import Fault, checked_fault
 from openarm_sim_bridge.world import Snapshot
 
-_SETUP, _MODEL, _STATE = b"C", b"M", b"S"
+_SETUP, _MODEL, _STATE, _FAULTS = b"C", b"M", b"S", b"F"
 _STATE_HEAD = struct.Struct("<qI")  # stamp in ns, which cameras
 _MAX_BYTES = 1 << 17
 
@@ -55,7 +58,7 @@ def pair() -> tuple[socket.socket, socket.socket]:
 
 
 class StateSender:
-    """The bridge's end. `offer` is for one thread, `reports` for one other.
+    """The bridge's end. `offer` and `faults` want a lock where they are called by several threads.
 
     Args:
         end: Socket of `pair`.
@@ -80,6 +83,18 @@ class StateSender:
         except (BlockingIOError, BrokenPipeError, ConnectionError):
             return False
         return True
+
+    def faults(self, faults: Iterable[Fault]) -> None:
+        """Hand over all faults that are active from now on.
+
+        Raises:
+            OpenArmError: BUSY, when the other side does not take anything at present.
+        """
+        told = [{"name": f.name, "parameters": f.parameters.model_dump(), "seed": f.seed} for f in faults]
+        try:
+            self._end.send(_FAULTS + json.dumps(told).encode())
+        except (BlockingIOError, ConnectionError) as error:
+            raise OpenArmError(Code.BUSY, "the process that draws does not answer; try again") from error
 
     def wait(self, timeout_s: float) -> None:
         """Wait until there is a report, or the other side has ended."""
@@ -131,6 +146,7 @@ class StateReceiver:
         self._end = end
         self._model: mujoco.MjModel | None = None
         self.dropped = 0
+        self.faults: tuple[Fault, ...] = ()
         body = end.recv(_MAX_BYTES)
         if not body:
             raise EOFError
@@ -156,6 +172,8 @@ class StateReceiver:
                 raise EOFError
             if body[:1] == _MODEL:
                 self._model = _load_model(files)
+            elif body[:1] == _FAULTS:
+                self.faults = tuple(checked_fault(**told) for told in _parameters(body[1:]))
             elif self._model is not None:
                 names = work.names if work is not None else frozenset[str]()
                 self.dropped += len(names)
@@ -171,6 +189,10 @@ class StateReceiver:
             self._end.send(report.model_dump_json().encode())
         except (BlockingIOError, ConnectionError):
             return
+
+
+def _parameters(body: bytes) -> list[dict[str, Any]]:
+    return [{"name": told["name"], "data": told["parameters"], "seed": told["seed"]} for told in json.loads(body)]
 
 
 def _load_model(files: Sequence[int]) -> mujoco.MjModel:

@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 from openarm_common.cameras import CameraConfig, load_cameras
-from openarm_common.errors import OpenArmError
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, BaseNode, reliable, run
 from openarm_common.resources import config_dir
 from openarm_common.scene import Scene, load_scene
@@ -30,6 +30,8 @@ from openarm_sim_bridge.camera_feed import CameraFeed
 from openarm_sim_bridge.camera_publisher import topic_names
 from openarm_sim_bridge.config import BridgeConfig
 from openarm_sim_bridge.controller import RobotController
+from openarm_sim_bridge.fault_executor import FaultServices
+from openarm_sim_bridge.faults import Fault
 from openarm_sim_bridge.handover import CameraSetup
 from openarm_sim_bridge.service_executor import SimulationServices
 from openarm_sim_bridge.simulation import Simulation
@@ -81,6 +83,10 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         ]
         self._sim_services = SimulationServices(self, stage, scene, self._simulation, self._on_scene)
 
+        self._faults = FaultServices(
+            self, self._simulation, cameras if self._images is not None else (), self._tell_cameras
+        )
+
         self._warned: set[str] = set()
         self._drawn = dict.fromkeys(cameras, 0)
         self.create_timer(REPORT_PERIOD_S, self._report, clock=self.wall_clock)
@@ -105,7 +111,8 @@ class MujocoBridge(BaseNode[BridgeConfig]):
     def _observe(self, state: JointReadout) -> None:
         """End of a tick, in the thread of the simulation."""
         with until_shutdown(self.context):
-            self._states.publish(state, self._simulation.world)
+            joints = self._simulation.faults.tells_joints(state.t_ns)
+            self._states.publish(state, self._simulation.world, joints=joints)
             if self._images is not None:
                 self._images.tick(self._simulation.world)
 
@@ -142,6 +149,12 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             environ[PROFILE] = environ[LARGE_PROFILE]
         return CameraFeed(setup, environ, first, lambda fault: self.get_logger().error(f"no images: {fault}"))
 
+    def _tell_cameras(self, faults: tuple[Fault, ...]) -> None:
+        if self._images is not None:
+            self._images.set_faults(faults)
+        elif faults:
+            raise OpenArmError(Code.NOT_READY, "there are no cameras: the parameter images is false")
+
     def _on_crash(self, error: Exception) -> None:
         """The physics ended by a fault of the program: end the process, so that it is started again."""
         self.get_logger().fatal(f"the physics thread ended: {error!r}\n{''.join(traceback.format_exception(error))}")
@@ -167,6 +180,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             joint_state_period_p99_ms=f"{period.p99_ms:.2f}",
             joint_state_period_max_ms=f"{period.max_ms:.2f}",
             wall_time_skipped_s=f"{simulation.skipped_s:.2f}",
+            faults_active=" ".join(self._faults.active),
             frames_dropped=images.dropped if images is not None else 0,
             draw_ms=f"{images.draw_ms:.1f}" if images is not None else "",
             watched=" ".join(sorted(images.watched)) if images is not None else "",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The services of the simulation: reset and exchange the world, pause, step, add an object.
+"""The services of the simulation: reset and exchange the world, pause, step, add, remove and move objects.
 
 What takes longer than a tick (reading a scene, compiling a model) runs in a worker thread; the world itself changes
 between two ticks, in the thread of the simulation.
@@ -12,14 +12,17 @@ import threading
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
-from openarm_interfaces.srv import ResetWorld, SetPause, SpawnObject, StepSimulation
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from numpy.typing import NDArray
+from openarm_interfaces.srv import MoveObject, RemoveObject, ResetWorld, SetPause, SpawnObject, StepSimulation
 
 from openarm_common.convert import pose_to_matrix, xyz
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import BaseNode
 from openarm_common.scene import Scene, load_scene
 from openarm_sim_bridge.simulation import Simulation
-from openarm_sim_bridge.stage import Stage, with_object
+from openarm_sim_bridge.stage import Stage, with_object, without_object
 from openarm_sim_bridge.state_publisher import WORLD_FRAME
 
 T = TypeVar("T")
@@ -29,8 +32,32 @@ _STEPPING_S = 60.0
 _UPRIGHT = 1e-3
 
 
+async def answer(node: BaseNode[Any], response: Any, work: Awaitable[str]) -> Any:
+    """Fill `success` and `message` of a response with the outcome of some work."""
+    try:
+        response.message = await work
+        response.success = True
+    except OpenArmError as error:
+        response.success = False
+        response.message = str(error)
+        node.get_logger().warning(str(error))
+    return response
+
+
+def between_ticks(simulation: Simulation, fn: Callable[[], T]) -> T:
+    """Run a short function in the thread of the simulation and wait for it; not for the executor.
+
+    Raises:
+        OpenArmError: TIMEOUT, and what the function raises.
+    """
+    try:
+        return simulation.call(fn).result(timeout=_ANSWER_S)
+    except TimeoutError as error:
+        raise OpenArmError(Code.TIMEOUT, f"the physics did not answer within {_ANSWER_S:.0f} s") from error
+
+
 class SimulationServices:
-    """/sim/reset_world, /sim/set_pause, /sim/step, /sim/spawn_object.
+    """/sim/reset_world, /sim/set_pause, /sim/step, and /sim/spawn_object, remove_object, move_object.
 
     Args:
         node: Owner.
@@ -58,31 +85,29 @@ class SimulationServices:
         node.create_service(SetPause, "/sim/set_pause", self._on_pause)
         node.create_service(StepSimulation, "/sim/step", self._on_step)
         node.create_service(SpawnObject, "/sim/spawn_object", self._on_spawn)
+        node.create_service(RemoveObject, "/sim/remove_object", self._on_remove)
+        node.create_service(MoveObject, "/sim/move_object", self._on_move)
 
     # --- callbacks
     async def _on_reset(self, request: ResetWorld.Request, response: ResetWorld.Response) -> ResetWorld.Response:
-        return await self._answer(response, self._node.in_thread(self._reset, request.scene, request.seed))
+        return await answer(self._node, response, self._node.in_thread(self._reset, request.scene, request.seed))
 
     async def _on_pause(self, request: SetPause.Request, response: SetPause.Response) -> SetPause.Response:
-        return await self._answer(response, self._node.in_thread(self._pause, request.paused))
+        return await answer(self._node, response, self._node.in_thread(self._pause, request.paused))
 
     async def _on_step(
         self, request: StepSimulation.Request, response: StepSimulation.Response
     ) -> StepSimulation.Response:
-        return await self._answer(response, self._node.in_thread(self._step, request.steps))
+        return await answer(self._node, response, self._node.in_thread(self._step, request.steps))
 
     async def _on_spawn(self, request: SpawnObject.Request, response: SpawnObject.Response) -> SpawnObject.Response:
-        return await self._answer(response, self._node.in_thread(self._spawn, request))
+        return await answer(self._node, response, self._node.in_thread(self._spawn, request))
 
-    async def _answer(self, response: Any, work: Awaitable[str]) -> Any:
-        try:
-            response.message = await work
-            response.success = True
-        except OpenArmError as error:
-            response.success = False
-            response.message = str(error)
-            self._node.get_logger().warning(str(error))
-        return response
+    async def _on_remove(self, request: RemoveObject.Request, response: RemoveObject.Response) -> RemoveObject.Response:
+        return await answer(self._node, response, self._node.in_thread(self._remove, request.name))
+
+    async def _on_move(self, request: MoveObject.Request, response: MoveObject.Response) -> MoveObject.Response:
+        return await answer(self._node, response, self._node.in_thread(self._move, request.name, request.pose))
 
     # --- work, in a worker thread
     def _reset(self, source: str, seed: int) -> str:
@@ -91,20 +116,20 @@ class SimulationServices:
                 raise OpenArmError(Code.SCENE_INVALID, f"seed is {seed}, expected 0 or more")
             scene = load_scene(source, seed) if source else self._loaded
             if scene == self._present:
-                self._between_ticks(self._reset_world)
+                between_ticks(self._simulation, self._reset_world)
             else:
                 compiled = self._stage.compile(self._simulation.world, scene)
-                self._between_ticks(lambda: self._exchange(compiled))
+                between_ticks(self._simulation, lambda: self._exchange(compiled))
             self._loaded = self._present = scene
         self._on_scene(scene)
         return f"scene {scene.name!r} with {len(scene.objects)} objects"
 
     def _pause(self, paused: bool) -> str:
-        self._between_ticks(lambda: self._simulation.set_paused(paused))
+        between_ticks(self._simulation, lambda: self._simulation.set_paused(paused))
         return "paused" if paused else "running"
 
     def _step(self, steps: int) -> str:
-        stepping = self._between_ticks(lambda: self._simulation.advance(steps))
+        stepping = between_ticks(self._simulation, lambda: self._simulation.advance(steps))
         try:
             t_ns = stepping.result(timeout=_STEPPING_S)
         except TimeoutError as error:
@@ -115,15 +140,28 @@ class SimulationServices:
         with self._changing:
             scene = with_object(self._present, _object_of(request, self._present.table.top_z))
             compiled = self._stage.compile(self._simulation.world, scene)
-            self._between_ticks(lambda: self._simulation.world.extend(compiled))
+            between_ticks(self._simulation, lambda: self._simulation.world.extend(compiled))
             self._present = scene
         return f"{request.name!r} is in the world"
 
-    def _between_ticks(self, fn: Callable[[], T]) -> T:
-        try:
-            return self._simulation.call(fn).result(timeout=_ANSWER_S)
-        except TimeoutError as error:
-            raise OpenArmError(Code.TIMEOUT, f"the physics did not answer within {_ANSWER_S:.0f} s") from error
+    def _remove(self, name: str) -> str:
+        with self._changing:
+            scene = without_object(self._present, name)
+            compiled = self._stage.compile(self._simulation.world, scene)
+            between_ticks(self._simulation, lambda: self._simulation.world.extend(compiled))
+            self._present = scene
+        return f"{name!r} is out of the world"
+
+    def _move(self, name: str, pose: PoseStamped) -> str:
+        with self._changing:
+            there = {item.name: item for item in self._present.objects}
+            if name not in there:
+                raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {', '.join(there) or 'none'}")
+            T, stands = _pose_in_world(pose, self._present.table.top_z)
+            if stands:
+                T[2, 3] += 0.5 * there[name].size[2]
+            between_ticks(self._simulation, lambda: self._simulation.world.move_object(name, T))
+        return f"{name!r} is at ({', '.join(f'{v:.3f}' for v in T[:3, 3])}) m in {WORLD_FRAME}"
 
     # --- between two ticks
     def _reset_world(self) -> None:
@@ -135,29 +173,40 @@ class SimulationServices:
         self._simulation.restart()
 
 
-def _object_of(request: SpawnObject.Request, table_top_z: float) -> dict[str, Any]:
-    """Keys of a `SceneObject`.
+def _pose_in_world(pose: PoseStamped, table_top_z: float) -> tuple[NDArray[np.float64], bool]:
+    """T_world_object, and whether its height is that of what the object shall stand on (z = 0 on the table).
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for a frame that is neither table nor world, or a tilted object.
     """
-    frame = request.pose.header.frame_id or "table"
+    frame = pose.header.frame_id or "table"
     if frame not in ("table", WORLD_FRAME):
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"pose is in the frame {frame!r}, expected 'table' (also when empty) or 'world'"
         )
-    T = pose_to_matrix(request.pose.pose)
+    T = pose_to_matrix(pose.pose)
     if T[2, 2] < 1.0 - _UPRIGHT:
         raise OpenArmError(Code.INVALID_ARGUMENT, "the pose is tilted, expected a turn about z only")
+    stands = frame == "table" and T[2, 3] == 0.0
+    if frame == "table":
+        T[2, 3] += table_top_z
+    return T, stands
+
+
+def _object_of(request: SpawnObject.Request, table_top_z: float) -> dict[str, Any]:
+    """Keys of a `SceneObject`.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, as `_pose_in_world`.
+    """
+    T, stands = _pose_in_world(request.pose, table_top_z)
     x, y, z = (float(v) for v in T[:3, 3])
-    # On the table z = 0 says that the object stands there.
-    stands = frame == "table" and z == 0.0
     return {
         "name": request.name,
         "shape": request.shape,
         "size": tuple(xyz(request.size).tolist()),
         "color": request.color,
         "mass": request.mass,
-        "position": (x, y) if stands else (x, y, z + (table_top_z if frame == "table" else 0.0)),
+        "position": (x, y) if stands else (x, y, z),
         "yaw": math.atan2(T[1, 0], T[0, 0]),
     }

@@ -19,6 +19,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_sim_bridge.controller import RobotController
 from openarm_sim_bridge.pacing import Pacer, PeriodMeter, RealTimeFactor
 from openarm_sim_bridge.world import JointReadout, World
+from openarm_sim_bridge.world_faults import WorldFaults
 
 T = TypeVar("T")
 
@@ -78,6 +79,8 @@ class Simulation:
         self.real_time_factor = RealTimeFactor()
         self.periods = PeriodMeter()
         self.fault = ""
+        #: What goes wrong on purpose; to be changed through `call` only.
+        self.faults = WorldFaults(world.joint_names, world.period_ns)
         self._observe = observe
         self._crashed = crashed
         self._clock = clock
@@ -192,8 +195,10 @@ class Simulation:
         world, controller = self.world, self.controller
         steps = min(world.steps_per_tick, self._steps_left) if self._paused else world.steps_per_tick
         self._pacer.ticked(now_ns)
-        world.set_targets(controller.update(world.read_joints(), steps * world.timestep_ns))
-        world.set_effort_limits(controller.effort_limits())
+        self.faults.prepare(world)
+        wanted = controller.update(world.read_joints(), steps * world.timestep_ns)
+        world.set_targets(self.faults.targets(wanted))
+        world.set_effort_limits(self.faults.effort_limits(controller.effort_limits()))
         try:
             world.step(steps)
         except OpenArmError as error:

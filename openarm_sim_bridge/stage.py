@@ -80,6 +80,19 @@ def tracked(scene: Scene) -> tuple[TrackedObject, ...]:
     return tuple(TrackedObject(item.name, item.label, item.size) for item in scene.objects)
 
 
+def without_object(scene: Scene, name: str) -> Scene:
+    """Return the scene with one object less.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, naming the objects that exist.
+    """
+    rest = tuple(item for item in scene.objects if item.name != name)
+    if len(rest) == len(scene.objects):
+        names = ", ".join(item.name for item in scene.objects) or "none"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {names}")
+    return scene.model_copy(update={"objects": rest})
+
+
 def with_object(scene: Scene, data: Mapping[str, Any]) -> Scene:
     """Return the scene with one more object.
 

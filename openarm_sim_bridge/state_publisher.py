@@ -90,8 +90,8 @@ class StatePublisher:
         edges.append((BASE_LINK, "table", se3.make(None, (0.0, 0.0, table_top_z))))
         self._tf_static.publish(TFMessage(transforms=[matrix_to_transform(*edge, 0) for edge in edges]))
 
-    def publish(self, state: JointReadout, world: World) -> None:
-        """Publish a tick; what is due less often follows what everyone waits for."""
+    def publish(self, state: JointReadout, world: World, *, joints: bool = True) -> None:
+        """Publish a tick, without its joint state where that is a gap on purpose."""
         stamp = ns_to_stamp(state.t_ns)
         self._clock_message.clock = stamp
         self._clock.publish(self._clock_message)
@@ -99,7 +99,8 @@ class StatePublisher:
         self._position[:] = state.position
         self._velocity[:] = state.velocity
         self._effort[:] = state.effort
-        self._joint_states.publish(self._joint_message)
+        if joints:
+            self._joint_states.publish(self._joint_message)
         if self._tf_ticks.due(state.t_ns):
             self._publish_tf(state)
         if self._object_ticks.due(state.t_ns) and self._objects.get_subscription_count():

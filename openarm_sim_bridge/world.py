@@ -211,7 +211,7 @@ class World:
         self.reset()
 
     def extend(self, compiled: CompiledWorld) -> None:
-        """Take a world that holds more, and keep the state of all joints and targets that both have by name; fast.
+        """Take a world that holds more or less, and keep the state of joints and targets that both have; fast.
 
         Raises:
             OpenArmError: SCENE_INVALID, when something new overlaps something that is there; the world is then as
@@ -235,6 +235,30 @@ class World:
         overlap = self._overlap_of_new(known)
         if overlap:
             self._compiled, self.model, self.data = before, old_model, old
+            raise OpenArmError(Code.SCENE_INVALID, overlap)
+
+    def move_object(self, name: str, T_world_object: Array) -> None:
+        """Put a tracked object elsewhere, at rest, as a hand from outside would; everything else goes on.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, naming the objects that exist; SCENE_INVALID, when something else is there
+                (the object then stays where it was).
+        """
+        c, d = self._compiled, self.data
+        names = [tracked.name for tracked in c.objects]
+        if name not in names:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {', '.join(names) or 'none'}")
+        q, v = c.object_qpos[names.index(name)], c.object_dof[names.index(name)]
+        before = d.qpos.copy(), d.qvel.copy(), d.ctrl.copy()
+        qpos, qvel, ctrl = (part.copy() for part in before)
+        qpos[q : q + 3] = T_world_object[:3, 3]
+        qpos[q + 3 : q + 7] = np.roll(se3.quat_xyzw_from_matrix(T_world_object[:3, :3]), 1)
+        qvel[v : v + 6] = 0.0
+        self._place(qpos, qvel, ctrl)
+        body = int(self.model.dof_bodyid[v])
+        overlap = self._overlap_of_new(set(range(self.model.nbody)) - {body})
+        if overlap:
+            self._place(*before)
             raise OpenArmError(Code.SCENE_INVALID, overlap)
 
     def _overlap_of_new(self, known: set[int]) -> str:

