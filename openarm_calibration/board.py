@@ -29,11 +29,13 @@ class CircleGrid(Config):
     """Rows of circles, every second row shifted by one spacing; 4 columns of 11 rows by default."""
 
     kind: Literal["circles"] = "circles"
-    columns: int = Field(4, ge=2, le=20, description="circles in a row")
-    rows: int = Field(11, ge=3, le=41, description="rows; odd, so that half a turn is another pattern")
-    spacing: float = Field(0.02, gt=0.001, le=0.5, description="between rows, half of that between circles of a row, m")
-    diameter: float = Field(0.015, gt=0.0, le=0.5, description="of a circle, m")
-    border: float = Field(0.02, ge=0.0, le=0.5, description="of white around the outer circle centres, m")
+    columns: int = Field(default=4, ge=2, le=20, description="circles in a row")
+    rows: int = Field(default=11, ge=3, le=41, description="rows; odd, so that half a turn is another pattern")
+    spacing: float = Field(
+        default=0.02, gt=0.001, le=0.5, description="between rows, half of that between circles of a row, m"
+    )
+    diameter: float = Field(default=0.015, gt=0.0, le=0.5, description="of a circle, m")
+    border: float = Field(default=0.02, ge=0.0, le=0.5, description="of white around the outer circle centres, m")
 
     @field_validator("rows")
     @classmethod
@@ -92,12 +94,12 @@ class Charuco(Config):
     """A chessboard with markers in its white squares; a part of it is enough."""
 
     kind: Literal["charuco"] = "charuco"
-    columns: int = Field(7, ge=3, le=40, description="squares in a row")
-    rows: int = Field(5, ge=3, le=40, description="rows of squares")
-    spacing: float = Field(0.034, gt=0.001, le=0.5, description="edge of a square, m")
-    diameter: float = Field(0.026, gt=0.0, le=0.5, description="edge of a marker, m")
-    border: float = Field(0.012, ge=0.0, le=0.5, description="of white around the squares, m")
-    dictionary: str = Field("DICT_5X5_100", description="of the markers")
+    columns: int = Field(default=7, ge=3, le=40, description="squares in a row")
+    rows: int = Field(default=5, ge=3, le=40, description="rows of squares")
+    spacing: float = Field(default=0.034, gt=0.001, le=0.5, description="edge of a square, m")
+    diameter: float = Field(default=0.026, gt=0.0, le=0.5, description="edge of a marker, m")
+    border: float = Field(default=0.012, ge=0.0, le=0.5, description="of white around the squares, m")
+    dictionary: str = Field(default="DICT_5X5_100", description="of the markers")
 
     @field_validator("dictionary")
     @classmethod

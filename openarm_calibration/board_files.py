@@ -70,7 +70,9 @@ def pdf(board: Board) -> bytes:
     """PDF of one page: the board in curves, its name, and a bar of 100 mm to measure; A4 where it fits."""
     width, height = board.size
     tall = height + 0.022  # for name and bar
-    pages = [page for page in (_A4, _A4[::-1]) if width + 2 * _MARGIN <= page[0] and tall + 2 * _MARGIN <= page[1]]
+    pages = [
+        page for page in (_A4, (_A4[1], _A4[0])) if width + 2 * _MARGIN <= page[0] and tall + 2 * _MARGIN <= page[1]
+    ]
     page = pages[0] if pages else (max(width, 0.12) + 2 * _MARGIN, tall + 2 * _MARGIN)
     left, top = (page[0] - width) / 2.0, page[1] - _MARGIN - (page[1] - 2 * _MARGIN - tall) / 2.0
     # board coordinates are y down, a page's are y up

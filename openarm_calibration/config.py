@@ -16,13 +16,15 @@ from openarm_common.config import Config
 class StoreConfig(Config):
     """Where calibrations are stored, and which mounts are in use."""
 
-    cameras: str = Field("", description="YAML of the cameras; empty is config/params/cameras.yaml")
+    cameras: str = Field(default="", description="YAML of the cameras; empty is config/params/cameras.yaml")
     store: str = Field(
-        "",
+        default="",
         description="folder of stored calibrations; empty: OPENARM_CALIBRATIONS or ~/.local/share/openarm/calibrations",
     )
     mount_seed: int = Field(
-        -1, ge=-1, description="of the simulated mounts in use; -1 or none: real ones, or simulated without an error"
+        default=-1,
+        ge=-1,
+        description="of the simulated mounts in use; -1 or none: real ones, or simulated without an error",
     )
 
     @field_validator("mount_seed", mode="before")
@@ -39,20 +41,26 @@ class StoreConfig(Config):
 class PublisherConfig(StoreConfig):
     """Parameters of the node `calibration_publisher`."""
 
-    period: float = Field(0.5, gt=0.0, le=60.0, description="between looks at the store, s of wall clock")
+    period: float = Field(default=0.5, gt=0.0, le=60.0, description="between looks at the store, s of wall clock")
 
 
 class CalibrationConfig(StoreConfig):
     """Parameters of the node `calibration`."""
 
-    camera: str = Field("wrist", min_length=1, description="name of the camera to calibrate")
-    board: str = Field("", description="keys of the board as YAML, such as {kind: circles, rows: 11}; empty: defaults")
-    carrier: str = Field(
-        "openarm_right_link7", min_length=1, description="link that holds the board when the camera stands still"
+    camera: str = Field(default="wrist", min_length=1, description="name of the camera to calibrate")
+    board: str = Field(
+        default="", description="keys of the board as YAML, such as {kind: circles, rows: 11}; empty: defaults"
     )
-    algorithm: str = Field("REFINED", description="what compute_calibration uses at first")
-    image_timeout: float = Field(2.0, gt=0.0, le=60.0, description="longest wait for an image, s of wall clock")
-    state_timeout: float = Field(1.0, gt=0.0, le=60.0, description="longest wait for joint states, s of wall clock")
+    carrier: str = Field(
+        default="openarm_right_link7",
+        min_length=1,
+        description="link that holds the board when the camera stands still",
+    )
+    algorithm: str = Field(default="REFINED", description="what compute_calibration uses at first")
+    image_timeout: float = Field(default=2.0, gt=0.0, le=60.0, description="longest wait for an image, s of wall clock")
+    state_timeout: float = Field(
+        default=1.0, gt=0.0, le=60.0, description="longest wait for joint states, s of wall clock"
+    )
     gate: GateConfig = GateConfig()
     limits: Limits = Limits()
 

@@ -69,7 +69,7 @@ def _circles(board: CircleGrid, image: Grey) -> Detection:
             cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING,
         ):
             found, centres = cv2.findCirclesGrid(large, size, flags=flags, blobDetector=blobs)
-            if not found or centres is None:
+            if not found:
                 continue  # on failure there may be a part of a grid, which is no use
             pixels = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
             # the resized image's pixel k covers (k + 0.5) / zoom - 0.5
@@ -94,7 +94,7 @@ def _circles(board: CircleGrid, image: Grey) -> Detection:
 
 def _blob_detector(area: int, circles: int) -> cv2.SimpleBlobDetector:
     """For circles of any size that fits: OpenCV's own limits are 80 px of diameter and 10 px of distance."""
-    params = cv2.SimpleBlobDetector_Params()
+    params = cv2.SimpleBlobDetector.Params()
     params.filterByArea = True
     params.minArea = 12.0
     params.maxArea = area / circles
@@ -135,7 +135,7 @@ def _ordered(board: CircleGrid, pixels: Array) -> tuple[Array, float]:
 def _corners(board: Charuco, image: Grey) -> Detection:
     detector = cv2.aruco.CharucoDetector(board.board)
     corners, ids, markers, _ = detector.detectBoard(image)
-    count = 0 if ids is None else len(ids)
+    count = 0 if ids is None else len(ids)  # pyright: ignore[reportUnnecessaryComparison] - None without a board
     if count < _FEWEST_CORNERS:
         raise OpenArmError(
             Code.NOTHING_DETECTED,

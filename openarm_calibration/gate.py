@@ -21,9 +21,9 @@ from openarm_common.robot_state import RobotStateBuffer
 class GateConfig(Config):
     """When a robot counts as standing."""
 
-    max_speed: float = Field(0.005, gt=0.0, description="of any joint that moves camera or board, rad/s")
-    window: float = Field(0.2, gt=0.0, le=2.0, description="before the image in which the speed is measured, s")
-    track: float = Field(0.15, ge=0.0, le=2.0, description="of joint states kept around the image, s")
+    max_speed: float = Field(default=0.005, gt=0.0, description="of any joint that moves camera or board, rad/s")
+    window: float = Field(default=0.2, gt=0.0, le=2.0, description="before the image in which the speed is measured, s")
+    track: float = Field(default=0.15, ge=0.0, le=2.0, description="of joint states kept around the image, s")
 
 
 @dataclass(frozen=True)

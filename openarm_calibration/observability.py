@@ -130,7 +130,7 @@ def require_accuracy(problem: Problem, estimate: Estimate, most_translation: flo
     mounts = 6 * (problem.cameras + problem.boards)
     units = np.tile(UNITS, problem.cameras + problem.boards)
     scaled = estimate.information[:mounts, :mounts] * np.outer(units, units)
-    values = np.linalg.eigvalsh(scaled) if np.isfinite(scaled).all() else np.zeros(1)
+    values: Array = np.linalg.eigvalsh(scaled).astype(np.float64) if np.isfinite(scaled).all() else np.zeros(1)
     singular = not values[0] > 0.0 or values[-1] > _WORST_CONDITION * values[0]
     if not singular:
         covariance = estimate.covariance()[:mounts, :mounts] / np.outer(units, units)
@@ -163,7 +163,8 @@ def condition_number(problem: Problem, information: Array) -> float:
     """Condition number of the information on the mounts, in units of 1 mm and 0.1°."""
     mounts = problem.cameras + problem.boards
     units = np.tile(UNITS, mounts)
-    return condition(np.linalg.eigvalsh(information[: 6 * mounts, : 6 * mounts] * np.outer(units, units)))
+    scaled = information[: 6 * mounts, : 6 * mounts] * np.outer(units, units)
+    return condition(np.linalg.eigvalsh(scaled).astype(np.float64))
 
 
 def _cause(seen: Motion) -> str:

@@ -183,7 +183,7 @@ def fit_poses(
                 H[k, k] *= 1.0 + damping
             step = np.linalg.solve(H, b[0, :6].copy())
             trial = pose.copy()
-            trial[0, :3, :3] = turned(np.ascontiguousarray(pose[0, :3, :3]), step[3:])
+            trial[0, :3, :3] = turned(np.ascontiguousarray(pose[0, :3, :3]), step[3:])  # pyright: ignore[reportArgumentType]
             w = step[3:]
             t = pose[0, :3, 3]
             trial[0, 0, 3] = t[0] + step[0] + w[1] * t[2] - w[2] * t[1]

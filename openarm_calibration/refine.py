@@ -149,7 +149,7 @@ def linearise(problem: Problem, state: State, px: float, extras: Sequence[Extra]
 
 def eliminate(linear: Linear, prior: Array) -> tuple[Array, Array, Array]:
     """Information (p, p), right-hand side (p,), and (poses, 6, 6) inverse of the corrections' block."""
-    V = np.linalg.inv(linear.KMK + prior)
+    V: Array = np.linalg.inv(linear.KMK + prior).astype(np.float64)
     VG = V @ linear.KMG
     information = linear.GMG - np.einsum("gip,giq->pq", linear.KMG, VG)
     right = linear.GMy - np.einsum("gip,gi->p", VG, linear.KMy)

@@ -45,11 +45,11 @@ class SessionHead(Config):
     setup: Literal["in_hand", "to_hand"] = Field(description="whether the arm carries the camera or the board")
     parent: str = Field(min_length=1, description="link that carries the camera")
     carrier: str = Field(min_length=1, description="link that moves: the camera's parent, or what carries the board")
-    base: str = Field("openarm_body_link0", min_length=1, description="base frame")
+    base: str = Field(default="openarm_body_link0", min_length=1, description="base frame")
     intrinsics: tuple[int, int, float, float, float, float] = Field(description="width, height, fx, fy, cx, cy")
     board: dict[str, Any] = Field(description="keys of the board")
-    mount_seed: int | None = Field(None, description="of the simulated mounts")
-    created: str = Field("", description="when, as ISO 8601")
+    mount_seed: int | None = Field(default=None, description="of the simulated mounts")
+    created: str = Field(default="", description="when, as ISO 8601")
 
     @property
     def optics(self) -> Intrinsics:

@@ -35,15 +35,19 @@ _FEWEST_TO_REJECT = 7
 class SolveConfig(Config):
     """How a calibration is solved."""
 
-    px: float | None = Field(None, gt=0.0, description="spread of a mark, px; None: estimated")
-    robot_translation: float | None = Field(None, ge=0.0, description="of the robot's position, m; None: estimated")
-    robot_rotation: float | None = Field(None, ge=0.0, description="of the robot's rotation, rad; None: estimated")
-    extras: tuple[Extra, ...] = Field((), description="more unknowns: scale, delay, intrinsics")
-    reject_outliers: bool = Field(True, description="leave poses out that the others contradict")
-    false_alarm: float = Field(1e-3, gt=0.0, lt=0.5, description="chance that a clean set loses a pose")
-    most_translation: float = Field(0.003, gt=0.0, description="largest predicted error that is an answer, m")
-    most_rotation: float = Field(math.radians(0.5), gt=0.0, description="the same of the rotation, rad")
-    seed: int = Field(0, ge=0, description="of the subsets that vote")
+    px: float | None = Field(default=None, gt=0.0, description="spread of a mark, px; None: estimated")
+    robot_translation: float | None = Field(
+        default=None, ge=0.0, description="of the robot's position, m; None: estimated"
+    )
+    robot_rotation: float | None = Field(
+        default=None, ge=0.0, description="of the robot's rotation, rad; None: estimated"
+    )
+    extras: tuple[Extra, ...] = Field(default=(), description="more unknowns: scale, delay, intrinsics")
+    reject_outliers: bool = Field(default=True, description="leave poses out that the others contradict")
+    false_alarm: float = Field(default=1e-3, gt=0.0, lt=0.5, description="chance that a clean set loses a pose")
+    most_translation: float = Field(default=0.003, gt=0.0, description="largest predicted error that is an answer, m")
+    most_rotation: float = Field(default=math.radians(0.5), gt=0.0, description="the same of the rotation, rad")
+    seed: int = Field(default=0, ge=0, description="of the subsets that vote")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +108,7 @@ def solve(problem: Problem, config: SolveConfig | None = None) -> Solution:
     require_motion(problem.subset(used))
     require_accuracy(problem.subset(used), estimate, config.most_translation, config.most_rotation)
     contradicted = [
-        Outlier(problem.views[i].name or str(i), i, _reason(tests[int(problem.pose[i])]))
+        Outlier(problem.views[i].name or str(i), int(i), _reason(tests[int(problem.pose[i])]))
         for i in np.flatnonzero(usable & ~used)
     ]
     outliers = tuple(sorted((*blurred, *contradicted), key=lambda outlier: outlier.index))
@@ -118,7 +122,7 @@ def _sharp(problem: Problem, px: float) -> tuple[Mask, list[Outlier]]:
     usable = np.isfinite(rms) & (rms < 4.0 * max(px, float(np.median(rms))) + 0.05)
     bad = [
         Outlier(
-            problem.views[i].name or str(i), i,
+            problem.views[i].name or str(i), int(i),
             f"its marks do not lie on the board: {rms[i]:.2f} px, the usual is {float(np.median(rms)):.2f} px",
         )
         for i in np.flatnonzero(~usable)

@@ -35,21 +35,21 @@ _FORMAT = 1
 class StoredCalibration(Config):
     """The mount of one camera and where it comes from."""
 
-    format: int = Field(_FORMAT, ge=_FORMAT, le=_FORMAT, description="of this file")
+    format: int = Field(default=_FORMAT, ge=_FORMAT, le=_FORMAT, description="of this file")
     camera: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$", description="name of the camera")
     parent: str = Field(min_length=1, description="link that carries the camera")
     position: tuple[float, float, float] = Field(description="of <camera>_link in the parent, m")
     quaternion_xyzw: tuple[float, float, float, float] = Field(description="of <camera>_link in the parent")
-    sigma_translation: float = Field(0.0, ge=0.0, description="predicted error of the position, m")
-    sigma_rotation: float = Field(0.0, ge=0.0, description="predicted error of the rotation, rad")
+    sigma_translation: float = Field(default=0.0, ge=0.0, description="predicted error of the position, m")
+    sigma_rotation: float = Field(default=0.0, ge=0.0, description="predicted error of the rotation, rad")
     mount_seed: int | None = Field(
-        None, description="of the simulated mounts that were calibrated; None: real or nominal"
+        default=None, description="of the simulated mounts that were calibrated; None: real or nominal"
     )
-    method: str = Field("REFINED", description="solver")
-    board: str = Field("", description="that was looked at")
-    samples: int = Field(0, ge=0, description="that the result rests on")
-    session: str = Field("", description="hash of the session file")
-    created: str = Field("", description="when, as ISO 8601")
+    method: str = Field(default="REFINED", description="solver")
+    board: str = Field(default="", description="that was looked at")
+    samples: int = Field(default=0, ge=0, description="that the result rests on")
+    session: str = Field(default="", description="hash of the session file")
+    created: str = Field(default="", description="when, as ISO 8601")
     versions: dict[str, str] = Field(default_factory=dict, description="of the software")
 
     @field_validator("position", "quaternion_xyzw")

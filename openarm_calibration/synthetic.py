@@ -38,7 +38,8 @@ class Truth:
 
     def bound(self, noise: Noise) -> Array:
         """(12, 12) Cramér-Rao bound on the covariance of X and Z."""
-        return np.linalg.inv(information_at(self.problem.with_poses(self.A), self.X[None], self.Z[None], noise))
+        information = information_at(self.problem.with_poses(self.A), self.X[None], self.Z[None], noise)
+        return np.linalg.inv(information).astype(np.float64)
 
 
 def mounts(setup: Setup) -> tuple[Array, Array]:

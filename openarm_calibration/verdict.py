@@ -30,12 +30,12 @@ Grade = Literal["pass", "warn", "fail"]
 class Limits(Config):
     """When a calibration passes; beyond three times a limit it fails, between the two it is a warning."""
 
-    translation: float = Field(0.5e-3, gt=0.0, description="predicted error of the position, m")
-    rotation: float = Field(math.radians(0.05), gt=0.0, description="predicted error of the rotation, rad")
-    held_out: float = Field(1e-3, gt=0.0, description="rms error at the board of poses that were left out, m")
-    scale: float = Field(0.003, gt=0.0, description="of the board against what is stated")
-    samples: int = Field(10, ge=3, description="fewer are a warning")
-    drift: float = Field(2e-3, gt=0.0, description="distance from the stored calibration, m")
+    translation: float = Field(default=0.5e-3, gt=0.0, description="predicted error of the position, m")
+    rotation: float = Field(default=math.radians(0.05), gt=0.0, description="predicted error of the rotation, rad")
+    held_out: float = Field(default=1e-3, gt=0.0, description="rms error at the board of poses that were left out, m")
+    scale: float = Field(default=0.003, gt=0.0, description="of the board against what is stated")
+    samples: int = Field(default=10, ge=3, description="fewer are a warning")
+    drift: float = Field(default=2e-3, gt=0.0, description="distance from the stored calibration, m")
 
 
 @dataclass(frozen=True)
