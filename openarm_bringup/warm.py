@@ -9,6 +9,7 @@ from openarm_common.cameras import Intrinsics
 from openarm_motion.warm import warm as warm_motion
 from openarm_octomap.warm import warm as warm_octomap
 from openarm_perception.depth import Deprojector, DepthLimits
+from openarm_perception.filters import drop_flying, voxel_filter
 
 
 def warm_perception() -> None:
@@ -17,7 +18,8 @@ def warm_perception() -> None:
     deprojector = Deprojector(DepthLimits(near=0.05, far=3.0))
     for depth in (np.full((6, 8), 500, np.uint16), np.full((6, 8), 0.5, np.float32)):
         deprojector.organised(depth, intrinsics)
-        deprojector.valid_points(depth, intrinsics)
+        drop_flying(depth, 0.03)
+        voxel_filter(deprojector.valid_points(depth, intrinsics), 0.01)
 
 
 def main() -> None:

@@ -50,8 +50,8 @@ def compare(states: Bytes, surface: Cells, solid: Cells) -> MapAccuracy:
     """
     occupied = states == OCCUPIED
     beside = generate_binary_structure(3, 3)
-    ghosts = occupied & ~np.asarray(binary_dilation(solid, beside))
-    missed = surface & ~np.asarray(binary_dilation(occupied, beside))
+    ghosts = occupied & np.logical_not(binary_dilation(solid, beside))
+    missed = surface & np.logical_not(binary_dilation(occupied, beside))
     hits, found = int(occupied.sum() - ghosts.sum()), int(surface.sum() - missed.sum())
     union = int(ghosts.sum()) + int(missed.sum()) + max(hits, found)
     strict = int((occupied | surface).sum())

@@ -22,20 +22,30 @@ class GridConfig(Config):
     unknown cell believes the first one. To use log-odds as liboctomap counts them, give `hit` and `miss`.
     """
 
-    resolution: float = Field(0.02, ge=0.005, le=0.2, description="edge of a cell, m")
-    lower: Vector3 = Field((-0.48, -1.0, -0.08), description="corner of the workspace in the base frame, m")
-    upper: Vector3 = Field((1.28, 1.0, 1.36), description="opposite corner of the workspace, m")
-    frames_to_mark: int = Field(1, ge=1, le=20, description="hits in a row that make the freest cell occupied")
-    frames_to_clear: int = Field(1, ge=1, le=20, description="misses in a row that make the surest cell free")
-    hit: float = Field(0.0, ge=0.0, le=10.0, description="log-odds of a hit instead; 0 derives them from the frames")
-    miss: float = Field(0.0, ge=-10.0, le=0.0, description="log-odds of a miss instead; 0 derives them from the frames")
-    clamp_min: float = Field(-CLAMP, ge=-10.0, lt=0.0, description="lowest log-odds")
-    clamp_max: float = Field(CLAMP, gt=0.0, le=10.0, description="highest log-odds")
-    max_range: float = Field(3.0, description="surfaces further away mark nothing, m; negative: no limit")
-    clear_without_return: bool = Field(True, description="views into the distance clear, without a surface behind")
-    no_return_block: int = Field(4, ge=1, le=32, description="pixels a side that must all lack a return, for that")
-    no_return_range: float = Field(2.0, gt=0.0, le=10.0, description="how far they clear, m")
-    decay_s: float = Field(0.0, ge=0.0, description="occupied cells unseen for longer become unknown, s; 0: never")
+    resolution: float = Field(default=0.02, ge=0.005, le=0.2, description="edge of a cell, m")
+    lower: Vector3 = Field(default=(-0.48, -1.0, -0.08), description="corner of the workspace in the base frame, m")
+    upper: Vector3 = Field(default=(1.28, 1.0, 1.36), description="opposite corner of the workspace, m")
+    frames_to_mark: int = Field(default=1, ge=1, le=20, description="hits in a row that make the freest cell occupied")
+    frames_to_clear: int = Field(default=1, ge=1, le=20, description="misses in a row that make the surest cell free")
+    hit: float = Field(
+        default=0.0, ge=0.0, le=10.0, description="log-odds of a hit instead; 0 derives them from the frames"
+    )
+    miss: float = Field(
+        default=0.0, ge=-10.0, le=0.0, description="log-odds of a miss instead; 0 derives them from the frames"
+    )
+    clamp_min: float = Field(default=-CLAMP, ge=-10.0, lt=0.0, description="lowest log-odds")
+    clamp_max: float = Field(default=CLAMP, gt=0.0, le=10.0, description="highest log-odds")
+    max_range: float = Field(default=3.0, description="surfaces further away mark nothing, m; negative: no limit")
+    clear_without_return: bool = Field(
+        default=True, description="views into the distance clear, without a surface behind"
+    )
+    no_return_block: int = Field(
+        default=4, ge=1, le=32, description="pixels a side that must all lack a return, for that"
+    )
+    no_return_range: float = Field(default=2.0, gt=0.0, le=10.0, description="how far they clear, m")
+    decay_s: float = Field(
+        default=0.0, ge=0.0, description="occupied cells unseen for longer become unknown, s; 0: never"
+    )
 
     @model_validator(mode="after")
     def _pair(self) -> GridConfig:
@@ -58,11 +68,13 @@ class GridConfig(Config):
 class FilterConfig(Config):
     """How the robot is cut out of what its cameras see."""
 
-    enabled: bool = Field(True, description="cut the robot and what it holds out of the images")
-    padding: float = Field(0.02, ge=0.0, le=0.2, description="around every link, m")
-    link_padding: tuple[str, ...] = Field((), description="other paddings, as `link=metres`")
-    held_padding: float = Field(0.02, ge=0.0, le=0.2, description="around what a hand holds, m")
-    reset_padding: float = Field(0.01, ge=0.0, le=0.2, description="cells this near to the robot are made unknown, m")
+    enabled: bool = Field(default=True, description="cut the robot and what it holds out of the images")
+    padding: float = Field(default=0.02, ge=0.0, le=0.2, description="around every link, m")
+    link_padding: tuple[str, ...] = Field(default=(), description="other paddings, as `link=metres`")
+    held_padding: float = Field(default=0.02, ge=0.0, le=0.2, description="around what a hand holds, m")
+    reset_padding: float = Field(
+        default=0.01, ge=0.0, le=0.2, description="cells this near to the robot are made unknown, m"
+    )
 
     @model_validator(mode="after")
     def _pairs(self) -> FilterConfig:
@@ -90,25 +102,29 @@ UnknownPolicy = Literal["free", "occupied"]
 class FieldConfig(Config):
     """The distance field for planners."""
 
-    enabled: bool = Field(True, description="compute it and share it")
-    reach: float = Field(0.40, gt=0.0, le=2.0, description="distances are cut here, m")
-    unknown: UnknownPolicy = Field("free", description="what unknown cells count as")
-    name: str = Field("", pattern=r"^[A-Za-z0-9_.-]*$", description="of the shared memory; empty: by ROS domain")
+    enabled: bool = Field(default=True, description="compute it and share it")
+    reach: float = Field(default=0.40, gt=0.0, le=2.0, description="distances are cut here, m")
+    unknown: UnknownPolicy = Field(default="free", description="what unknown cells count as")
+    name: str = Field(
+        default="", pattern=r"^[A-Za-z0-9_.-]*$", description="of the shared memory; empty: by ROS domain"
+    )
 
 
 class OctomapNodeConfig(Config):
     """Parameters of the node `octomap`."""
 
-    cameras: tuple[str, ...] = Field(("overhead", "wrist"), description="cameras of cameras.yaml")
-    depth_topic: str = Field("/{camera}/depth/image_raw", description="depth image; {camera} is filled in")
-    info_topic: str = Field("/{camera}/depth/camera_info", description="CameraInfo; {camera} is filled in")
-    cloud_topic: str = Field("cloud_in", description="clouds, a second input; empty: none")
-    period: float = Field(0.5, ge=0.05, le=60.0, description="time from update to update, s")
-    stale_after: float = Field(1.5, gt=0.0, description="a camera without a used frame for longer is reported, s")
-    held_topic: str = Field("/motion/attached_objects", description="what the hands hold, as markers on links")
-    map_file: str = Field("", description=".bt or .ot to start from; empty: nothing is known")
-    coarse_depths: tuple[int, ...] = Field((15, 14, 13), description="further depths that services answer")
-    publish_full: bool = Field(True, description="publish octomap_full too")
+    cameras: tuple[str, ...] = Field(default=("overhead", "wrist"), description="cameras of cameras.yaml")
+    depth_topic: str = Field(default="/{camera}/depth/image_raw", description="depth image; {camera} is filled in")
+    info_topic: str = Field(default="/{camera}/depth/camera_info", description="CameraInfo; {camera} is filled in")
+    cloud_topic: str = Field(default="cloud_in", description="clouds, a second input; empty: none")
+    period: float = Field(default=0.5, ge=0.05, le=60.0, description="time from update to update, s")
+    stale_after: float = Field(
+        default=1.5, gt=0.0, description="a camera without a used frame for longer is reported, s"
+    )
+    held_topic: str = Field(default="/motion/attached_objects", description="what the hands hold, as markers on links")
+    map_file: str = Field(default="", description=".bt or .ot to start from; empty: nothing is known")
+    coarse_depths: tuple[int, ...] = Field(default=(15, 14, 13), description="further depths that services answer")
+    publish_full: bool = Field(default=True, description="publish octomap_full too")
     grid: GridConfig = GridConfig()
     filter: FilterConfig = FilterConfig()
     field: FieldConfig = FieldConfig()

@@ -6,15 +6,18 @@ from __future__ import annotations
 import time
 from typing import Any, cast
 
+import numpy as np
+from numpy.typing import NDArray
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from openarm_common.convert import cloud_from_points, image_to_array, intrinsics_from_info, stamp_to_ns
-from openarm_common.errors import OpenArmError
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_NEWEST, QOS_SENSOR, BaseNode, run
 from openarm_perception.config import CloudNodeConfig, camera_of
 from openarm_perception.convert import check_frames
 from openarm_perception.depth import Deprojector, DepthImage, DepthLimits
+from openarm_perception.filters import CloudFilter
 from openarm_perception.matching import StampMatcher
 
 
@@ -27,7 +30,9 @@ class _Camera:
         self._name = name
         self._frame_id = camera.optical_frame
         self._deprojector = Deprojector(DepthLimits(near=camera.near, far=camera.far))
-        self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(("depth", "info"), self._on_frame)
+        self._filter = CloudFilter(node.config.filter)
+        streams = ("depth", "info", "color") if node.config.color else ("depth", "info")
+        self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(streams, self._on_frame)
         self._inputs: list[Subscription] = []
         topic = node.config.points_topic.format(camera=name)
         self._points = node.create_publisher(PointCloud2, topic, QOS_SENSOR)
@@ -45,6 +50,8 @@ class _Camera:
         if wanted and not self._inputs:
             self._subscribe("depth", Image, self._node.config.depth_topic)
             self._subscribe("info", CameraInfo, self._node.config.info_topic)
+            if self._node.config.color:
+                self._subscribe("color", Image, self._node.config.color_topic)
         elif not wanted and self._inputs:
             for subscription in self._inputs:
                 self._node.destroy_subscription(subscription)
@@ -65,15 +72,28 @@ class _Camera:
             check_frames(messages, self._frame_id)
             started = time.perf_counter()
             deproject = self._deprojector.organised if self._node.config.organised else self._deprojector.valid_points
-            points = deproject(cast(DepthImage, image_to_array(depth)), intrinsics_from_info(info))
+            pixels = self._filter.depth(cast(DepthImage, image_to_array(depth)))
+            points = self._filter.points(deproject(pixels, intrinsics_from_info(info)))
+            rgb = self._colors(cast(Image, messages["color"]), points.shape) if "color" in messages else None
             self.elapsed_ms = (time.perf_counter() - started) * 1e3
         except OpenArmError as error:
             self.fault = f"{self._name}: frame refused: {error.message}"
             self._node.get_logger().warning(self.fault, throttle_duration_sec=5.0)
             return
-        self._points.publish(cloud_from_points(points, self._frame_id, t_ns))
+        self._points.publish(cloud_from_points(points, self._frame_id, t_ns, rgb))
         self.fault = ""
         self.frames += 1
+
+    @staticmethod
+    def _colors(message: Image, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+        rgb = cast("NDArray[np.uint8]", image_to_array(message))
+        if message.encoding not in ("rgb8", "bgr8") or rgb.shape[:2] != shape[:2]:
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"colour image is {message.width}x{message.height} {message.encoding}; expected rgb8 or bgr8 of the"
+                f" depth's {shape[1]}x{shape[0]}",
+            )
+        return rgb if message.encoding == "rgb8" else rgb[..., ::-1]
 
 
 class CloudNode(BaseNode[CloudNodeConfig]):

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from openarm_common.cameras import CameraConfig, load_cameras
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import load_scene
 from openarm_perception.detector import Policy
+from openarm_perception.filters import FilterConfig
 from openarm_perception.localize import LocalizerConfig
 
 
@@ -58,6 +59,17 @@ class CloudNodeConfig(Config):
     organised: bool = Field(
         default=True, description="a point for every pixel, NaN where invalid; false: valid points only"
     )
+    color: bool = Field(default=False, description="a field `rgb` beside x, y, z; organised clouds only")
+    color_topic: str = Field(default="/{camera}/color/image_raw", description="aligned colour; {camera} is filled in")
+    filter: FilterConfig = FilterConfig()
+
+    @model_validator(mode="after")
+    def _fits(self) -> CloudNodeConfig:
+        if self.organised and (self.filter.voxel > 0.0 or self.filter.outliers):
+            raise ValueError("filter.voxel and filter.outliers take points away; they need organised: false")
+        if self.color and not self.organised:
+            raise ValueError("color needs organised: true")
+        return self
 
 
 def camera_of(name: str) -> CameraConfig:

@@ -86,6 +86,45 @@ def test_a47_a48_filtered_points_from_metres(ros) -> None:
     assert bench.clouds[0].is_dense
 
 
+def test_a50_a51_filters_thin_the_cloud(ros) -> None:
+    """One point a centimetre, flying pixels gone."""
+    bench = Bench(ros, organised=False, **{"filter.voxel": 0.01, "filter.flying": 0.03, "filter.median": 3})
+    bench.watch()
+    depth = flat()
+    depth[100, 100] = 900
+    bench.pump(depth, "16UC1", lambda: bench.clouds, "a cloud")
+    points = points_from_cloud(bench.clouds[0])
+    assert 5000 < len(points) < 12000
+    np.testing.assert_allclose(points[:, 2], 0.7, atol=1e-3)
+
+
+def test_colour_comes_with_the_points_when_asked_for(ros) -> None:
+    """As RViz reads it; sizes are checked."""
+    bench = Bench(ros, color=True)
+    color = ros.node.create_publisher(Image, "/overhead/color/image_raw", QOS_SENSOR)
+    pixels = np.zeros((480, 640, 3), np.uint8)
+    pixels[..., 0] = 200
+    bench.watch()
+
+    def with_color() -> bool:
+        color.publish(array_to_image(pixels, "rgb8", FRAME, bench.t_ns))
+        return bool(bench.clouds)
+
+    bench.pump(flat(), "16UC1", with_color, "a coloured cloud")
+    cloud = bench.clouds[0]
+    assert [f.name for f in cloud.fields] == ["x", "y", "z", "rgb"]
+    rgb = np.frombuffer(cloud.data, np.uint32).reshape(480, 640, 4)[..., 3]
+    assert (rgb == 200 << 16).all()
+
+
+@pytest.mark.parametrize(
+    "params", [{"filter.voxel": 0.01}, {"filter.outliers": True}, {"color": True, "organised": False}]
+)
+def test_what_takes_points_away_is_not_organised(ros, params) -> None:
+    with pytest.raises(OpenArmError, match="organised"):
+        CloudNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()])
+
+
 def test_a58_images_are_listened_to_only_while_somebody_wants_points(ros) -> None:
     """Of that camera alone."""
     bench = Bench(ros)
