@@ -30,7 +30,7 @@ from openarm_calibration.closed_form import METHODS, closed_form
 from openarm_calibration.problem import Setup, difference
 from openarm_calibration.refine import Noise
 from openarm_calibration.solve import SolveConfig, solve
-from openarm_common.errors import OpenArmError
+from openarm_common.errors import Code, OpenArmError
 
 ROBOTS = {"exact": (0.0, 0.0), "0.2mm/0.02deg": (2e-4, math.radians(0.02))}
 SETUPS: tuple[Setup, ...] = ("in_hand", "to_hand")
@@ -118,6 +118,33 @@ def show(cell: Cell) -> None:
     print("  ".join(parts), flush=True)
 
 
+def nearly_degenerate(trials: int) -> tuple[int, int, int]:
+    """Random nearly degenerate sets of every kind: how many were refused, answered, and answered silently wrong.
+
+    Silently wrong is a number that is not finite, or an error of more than six predicted standard deviations.
+    """
+    rng = np.random.default_rng(7)
+    refused = wrong = 0
+    for k in range(trials):
+        kind, setup = synthetic.DEGENERATE[k % 4], SETUPS[k // 4 % 2]
+        amount = 0.0 if k % 20 < 4 else math.radians(10.0 ** rng.uniform(-3.0, 1.0))
+        truth = synthetic.degenerate(kind, setup, rng, amount, int(rng.integers(3, 13)))
+        try:
+            solution = solve(truth.problem)
+        except OpenArmError as error:
+            if error.code != Code.DEGENERATE:
+                raise
+            refused += 1
+            continue
+        away = difference(solution.estimate.X[0], truth.X)
+        t, r = solution.sigma()
+        right = np.linalg.norm(away[:3]) <= 6.0 * t and np.linalg.norm(away[3:]) <= 6.0 * r
+        if not right:
+            wrong += 1
+            print(f"silently wrong: {kind} {setup} {math.degrees(amount):.3f}°, {away} against {t:.2e} m, {r:.2e} rad")
+    return refused, trials - refused, wrong
+
+
 def best_peer(cells: list[Cell]) -> tuple[str, float]:
     """The OpenCV method whose worst ratio is the smallest, and that ratio."""
     worst = {m: max(max(c.ratio(m)) for c in cells) for m in METHODS if all(c.error.get(m) for c in cells)}
@@ -181,6 +208,10 @@ def main() -> None:
             float(np.median(peer_ms)) if peer_ms else None, len(ms),
         )
     )  # fmt: skip
+    sets = 200 if arguments.quick else 1000
+    refused, answered, wrong = nearly_degenerate(sets)
+    print(f"nearly degenerate sets: {refused} refused by name, {answered} answered, {wrong} of these silently wrong")
+    rows.append(Row("degenerate_silent", wrong, "", "lower", 0.0, n=sets))
     write_report(rows, arguments.json)
     if arguments.table:
         arguments.table.write_text(table(cells) + "\n", encoding="utf-8")

@@ -91,3 +91,30 @@ def make(setup: Setup, C: Array, noise: Noise, rng: np.random.Generator) -> Trut
 def trial(setup: Setup, count: int, noise: Noise, rng: np.random.Generator) -> Truth:
     """A random problem of `count` poses."""
     return make(setup, views(setup, count, rng), noise, rng)
+
+
+DEGENERATE = ("translation", "axis", "turntable", "identical")
+
+
+def degenerate(kind: str, setup: Setup, rng: np.random.Generator, amount: float = 0.0, count: int = 10) -> Truth:
+    """A problem whose robot poses move in one way only.
+
+    Args:
+        kind: translation, axis (one rotation axis and translations), turntable (one axis), identical.
+        setup: in_hand or to_hand.
+        rng: Of everything random.
+        amount: Free rotation besides, rad by axis; makes the set nearly degenerate.
+        count: Poses.
+    """
+    X, Z = mounts(setup)
+    B = X @ views(setup, 1, rng)[0] @ se3.inverse(Z)
+    first = se3.inverse(B) if setup == "in_hand" else B
+    change = np.zeros((count, 6))
+    if kind in ("translation", "axis"):
+        change[:, :3] = rng.uniform(-0.03, 0.03, (count, 3))
+    if kind in ("axis", "turntable"):
+        change[:, 5] = np.radians(np.linspace(-20.0, 16.0, count))
+    change[:, 3:] += rng.normal(0.0, 1.0, (count, 3)) * amount
+    A = moved(np.broadcast_to(first, (count, 4, 4)).copy(), change)
+    C = inverses(np.broadcast_to(X, A.shape)) @ (inverses(A) if setup == "in_hand" else A) @ Z
+    return make(setup, C, Noise(0.3), rng)

@@ -118,26 +118,6 @@ def test_marks_in_a_wrong_order_are_an_outlier_too() -> None:
     assert mount_error(solution.estimate.X[0], truth.X)[0] < 1e-4
 
 
-def degenerate(kind: str, setup: str, rng: np.random.Generator, amount: float = 0.0) -> synthetic.Truth:
-    """Views whose robot poses move only in one way; `amount` (rad) of free rotation makes them nearly so."""
-    X, Z = synthetic.mounts(setup)
-    base = synthetic.views(setup, 1, rng)[0]
-    B0 = X @ base @ se3.inverse(Z)
-    A0 = se3.inverse(B0) if setup == "in_hand" else B0
-    A = []
-    for k in range(10):
-        change = np.zeros(6)
-        if kind in ("translation", "axis"):
-            change[:3] = rng.uniform(-0.03, 0.03, 3)
-        if kind in ("axis", "turntable"):
-            change[5] = math.radians(-20 + 4 * k)
-        change[3:] += rng.normal(0.0, 1.0, 3) * amount
-        A.append(moved(A0, change))
-    count = 2 if kind == "few" else 10
-    C = np.array([se3.inverse(X) @ (se3.inverse(a) if setup == "in_hand" else a) @ Z for a in A[:count]])
-    return synthetic.make(setup, C, Noise(0.3), rng)
-
-
 @pytest.mark.parametrize("setup", SETUPS)
 @pytest.mark.parametrize(
     ("kind", "name"),
@@ -151,7 +131,7 @@ def degenerate(kind: str, setup: str, rng: np.random.Generator, amount: float = 
 )
 def test_a41_n07_degenerate_sets_are_refused_by_name(setup: str, kind: str, name: str) -> None:
     """With what to add."""
-    truth = degenerate(kind, setup, np.random.default_rng(8))
+    truth = synthetic.degenerate(kind, setup, np.random.default_rng(8), count=2 if kind == "few" else 10)
     with pytest.raises(OpenArmError, match=name) as caught:
         solve(truth.problem)
     assert caught.value.code == Code.DEGENERATE
@@ -162,9 +142,9 @@ def test_a41_nearly_degenerate_sets_are_refused_or_right() -> None:
     rng = np.random.default_rng(9)
     refused = 0
     for k in range(60):
-        kind = ("translation", "axis", "turntable", "identical")[k % 4]
-        setup = SETUPS[k % 2]
-        truth = degenerate(kind, setup, rng, math.radians(10.0 ** rng.uniform(-3, 1)))
+        kind = synthetic.DEGENERATE[k % 4]
+        setup = SETUPS[k // 4 % 2]
+        truth = synthetic.degenerate(kind, setup, rng, math.radians(10.0 ** rng.uniform(-3, 1)))
         try:
             solution = solve(truth.problem)
         except OpenArmError as error:
