@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,10 @@ from openarm_common.cameras import CameraConfig, Intrinsics
 from openarm_common.convert import ENCODINGS, info_from_intrinsics, ns_to_stamp
 from openarm_common.node import QOS_SENSOR
 from openarm_sim_bridge.camera_faults import CameraFaults
-from openarm_sim_bridge.cameras import SnapshotRenderer
+from openarm_sim_bridge.cameras import Colour, Depth, SnapshotRenderer
 from openarm_sim_bridge.faults import Fault
 from openarm_sim_bridge.handover import CameraSetup
+from openarm_sim_bridge.noise import add_colour_noise, add_depth_noise
 
 
 def topic_names(camera: CameraConfig) -> tuple[str, ...]:
@@ -100,6 +102,8 @@ class CameraPublisher:
 
     def __init__(self, node: Node, setup: CameraSetup) -> None:
         self.faults = CameraFaults()
+        self._depth_noise, self._colour_noise = setup.depth_noise, setup.colour_noise
+        self._rng = np.random.default_rng(setup.noise_seed)
         self._late: list[tuple[float, Publisher, Image | CameraInfo]] = []
         self._configs = {camera.name: camera for camera in setup.cameras}
         self._cameras = {
@@ -124,10 +128,15 @@ class CameraPublisher:
         if self.faults.frozen(name):
             return
         camera = self._cameras[name]
+        colour = cast(Colour, camera.colour.pixels)
         depth = camera.depth.pixels if camera.depth is not None and camera.depth.wants_image else None
-        renderer.draw(name, camera.colour.pixels, depth)
+        renderer.draw(name, colour, cast(Depth | None, depth), self._noise if self._depth_noise.enabled else None)
+        add_colour_noise(colour, self._colour_noise, self._rng)
         if depth is not None:
             self.faults.spoil_depth(name, depth)
+
+    def _noise(self, name: str, z: NDArray[np.float32]) -> NDArray[np.float32]:
+        return add_depth_noise(z, self._configs[name].intrinsics.fx, self._depth_noise, self._rng)
 
     def publish(self, name: str, t_ns: int, *, drawn: bool) -> None:
         """Publish what listeners want of a camera.

@@ -9,7 +9,7 @@ with NaN there. Row 0 of an image is the top.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,8 @@ from openarm_sim_bridge.world import Snapshot
 
 Colour = NDArray[np.uint8]
 Depth = NDArray[np.uint16] | NDArray[np.float32]
+#: From the name of a camera and its clean depth to the measured one.
+DepthNoise = Callable[[str, NDArray[np.float32]], NDArray[np.float32]]
 
 _ADVICE = (
     "install a software renderer (Debian, Ubuntu: libegl1 libgl1 libegl-mesa0, or libosmesa6) and leave MUJOCO_GL"
@@ -108,13 +110,14 @@ class SnapshotRenderer:
         mujoco.mj_comPos(drawn.model, drawn.data)
         mujoco.mj_camlight(drawn.model, drawn.data)
 
-    def draw(self, name: str, colour: Colour, depth: Depth | None = None) -> None:
+    def draw(self, name: str, colour: Colour, depth: Depth | None = None, noise: DepthNoise | None = None) -> None:
         """Draw one camera's view of the loaded state: colour and depth from one pass.
 
         Args:
             name: Of the camera.
             colour: (height, width, 3), filled.
             depth: (height, width), filled with mm (uint16) or m (float32); None when it is not wanted.
+            noise: Makes the depth (m, NaN where invalid, before rounding) as noisy as a real camera's.
         """
         drawn = self._drawn
         if drawn is None:
@@ -130,6 +133,8 @@ class SnapshotRenderer:
         if depth is not None and raw is not None:
             z = planar_metres(raw, drawn.near, drawn.far)
             z[(z < camera.near) | (z > camera.far)] = np.nan
+            if noise is not None:
+                z = noise(name, z)
             np.copyto(depth, (millimetres(z) if depth.dtype == np.uint16 else z)[::-1])
 
     def close(self) -> None:

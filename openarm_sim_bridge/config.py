@@ -11,6 +11,7 @@ from openarm_common.config import Config
 from openarm_sim_bridge.actuation import TrajectoryConfig
 from openarm_sim_bridge.gripper import GripperConfig
 from openarm_sim_bridge.model import PhysicsConfig
+from openarm_sim_bridge.noise import ColourNoiseConfig, DepthNoiseConfig
 
 
 class BridgeConfig(Config):
@@ -30,6 +31,8 @@ class BridgeConfig(Config):
     ground_truth_rate: float = Field(
         default=20.0, gt=0.0, le=100.0, description="of the judge's topic, Hz of simulated time"
     )
+    depth_noise: DepthNoiseConfig = DepthNoiseConfig()
+    colour_noise: ColourNoiseConfig = ColourNoiseConfig()
     physics: PhysicsConfig = PhysicsConfig()
     trajectory: TrajectoryConfig = TrajectoryConfig()
     gripper: GripperConfig = GripperConfig()

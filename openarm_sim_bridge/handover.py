@@ -26,6 +26,7 @@ from openarm_common.cameras import CameraConfig
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_sim_bridge.faults import Fault, checked_fault
+from openarm_sim_bridge.noise import ColourNoiseConfig, DepthNoiseConfig
 from openarm_sim_bridge.world import Snapshot
 
 _SETUP, _MODEL, _STATE, _FAULTS = b"C", b"M", b"S", b"F"
@@ -38,18 +39,21 @@ class CameraSetup(Config):
 
     cameras: tuple[CameraConfig, ...] = Field(description="all cameras; states name them by their place here")
     depth_encoding: Literal["16UC1", "32FC1"] = Field(description="whole millimetres, or metres")
+    depth_noise: DepthNoiseConfig = DepthNoiseConfig()
+    colour_noise: ColourNoiseConfig = ColourNoiseConfig()
+    noise_seed: int = Field(default=0, ge=0, description="of all noise")
     topics: dict[str, str] = Field(description="name on the graph of each topic, by its name without remapping")
 
 
 class CameraReport(Config):
     """What the drawing process tells."""
 
-    ready: bool = Field(False, description="a frame of every camera was drawn, it can begin")
-    fault: str = Field("", description="why it can't draw")
-    watched: tuple[str, ...] = Field((), description="cameras with a subscriber")
+    ready: bool = Field(default=False, description="a frame of every camera was drawn, it can begin")
+    fault: str = Field(default="", description="why it can't draw")
+    watched: tuple[str, ...] = Field(default=(), description="cameras with a subscriber")
     rendered: dict[str, int] = Field(default={}, description="frames drawn so far, by camera")
-    dropped: int = Field(0, description="frames that were replaced by newer ones before they were drawn")
-    draw_ms: float = Field(0.0, description="mean time of the frames drawn since the last report")
+    dropped: int = Field(default=0, description="frames that were replaced by newer ones before they were drawn")
+    draw_ms: float = Field(default=0.0, description="mean time of the frames drawn since the last report")
 
 
 def pair() -> tuple[socket.socket, socket.socket]:

@@ -24,6 +24,7 @@ from openarm_common.description import SIDES, RobotDescription, Side
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Scene
 from openarm_sim_bridge import scenery
+from openarm_sim_bridge.touch import add_wrist_sensor, hand_link
 
 Positive = Annotated[float, Field(gt=0.0)]
 Seven = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive]
@@ -218,6 +219,7 @@ def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: Side,
         joint.armature = physics.arm_armature[i]
         joint.actfrclimited = False  # one limit is enough: the actuator's
         _add_servo(spec, description, name, physics.arm_kp[i], physics.arm_kv[i], effort)
+    add_wrist_sensor(spec, hand_link(side))
     tcp = description.tcp_link(side)
     spec.body(tcp).add_site(name=tcp, size=(0.004, 0.004, 0.004), group=4)
 

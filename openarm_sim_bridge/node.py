@@ -32,6 +32,7 @@ from openarm_sim_bridge.config import BridgeConfig
 from openarm_sim_bridge.controller import RobotController
 from openarm_sim_bridge.fault_executor import FaultServices
 from openarm_sim_bridge.faults import Fault
+from openarm_sim_bridge.force_publisher import ForcePublisher
 from openarm_sim_bridge.handover import CameraSetup
 from openarm_sim_bridge.service_executor import SimulationServices
 from openarm_sim_bridge.simulation import Simulation
@@ -73,6 +74,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._states = StatePublisher(
             self, self.description, world.joint_names, config.tf_rate, config.ground_truth_rate
         )
+        self._forces = ForcePublisher(self)
         self._images = self._camera_feed(cameras, world.snapshot()) if config.images else None
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
 
@@ -113,6 +115,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         with until_shutdown(self.context):
             joints = self._simulation.faults.tells_joints(state.t_ns)
             self._states.publish(state, self._simulation.world, joints=joints)
+            self._forces.publish(self._simulation.world)
             if self._images is not None:
                 self._images.tick(self._simulation.world)
 
@@ -142,12 +145,21 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         setup = CameraSetup(
             cameras=tuple(cameras.values()),
             depth_encoding=self.config.depth_encoding,
+            depth_noise=self.config.depth_noise,
+            colour_noise=self.config.colour_noise,
+            noise_seed=self.config.seed,
             topics={name: self.resolve_topic_name(name) for name in topics},
         )
         environ = {**os.environ, "ROS_DOMAIN_ID": str(self.context.get_domain_id())}
         if LARGE_PROFILE in environ:
             environ[PROFILE] = environ[LARGE_PROFILE]
-        return CameraFeed(setup, environ, first, lambda fault: self.get_logger().error(f"no images: {fault}"))
+        return CameraFeed(setup, environ, first, self._on_no_images)
+
+    def _on_no_images(self, fault: str) -> None:
+        if fault:
+            self.get_logger().error(f"no images: {fault}")
+        else:
+            self.get_logger().info("images again")
 
     def _tell_cameras(self, faults: tuple[Fault, ...]) -> None:
         if self._images is not None:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_sim_bridge.compiled import CompiledWorld, TrackedObject, compile_world, joint_slices
+from openarm_sim_bridge.touch import contact_wrench, wrist_wrench
 
 Array = NDArray[np.float64]
 
@@ -180,6 +181,15 @@ class World:
             # A free joint's linear velocity is in the world frame, its angular velocity in the body frame.
             out.append(ObjectReadout(tracked, T, d.qvel[v : v + 3].copy(), T[:3, :3] @ d.qvel[v + 3 : v + 6]))
         return tuple(out)
+
+    def wrist_wrench(self, body: str) -> tuple[Array, Array]:
+        """Force and torque (3,) of the wrist sensor of a body, in its frame; as `touch.wrist_wrench`."""
+        return wrist_wrench(self.model, self.data, body)
+
+    def pad_wrench(self, link: str) -> tuple[Array, Array]:
+        """Contact force and torque (3,) on the pad of a finger link, in its frame. A sensor of the simulated robot."""
+        pad = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_GEOM, f"{link}_pad_collision")
+        return contact_wrench(self.model, self.data, (pad,))
 
     def snapshot(self) -> Snapshot:
         """Copy of the configuration for a renderer."""

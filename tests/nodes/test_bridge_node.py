@@ -17,7 +17,7 @@ from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Duration
 from control_msgs.action import FollowJointTrajectory, ParallelGripperCommand
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, Vector3
+from geometry_msgs.msg import PoseStamped, Vector3, WrenchStamped
 from openarm_interfaces.msg import ObjectStateArray
 from openarm_interfaces.srv import InjectFault, ResetWorld, SetPause, SpawnObject, StepSimulation
 from rclpy.action import ActionClient
@@ -348,6 +348,16 @@ def test_a47_depth_in_metres_by_parameter(ros) -> None:
     assert np.nanmedian(depth_to_metres(depth[-1])) == pytest.approx(0.8, abs=0.2)
 
 
+def test_a52_noisy_depth_by_parameter(ros) -> None:
+    bench = Bench(ros, depth_noise__enabled=True, scene="empty")
+    depth = bench.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
+    ros.spin_until(lambda: len(depth) > 1, 20.0, "depth images")
+    z = depth_to_metres(depth[-1])[400:440, 300:340]
+    columns = z - np.nanmean(z, axis=1, keepdims=True)  # the table is level along a row
+    fx = load_cameras()["overhead"].intrinsics.fx
+    assert np.nanstd(columns) == pytest.approx(np.nanmean(z) ** 2 * 0.08 / (fx * 0.05), rel=0.2)
+
+
 # --- arms
 def test_a25_a_trajectory_is_followed(bench: Bench) -> None:
     feedback: list = []
@@ -477,6 +487,18 @@ def test_p22_a_gripper_stalls_on_an_object_and_says_so(bench: Bench) -> None:
     assert (answer.result.stalled, answer.result.reached_goal) == (True, False)
     assert 2 * answer.result.state.position[0] == pytest.approx(0.030, abs=0.001)
     assert answer.result.state.effort[0] == pytest.approx(-30.0, abs=1.0)
+    pads = [
+        bench.collect(WrenchStamped, f"/openarm_right_{finger}_finger/contact_wrench", QOS_SENSOR)
+        for finger in ("left", "right")
+    ]
+    wrists = bench.collect(WrenchStamped, "/right_force_torque_sensor_broadcaster/wrench", QOS_SENSOR)
+    bench.ros.spin_until(lambda: all(pads) and wrists, 5.0, "force sensors")
+    for got in pads:  # each presses with half of the force
+        force = got[-1].wrench.force
+        assert math.hypot(force.x, force.y, force.z) == pytest.approx(15.0, abs=1.5)
+    assert pads[0][-1].wrench.force.y * pads[1][-1].wrench.force.y < 0.0
+    assert pads[0][-1].header.frame_id == "openarm_right_left_finger"
+    assert wrists[-1].header.frame_id == "openarm_right_hand"
     bench.spin_sim(1.0)
     held = next(o for o in bench.node._simulation.world.objects() if o.object.name == "held")
     assert held.T_world_object[2, 3] > 0.6  # by friction alone

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated force sensors: the wrench at a wrist, and the contact force on a finger pad.
+
+Forces are N, torques N m, in the frame of the body that carries the sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def hand_link(side: str) -> str:
+    """Link that carries the wrist's force-torque sensor."""
+    return f"openarm_{side}_hand"
+
+
+def pad_links(side: str) -> tuple[str, str]:
+    """Finger links of a hand; the pad of each is its collision geom `{link}_pad_collision`."""
+    return f"openarm_{side}_left_finger", f"openarm_{side}_right_finger"
+
+
+def add_wrist_sensor(spec: mujoco.MjSpec, body: str) -> None:
+    """Let a body feel how the arm holds it and all beyond it: sensors `{body}_force` and `{body}_torque`."""
+    site = f"{body}_wrench"
+    spec.body(body).add_site(name=site, size=(0.004, 0.004, 0.004), group=4)
+    for kind, what in ((mujoco.mjtSensor.mjSENS_FORCE, "force"), (mujoco.mjtSensor.mjSENS_TORQUE, "torque")):
+        spec.add_sensor(name=f"{body}_{what}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site)
+
+
+def wrist_wrench(model: mujoco.MjModel, data: mujoco.MjData, body: str) -> tuple[Array, Array]:
+    """Force and torque (3,) by which the arm holds a body with a wrist sensor and all beyond it, in its own frame."""
+    out: list[Array] = []
+    for what in ("force", "torque"):
+        sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, f"{body}_{what}")
+        address = int(model.sensor_adr[sensor])
+        out.append(data.sensordata[address : address + 3].copy())
+    return out[0], out[1]
+
+
+def contact_wrench(model: mujoco.MjModel, data: mujoco.MjData, geoms: Iterable[int]) -> tuple[Array, Array]:
+    """Sum of the contact forces on geoms of one body, and their torque about its origin, (3,) in the body's frame.
+
+    A contact names its two geoms in an order of MuJoCo's choice; its force is the one on the second.
+    """
+    wanted = set(geoms)
+    force, torque, result = np.zeros(3), np.zeros(3), np.zeros(6)
+    if not wanted:
+        return force, torque
+    body = int(model.geom_bodyid[next(iter(wanted))])
+    origin, rotation = data.xpos[body], data.xmat[body].reshape(3, 3)
+    for i in range(data.ncon):
+        contact = data.contact[i]
+        sign = float(contact.geom2 in wanted) - float(contact.geom1 in wanted)
+        if sign == 0.0:
+            continue
+        mujoco.mj_contactForce(model, data, i, result)
+        axes = contact.frame.reshape(3, 3)  # rows: normal from the first geom to the second, two tangents
+        push, turn = sign * axes.T @ result[:3], sign * axes.T @ result[3:]
+        force += push
+        torque += turn + np.cross(contact.pos - origin, push)
+    return rotation.T @ force, rotation.T @ torque
