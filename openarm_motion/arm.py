@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from openarm_motion.cartesian import Line
 from openarm_motion.collision import Box, CollisionScene, Contact, Surroundings
 from openarm_motion.collision_robot import CollisionRobot
 from openarm_motion.config import MotionConfig
+from openarm_motion.fast import FastScene
+from openarm_motion.fast_planner import FastPlanner
 from openarm_motion.inverse import InverseKinematics
 from openarm_motion.kinematics import ArmKinematics
 from openarm_motion.planner import OmplPlanner, PlannedPath, Planner, PlanQuery, never
@@ -75,7 +78,7 @@ class Arm:
         self.inverse = InverseKinematics(self.kinematics, config.planning.swivels)
         self.robot = CollisionRobot(description, self.kinematics)
         self.static: tuple[Box, ...] = tuple(static)
-        self._planner: Planner = planner or OmplPlanner()
+        self._planner: Planner = planner or (FastPlanner() if config.planning.planner == "fast" else OmplPlanner())
         limits = config.limits
         if len(limits.velocity) != self.kinematics.n:
             raise OpenArmError(
@@ -241,6 +244,9 @@ class Arm:
             time_limit=time_limit,
             seed=search.seed,
             stopped=now.stopped,
+            fast=cache(lambda: FastScene([scene])),
+            resolution=(search.edge_step, search.edge_travel),
+            limits=(limits.velocity, limits.acceleration, limits.jerk),
         )
 
     def time_free(self, path: PlannedPath, scale: float) -> Trajectory:

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from openarm_motion.arm import Arm, segment_time
 from openarm_motion.collision import Box, CollisionScene, Contact, Surroundings, spread
+from openarm_motion.fast import FastScene
 from openarm_motion.planner import PlanQuery, never
 from openarm_motion.trajectory import JointLimits
 
@@ -120,4 +122,7 @@ class BothArms:
             time_limit=time_limit,
             seed=search.seed,
             stopped=never,
+            fast=cache(lambda: FastScene([scene.first, scene.second])),
+            resolution=(search.edge_step, search.edge_travel),
+            limits=(limits.velocity, limits.acceleration, limits.jerk),
         )

@@ -137,6 +137,29 @@ class CollisionScene:
         self._geometry_data = pin.GeometryData(self._geometry)
         self._set_margins()
 
+    @property
+    def robot(self) -> CollisionRobot:
+        """The robot as the arm sees it."""
+        return self._robot
+
+    @property
+    def around(self) -> Surroundings:
+        """What is around the arm."""
+        return self._around
+
+    def shapes(self) -> list[tuple[int, Array, coal.ShapeBase]]:
+        """Joint, pose (4, 4) in that joint's frame, and geometry of every shape; the robot's come first."""
+        return [(o.parentJoint, np.array(o.placement.homogeneous), o.geometry) for o in self._geometry.geometryObjects]
+
+    def joint_poses(self) -> list[Array]:
+        """Poses (4, 4) of the model's joints with the arm wherever it was last put."""
+        pin.forwardKinematics(self._robot.model, self._data, self._q)
+        return [np.array(pose.homogeneous) for pose in self._data.oMi]
+
+    def required(self) -> list[tuple[int, int, float]]:
+        """Pairs of shapes and the distance that each must keep, m."""
+        return [(i, j, float(d)) for (i, j), d in zip(self._pair_index, self._required, strict=True)]
+
     def collides(self, q: ArrayLike) -> bool:
         """Whether some pair is nearer than it may be at the arm's configuration (n,)."""
         self._robot.put(self._q, q)

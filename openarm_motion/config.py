@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from openarm_common.config import Config
@@ -45,6 +47,7 @@ class StraightClearance(Clearance):
 class PlanningConfig(Config):
     """How plans are searched for."""
 
+    planner: Literal["fast", "ompl"] = Field(default="fast", description="what searches for free paths")
     joint_margin: float = Field(
         default=0.05, ge=0.0, le=0.5, description="kept from joint limits at goals and on lines, rad"
     )

@@ -21,6 +21,7 @@ from ompl import geometric as og
 from ompl import util as ou
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_motion.fast import FastScene
 
 Array = NDArray[np.float64]
 
@@ -54,6 +55,9 @@ class PlanQuery:
         time_limit: Wall clock, s.
         seed: Of the random numbers: the same query gives the same path.
         stopped: Asked often; planning ends with CANCELLED when it says True.
+        fast: Makes the fast layer's view of the same; None leaves the two questions above.
+        resolution: Turn of a joint (rad) and travel of a point (m) between two checks of a line.
+        limits: Velocity, acceleration and jerk (n,) of the joints, which make a segment's cost on the fast layer.
     """
 
     start: Array
@@ -66,6 +70,9 @@ class PlanQuery:
     time_limit: float = 5.0
     seed: int = 1
     stopped: Callable[[], bool] = field(default=never)
+    fast: Callable[[], FastScene] | None = None
+    resolution: tuple[float, float] = (0.05, 0.02)
+    limits: tuple[Array, Array, Array] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,10 @@ import numpy as np
 
 from openarm_common.description import SIDES, RobotDescription
 from openarm_motion.cartesian import solve_line
+from openarm_motion.collision import CollisionScene, Surroundings
+from openarm_motion.collision_robot import CollisionRobot
+from openarm_motion.fast import FastScene
+from openarm_motion.fast_planner import warm_search
 from openarm_motion.inverse import InverseKinematics
 from openarm_motion.kinematics import ArmKinematics
 
@@ -25,6 +29,8 @@ def warm() -> None:
     inverse.solutions(pose, near=q)
     away = pose.copy()
     away[2, 3] += 0.01
+    scene = CollisionScene(CollisionRobot(description, kinematics), Surroundings(home))
+    warm_search(FastScene([scene]), q)
     solve_line(inverse, inverse.classify(q), pose, away, margin=0.0)
 
 

@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fast collision layer: what an exact scene checks, packed for numba, and the map as distances.
+
+It never calls a state free that the exact layer calls a collision: pairs of shapes count as apart only where an axis
+separates their projections by the distance that the exact layer asks for; the map is met by spheres that cover the
+shapes. A scene is a snapshot: boxes that are moved later, and other joints, are not followed. Base frame, m, rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion import fast_kernels as kernels
+from openarm_motion.collision import CollisionScene
+
+Array = NDArray[np.float64]
+
+#: Added to distances, so that rounding does not decide, m.
+_ROUNDING = 1e-6
+#: Edge of the cells that shapes are cut into before each is put into a sphere, m.
+_CELL = 0.045
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceMap:
+    """Distances (x, y, z), m, between centres of cells, to the nearest occupied one, cut at `reach`.
+
+    Attributes:
+        distances: float32, m.
+        corner: (3,) lower corner of the first cell, base frame, m.
+        resolution: Edge of a cell, m.
+        reach: Where distances are cut, m.
+    """
+
+    distances: NDArray[np.float32]
+    corner: Array
+    resolution: float
+    reach: float
+
+
+class FastScene:
+    """One arm, or two as one, in one set of surroundings. Not for two threads at once; `model` may be shared.
+
+    Args:
+        scenes: Exact scenes of the arms, one each, of the same robot; configurations are in their order.
+        field: What else is in the way.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when the reach of the map is too short to say anything.
+    """
+
+    def __init__(self, scenes: Sequence[CollisionScene], field: DistanceMap | None = None) -> None:
+        self.levers: Array = np.concatenate([scene.levers for scene in scenes])
+        packed = _Packer(scenes, field)
+        self.model: kernels.Model = packed.model()
+        self._work = kernels.workspace(self.model)
+
+    def free(self, q: ArrayLike) -> bool:
+        """Whether a state (n,) is proven free."""
+        return kernels.near_pair(np.ascontiguousarray(q, dtype=np.float64), self.model, self._work) == -1
+
+    def free_many(self, states: ArrayLike) -> NDArray[np.bool_]:
+        """Whether each of the states (m, n) is proven free."""
+        values = np.ascontiguousarray(states, dtype=np.float64)
+        out = np.empty(values.shape[0], np.bool_)
+        kernels.states_free(values, self.model, out)
+        return out
+
+    def edge_free(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.02) -> bool:
+        """Whether the straight joint line is free, at the states where the exact layer would look."""
+        return bool(kernels.line_free(a, b, step, travel, self.levers, self.model, self._work))
+
+
+class _Packer:
+    def __init__(self, scenes: Sequence[CollisionScene], field: DistanceMap | None) -> None:
+        self._scenes, self._field = scenes, field
+        self._kinds: list[int] = []
+        self._sizes: list[Array] = []
+        self._radii: list[float] = []
+        self._bodies: list[int] = []
+        self._poses: list[Array] = []
+        self._keep: list[tuple[int, int, float]] = []
+        self._covered: dict[int, float] = {}
+        joints: dict[int, int] = {}
+        for scene in scenes:
+            joints.update({joint: len(joints) + k + 1 for k, joint in enumerate(scene.robot.joints)})
+        links = len(scenes[0].robot.links)
+        seen: set[tuple[int, int]] = set()
+        for s, scene in enumerate(scenes):
+            shapes, places = scene.shapes(), scene.joint_poses()
+            parents = scene.robot.model.parents
+            index = {k: (k if k < links else k - links + len(self._kinds)) for k in range(len(shapes))}
+            if s == 0:
+                index = {k: k for k in range(len(shapes))}
+            for joint, T, shape in shapes if s == 0 else shapes[links:]:
+                self._add(joint, T, shape, places, parents, joints)
+            for i, j, keep in scene.required():
+                pair = (min(index[i], index[j]), max(index[i], index[j]))
+                if pair not in seen:
+                    seen.add(pair)
+                    self._keep.append((*pair, keep + _ROUNDING))
+            self._cover(scene, index, len(shapes), links)
+
+    def _cover(self, scene: CollisionScene, index: dict[int, int], count: int, links: int) -> None:
+        """Clearance to the map of what moves."""
+        keep, hand = scene.around.clearance, scene.robot.arm.hand
+        for k in scene.robot.moving:
+            self._covered[index[k]] = keep.hand if scene.robot.links[k] in hand else keep.world
+        for k in range(links, count):
+            if self._bodies[index[k]] > 0:
+                self._covered[index[k]] = keep.hand
+
+    def _add(
+        self,
+        joint: int,
+        T: Array,
+        shape: coal.ShapeBase,
+        places: list[Array],
+        parents: Sequence[int],
+        joints: dict[int, int],
+    ) -> None:
+        kind, size = _kind(shape)
+        mover = joint
+        while mover > 0 and mover not in joints:
+            mover = parents[mover]
+        body = joints.get(mover, 0)
+        pose = places[joint] @ T if body == 0 else se3.inverse(places[mover]) @ places[joint] @ T
+        self._kinds.append(kind)
+        self._sizes.append(size)
+        self._radii.append(_radius(kind, size))
+        self._bodies.append(body)
+        self._poses.append(pose[:3])
+
+    def model(self) -> kernels.Model:
+        """Everything as arrays."""
+        chains = [scene.robot.kinematics for scene in self._scenes]
+        parents: list[int] = []
+        for chain in chains:
+            parents += [0, *range(len(parents) + 1, len(parents) + chain.n)]
+        clusters, of = self._clusters()
+        groups, reaches, pairs, keep = self._groups(of)
+        centres = np.array([c for _, c, _ in clusters])
+        spheres, sphere_groups, bounds = self._spheres()
+        field = self._field
+        slack = 0.0 if field is None else float(np.sqrt(3.0)) * field.resolution
+        if field is not None and len(spheres) and float(spheres[:, 3].max()) + slack > field.reach:
+            need = float(spheres[:, 3].max()) + slack
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"distances of the map are cut at {field.reach:.3f} m, expected {need:.3f} m or more",
+            )
+        return kernels.Model(
+            np.array(parents, np.int64),
+            np.concatenate([chain.placements for chain in chains]),
+            np.concatenate([chain.axes for chain in chains]),
+            np.concatenate([chain.prismatic for chain in chains]),
+            np.array(self._kinds, np.int64),
+            np.array(self._sizes),
+            np.array(self._radii),
+            np.array(self._bodies, np.int64),
+            np.array(self._poses),
+            groups,
+            reaches,
+            np.array([body for body, _, _ in clusters], np.int64),
+            centres,
+            np.array([bound for _, _, bound in clusters]),
+            pairs,
+            keep,
+            spheres,
+            sphere_groups,
+            bounds,
+            np.full((1, 1, 1), np.inf, np.float32) if field is None else np.array(field.distances, np.float32),
+            np.zeros(3) if field is None else np.array(field.corner, np.float64),
+            np.array([1.0 if field is None else field.resolution, slack]),
+        )
+
+    def _clusters(self) -> tuple[list[tuple[int, Array, float]], dict[int, int]]:
+        """Shapes of one body are a cluster, each shape that does not move is its own; body, centre, radius."""
+        members: dict[tuple[int, int], list[int]] = {}
+        for k, body in enumerate(self._bodies):
+            members.setdefault((body, -1 if body else k), []).append(k)
+        out: list[tuple[int, Array, float]] = []
+        of: dict[int, int] = {}
+        for (body, _), shapes in members.items():
+            places = np.array([self._poses[k][:, 3] for k in shapes])
+            centre = 0.5 * (places.min(axis=0) + places.max(axis=0))
+            radii = np.array([self._radii[k] for k in shapes])
+            of.update(dict.fromkeys(shapes, len(out)))
+            out.append((body, centre, float(np.max(np.linalg.norm(places - centre, axis=1) + radii))))
+        return out, of
+
+    def _groups(self, of: dict[int, int]) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
+        bodies = {cluster: self._bodies[k] for k, cluster in of.items()}
+        lone = {cluster: k for k, cluster in of.items() if bodies[cluster] == 0}
+        ordered: dict[tuple[int, int], list[tuple[int, int, float]]] = {}
+        for i, j, keep in self._keep:
+            # what stands still comes second
+            a, b = sorted((of[i], of[j]), key=lambda c: (bodies[c] == 0, c))
+            ordered.setdefault((a, b), []).append((i, j, keep))
+        groups: list[tuple[int, int, int, int, int]] = []
+        flat: list[tuple[int, int, float]] = []
+        for (a, b), pairs in ordered.items():
+            groups.append((a, b, len(flat), len(flat) + len(pairs), lone.get(b, -1)))
+            flat += pairs
+        reaches = [max(0.0, *(keep for _, _, keep in pairs), 0.0) for pairs in ordered.values()]
+        return (
+            np.array(groups, np.int64).reshape(-1, 5),
+            np.array(reaches, np.float64),
+            np.array([(i, j) for i, j, _ in flat], np.int64).reshape(-1, 2),
+            np.array([keep for _, _, keep in flat], np.float64),
+        )
+
+    def _spheres(self) -> tuple[Array, NDArray[np.int64], Array]:
+        """Spheres that cover what moves, body by body; empty without a map."""
+        spheres: list[Array] = []
+        groups: list[tuple[int, int, int]] = []
+        bounds: list[Array] = []
+        bodies = sorted({self._bodies[k] for k in self._covered}) if self._field is not None else []
+        for body in bodies:
+            first = len(spheres)
+            for k, keep in self._covered.items():
+                if self._bodies[k] == body:
+                    for centre, radius in cover(self._kinds[k], self._sizes[k]):
+                        p = self._poses[k][:, :3] @ centre + self._poses[k][:, 3]
+                        spheres.append(np.array([*p, radius + keep]))
+            mine = np.array(spheres[first:])
+            centre = 0.5 * (mine[:, :3].min(axis=0) + mine[:, :3].max(axis=0))
+            bound = float(np.max(np.linalg.norm(mine[:, :3] - centre, axis=1) + mine[:, 3]))
+            groups.append((body, first, len(spheres)))
+            bounds.append(np.array([*centre, bound]))
+        return (
+            np.array(spheres, np.float64).reshape(-1, 4),
+            np.array(groups, np.int64).reshape(-1, 3),
+            np.array(bounds, np.float64).reshape(-1, 4),
+        )
+
+
+def cover(kind: int, size: Array) -> Iterable[tuple[Array, float]]:
+    """Spheres (centre (3,), radius) that together hold a shape, in its frame."""
+    if kind == kernels.SPHERE:
+        yield np.zeros(3), float(size[0])
+        return
+    half = size if kind == kernels.BOX else np.array([size[0], size[0], size[1]])
+    counts = np.maximum(np.ceil(2.0 * half / _CELL), 1).astype(int)
+    cell = 2.0 * half / counts
+    for at in np.ndindex(*counts.tolist()):
+        centre = -half + (np.array(at) + 0.5) * cell
+        beyond = np.maximum(np.abs(centre[:2]) - 0.5 * cell[:2], 0.0)
+        if kind == kernels.CYLINDER and float(np.hypot(*beyond)) > size[0]:
+            continue  # a corner that the cylinder does not reach
+        yield centre, 0.5 * float(np.linalg.norm(cell)) + 1e-9
+
+
+def _kind(shape: coal.ShapeBase) -> tuple[int, Array]:
+    if isinstance(shape, coal.Box):
+        return kernels.BOX, np.array(shape.halfSide, np.float64)
+    if isinstance(shape, coal.Cylinder):
+        return kernels.CYLINDER, np.array([shape.radius, shape.halfLength, 0.0])
+    if isinstance(shape, coal.Sphere):
+        return kernels.SPHERE, np.array([shape.radius, 0.0, 0.0])
+    raise OpenArmError(Code.INVALID_ARGUMENT, f"shape {type(shape).__name__}; valid: box, cylinder, sphere")
+
+
+def _radius(kind: int, size: Array) -> float:
+    if kind == kernels.CYLINDER:
+        return float(np.hypot(size[0], size[1]))
+    return float(np.linalg.norm(size)) if kind == kernels.BOX else float(size[0])

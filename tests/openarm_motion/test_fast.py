@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fast collision layer: it never says free where the exact layer says collision."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from openarm_common import se3
+from openarm_common.description import RobotDescription
+from openarm_common.errors import OpenArmError
+from openarm_motion import fast_kernels as kernels
+from openarm_motion.arm import Arm
+from openarm_motion.both import BothArms
+from openarm_motion.collision import Box, CollisionScene, Surroundings, box_from
+from openarm_motion.collision_robot import CollisionRobot
+from openarm_motion.fast import DistanceMap, FastScene, cover
+from openarm_motion.kinematics import ArmKinematics
+
+
+def turned_boxes(rng: np.random.Generator, count: int) -> list[Box]:
+    """Boxes of any size in any orientation around the arms."""
+    boxes = []
+    for i in range(count):
+        R = se3.exp_so3(rng.uniform(-2.0, 2.0, 3))
+        boxes.append(box_from(f"b{i}", rng.uniform((0.1, -0.5, 0.4), (0.7, 0.5, 1.0)), rng.uniform(0.01, 0.3, 3), R))
+    return boxes
+
+
+def disagreements(arm: Arm, home: dict[str, float], count: int, seed: int) -> tuple[int, int, int]:
+    """States called free wrongly, called a collision needlessly, and truly free, with boxes and something held."""
+    rng = np.random.default_rng(seed)
+    wrong = needless = free = 0
+    per_scene = 500
+    for _ in range(count // per_scene):
+        held = [box_from("thing", (0.0, 0.0, 0.03), rng.uniform(0.02, 0.12, 3))]
+        exact = arm.scene(home, turned_boxes(rng, 6), held)
+        states = rng.uniform(arm.kinematics.lower, arm.kinematics.upper, (per_scene, arm.kinematics.n))
+        fast = FastScene([exact]).free_many(states)
+        truth = np.array([not exact.collides(q) for q in states])
+        wrong += int(np.sum(fast & ~truth))
+        needless += int(np.sum(~fast & truth))
+        free += int(np.sum(truth))
+    return wrong, needless, free
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a68_never_free_where_the_exact_layer_says_collision(
+    arms: dict[str, Arm], home: dict[str, float], side: str
+) -> None:
+    wrong, needless, free = disagreements(arms[side], home, 4000, 68)
+    assert wrong == 0
+    assert free > 300
+    assert needless < 0.05 * free  # it is of use, too
+
+
+@pytest.mark.slow
+def test_a68_never_free_where_the_exact_layer_says_collision_1e5(arms: dict[str, Arm], home: dict[str, float]) -> None:
+    for seed, arm in enumerate(arms.values()):
+        wrong, needless, free = disagreements(arm, home, 50_000, 1000 + seed)
+        assert wrong == 0
+        assert needless < 0.05 * free
+
+
+def test_a74_both_arms_never_free_where_they_meet(arms: dict[str, Arm], home: dict[str, float]) -> None:
+    both = BothArms(arms["left"], arms["right"])
+    rng = np.random.default_rng(74)
+    exact = both.scene(home, turned_boxes(rng, 3))
+    fast = FastScene([exact.first, exact.second])
+    states = rng.uniform(both.lower, both.upper, (1500, 14))
+    free = fast.free_many(states)
+    truth = np.array([not exact.collides(q) for q in states])
+    assert not np.any(free & ~truth)
+    assert int(np.sum(free)) > 0.9 * int(np.sum(truth)) > 30
+
+
+def test_edges_agree_with_the_exact_layer(right: Arm, home: dict[str, float]) -> None:
+    rng = np.random.default_rng(5)
+    exact = right.scene(home, turned_boxes(rng, 3))
+    fast = FastScene([exact])
+    states = rng.uniform(right.kinematics.lower, right.kinematics.upper, (400, 7))
+    states = states[fast.free_many(states)]
+    free = 0
+    for a in states:
+        b = np.clip(a + rng.normal(0.0, 0.2, 7), right.kinematics.lower, right.kinematics.upper)
+        if fast.edge_free(a, b, 0.05, 0.02):
+            assert exact.edge_free(a, b, 0.05, 0.02)
+            free += 1
+    assert free > 10
+
+
+def test_a_thin_wall_is_not_jumped_over(right: Arm, home: dict[str, float]) -> None:
+    """The hand on one side of a sheet of 1 mm, and on the other: steps are short enough to meet it."""
+    poses = [se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.32, y, 0.62)) for y in (-0.32, -0.10)]
+    scene = right.scene(home)
+    a, b = (next(s.q for s in right.inverse.solutions(p, 0.05) if not scene.collides(s.q)) for p in poses)
+    walled = right.scene(home, [box_from("sheet", (0.32, -0.21, 0.6), (0.5, 0.001, 0.4))])
+    assert not FastScene([walled]).edge_free(a, b, 0.05, 0.02)
+
+
+def map_of(cells: np.ndarray, reach: float) -> DistanceMap:
+    """Distances to occupied cells (x, y, z) of 2 cm, the corner at (-0.2, -0.8, 0.2)."""
+    distances = np.minimum(ndimage.distance_transform_edt(~cells) * 0.02, reach).astype(np.float32)
+    return DistanceMap(distances, np.array([-0.2, -0.8, 0.2]), 0.02, reach)
+
+
+def map_boxes(cells: np.ndarray) -> Sequence[Box]:
+    corner = np.array([-0.2, -0.8, 0.2])
+    return [box_from(f"c{k}", corner + (i + 0.5) * 0.02, (0.02,) * 3) for k, i in enumerate(np.argwhere(cells))]
+
+
+def test_a67_cells_of_a_map_are_never_overlooked(right: Arm, home: dict[str, float]) -> None:
+    rng = np.random.default_rng(9)
+    cells = np.zeros((50, 80, 50), np.bool_)
+    cells[tuple(rng.integers(0, cells.shape, (60, 3)).T)] = True
+    exact = right.scene(home, map_boxes(cells))
+    fast = FastScene([right.scene(home)], map_of(cells, 0.15))
+    states = rng.uniform(right.kinematics.lower, right.kinematics.upper, (1000, 7))
+    free = fast.free_many(states)
+    truth = np.array([not exact.collides(q) for q in states])
+    assert not np.any(free & ~truth)
+    assert 10 < int(np.sum(free)) < int(np.sum(FastScene([right.scene(home)]).free_many(states)))
+
+
+def test_a_cell_at_the_gripper_is_seen(right: Arm, home: dict[str, float]) -> None:
+    q = np.array([home[name] for name in right.names])
+    cells = np.zeros((50, 80, 50), np.bool_)
+    far = FastScene([right.scene(home)], map_of(cells, 0.15))
+    assert far.free(q)
+    p = right.kinematics.fk(q)[:3, 3]
+    cells[tuple(np.floor((p - [-0.2, -0.8, 0.2]) / 0.02).astype(int))] = True
+    assert not FastScene([right.scene(home)], map_of(cells, 0.15)).free(q)
+
+
+def test_a_map_that_does_not_reach_far_enough_is_refused(right: Arm, home: dict[str, float]) -> None:
+    cells = np.zeros((5, 5, 5), np.bool_)
+    with pytest.raises(OpenArmError, match="distances of the map are cut at"):
+        FastScene([right.scene(home)], map_of(cells, 0.05))
+
+
+@pytest.mark.parametrize("kind", [kernels.BOX, kernels.CYLINDER, kernels.SPHERE])
+def test_spheres_cover_their_shape(kind: int) -> None:
+    rng = np.random.default_rng(kind)
+    for _ in range(20):
+        size = rng.uniform(0.005, 0.12, 3)
+        p = rng.uniform(-1.0, 1.0, (2000, 3))
+        if kind == kernels.BOX:
+            p = p * size
+        elif kind == kernels.CYLINDER:
+            p = p[np.hypot(p[:, 0], p[:, 1]) <= 1.0] * [size[0], size[0], size[1]]
+        else:
+            p = p[np.linalg.norm(p, axis=1) <= 1.0] * size[0]
+        spheres = list(cover(kind, size))
+        gaps = np.min([np.linalg.norm(p - centre, axis=1) - radius for centre, radius in spheres], axis=0)
+        assert np.all(gaps <= 0.0)
+
+
+def test_b13_another_robot_goes_through_the_same_code(six: RobotDescription) -> None:
+    robot = CollisionRobot(six, ArmKinematics(six, "tool"))
+    rng = np.random.default_rng(13)
+    exact = CollisionScene(robot, Surroundings({}, turned_boxes(rng, 4)))
+    states = rng.uniform(robot.kinematics.lower, robot.kinematics.upper, (2000, 6))
+    free = FastScene([exact]).free_many(states)
+    truth = np.array([not exact.collides(q) for q in states])
+    assert not np.any(free & ~truth)
+    assert int(np.sum(free)) > 0.9 * int(np.sum(truth)) > 100
