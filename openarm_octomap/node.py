@@ -40,6 +40,8 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
         config = self.config
         body = with_housings(self.description, load_cameras().values())
         self._mapper = Mapper(body, config.grid, config.filter, config.field)
+        if config.map_file:
+            self._mapper.load(Path(config.map_file).expanduser())
         self._cameras = [DepthSource(self, c, config.depth_topic, config.info_topic) for c in _cameras(config.cameras)]
         self._sources: list[Source[Image] | Source[PointCloud2]] = [*self._cameras]
         if config.cloud_topic:
@@ -70,7 +72,6 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
         self.create_timer(config.period, self._on_timer, clock=self.wall_clock)
         self.create_timer(1.0, self._report, clock=self.wall_clock)
         if config.map_file:
-            self._mapper.load(Path(config.map_file).expanduser())
             self._show()
 
     def close(self) -> None:

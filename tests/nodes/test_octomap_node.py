@@ -349,6 +349,21 @@ def test_a_camera_that_falls_silent_is_named(ros, tmp_path) -> None:
         field.require_fresh(time.monotonic_ns(), 1.0)
 
 
+def test_a_map_to_start_from_is_published_and_a_damaged_one_refused(ros, tmp_path) -> None:
+    """And leaves no shared memory behind."""
+    reference = Path(__file__).parents[1] / "openarm_octomap" / "data" / "reference.bt"
+    bench = Bench(ros, tmp_path, map_file=str(reference))
+    bench.ros.spin_until(lambda: bench.maps, 10.0, "the map of the file")
+    assert len(bench.maps[0].data) > 1000
+    damaged = tmp_path / "damaged.bt"
+    damaged.write_bytes(reference.read_bytes()[:2000])
+    name = f"test_{tmp_path.name}_2"
+    params = {"map_file": str(damaged), "field.name": name}
+    with pytest.raises(OpenArmError, match="octree is damaged"):
+        OctomapNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()])
+    assert not field_path(name).exists()
+
+
 def test_unknown_cameras_and_wrong_parameters_are_refused(ros) -> None:
     for params, text in (({"cameras": ["spectator"]}, "has no depth"), ({"grid.resolution": 0.0}, "grid.resolution")):
         with pytest.raises(OpenArmError, match=text):

@@ -14,9 +14,10 @@ from openarm_common import se3
 from openarm_common.scene import load_scene
 from openarm_octomap.accuracy import compare
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
+from openarm_octomap.grid import CloudScan
 from openarm_octomap.kernels import OCCUPIED
 from openarm_octomap.mapper import Mapper
-from openarm_octomap.self_filter import HeldBox
+from openarm_octomap.self_filter import HeldBox, SelfFilter
 
 PERIOD_NS = 500_000_000
 DEMO = load_scene("demo")
@@ -69,6 +70,26 @@ def test_n10_a46_the_map_is_the_visible_geometry(scene: MapScene, truth: Visible
     assert result.ghosts == 0
     assert result.missed <= 0.005 * result.surface
     assert result.iou >= 0.98
+
+
+def test_a46_the_clouds_of_both_cameras_meet_in_the_base_frame(scene: MapScene) -> None:
+    """Where both see a surface, they say the same of its depth: 5 mm at the 95th percentile."""
+    home, looking = dict(scene.joints), scene.description.group_state("right_arm", "wrist_look")
+    scene.joints |= {name: q for name, q in looking.items() if name in home}
+    frames = scene.frames(0)
+    wrist = frames[1].scan.points()
+    body = SelfFilter(scene.body, FilterConfig())
+    label, _ = body.label_cloud(CloudScan(wrist, np.zeros(3)), body.shapes(scene.joints))
+    scene.joints = home
+    view = frames[0].scan
+    local = se3.apply(se3.inverse(view.T_base_camera), wrist[label == 0])
+    u, v = np.round(view.intrinsics.project(local)).T
+    inside = (u >= 0) & (u < 640) & (v >= 0) & (v < 480)
+    there = view.depth[v[inside].astype(int), u[inside].astype(int)] * 1e-3
+    error = np.abs(there - local[inside, 2])
+    shared = error < 0.02  # the rest is hidden from the overhead camera
+    assert np.count_nonzero(shared) > 100_000
+    assert np.percentile(error[shared], 95) <= 0.005
 
 
 def test_a55_a56_an_object_is_gone_and_back_within_a_second_at_two_hertz(scene: MapScene, truth: Visible) -> None:
