@@ -13,15 +13,16 @@ from concurrent.futures import Future as ThreadFuture
 from typing import Any, Generic, TypeVar
 
 from control_msgs.action import FollowJointTrajectory, ParallelGripperCommand
+from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectoryPoint
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from openarm_common.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import BaseNode
+from openarm_common.node import QOS_COMMAND, BaseNode
 from openarm_sim_bridge.actuation import End, FollowerState, TrajectoryFollower, TrajectoryOutcome
 from openarm_sim_bridge.gripper import GripperFollower, GripperGoal, GripperOutcome
 from openarm_sim_bridge.simulation import Simulation
@@ -30,6 +31,7 @@ from openarm_sim_bridge.trajectory import JointTolerance, Trajectory, Trajectory
 OutcomeT = TypeVar("OutcomeT")
 
 FEEDBACK_PERIOD_S = 0.05
+STATE_PERIOD_S = 0.05
 
 
 class _Waiting(Generic[OutcomeT]):
@@ -59,7 +61,7 @@ class _Waiting(Generic[OutcomeT]):
 
 
 class ArmActionServer:
-    """/{side}_joint_trajectory_controller/follow_joint_trajectory.
+    """/{side}_joint_trajectory_controller: follow_joint_trajectory, and the topics joint_trajectory, controller_state.
 
     Args:
         node: Owner.
@@ -85,10 +87,42 @@ class ArmActionServer:
             self._execute,
             cancel_callback=self._cancel,
         )
+        controller = f"/{side}_joint_trajectory_controller"
+        self._states = node.create_publisher(JointTrajectoryControllerState, f"{controller}/controller_state", 10)
+        node.create_timer(STATE_PERIOD_S, self._publish_state, clock=node.wall_clock)
+        node.create_subscription(JointTrajectory, f"{controller}/joint_trajectory", self._on_trajectory, QOS_COMMAND)
 
     def destroy(self) -> None:
         """Take the action away."""
         self._server.destroy()
+
+    def _on_trajectory(self, message: JointTrajectory) -> None:
+        """Follow a trajectory that nobody waits for; one that is refused is told in the log."""
+        try:
+            goal = FollowJointTrajectory.Goal(trajectory=message)
+            trajectory = self._follower.check(_trajectory_of(goal))
+        except OpenArmError as error:
+            self._node.get_logger().error(f"{self._side} arm: joint_trajectory refused: {error}")
+            return
+        self._simulation.call(lambda: self._start(trajectory, self._on_end)).add_done_callback(self._on_started)
+
+    def _on_started(self, start: ThreadFuture[None]) -> None:
+        if not start.cancelled() and (error := start.exception()) is not None:
+            self._node.get_logger().error(f"{self._side} arm: joint_trajectory refused: {error}")
+
+    def _on_end(self, outcome: TrajectoryOutcome) -> None:
+        if outcome.end is not End.SUCCEEDED:
+            self._node.get_logger().warning(f"{self._side} arm: {outcome.text}")
+
+    def _publish_state(self) -> None:
+        state = self._follower.state
+        if state is None or not self._states.get_subscription_count():
+            return
+        told = _feedback(self._follower.group.names, state)
+        message = JointTrajectoryControllerState(joint_names=told.joint_names, header=told.header)
+        message.reference, message.feedback, message.error = told.desired, told.actual, told.error
+        message.output = told.desired
+        self._states.publish(message)
 
     def _cancel(self, _handle: ServerGoalHandle) -> CancelResponse:
         self._simulation.call(self._follower.cancel)

@@ -47,6 +47,9 @@ class TrajectoryConfig(Config):
     stop_time: float = Field(default=0.15, gt=0.0, le=2.0, description="a cancelled arm comes to rest in this time, s")
     blend_time: float = Field(default=0.2, gt=0.0, description="a small offset at the start fades in this time, s")
     feed_forward: bool = Field(default=True, description="lead moving targets by the lag of the actuators")
+    command_timeout: float = Field(
+        default=0.5, gt=0.0, le=60.0, description="arm and gripper hold when no /joint_commands came for so long, s"
+    )
     command_velocity: float = Field(
         default=1.5, gt=0.0, description="largest speed towards a /joint_commands target, rad/s"
     )
@@ -140,6 +143,11 @@ class TrajectoryFollower:
         if self._goal is None:
             self._target = np.clip(np.where(np.isnan(target), self._target, target), self.group.lower, self.group.upper)
 
+    def halt(self) -> None:
+        """Come to rest and hold, because commands ceased; a trajectory goes on."""
+        if self._goal is None:
+            self._target = np.clip(self._command.stopping_place(), self.group.lower, self.group.upper)
+
     def start(
         self, trajectory: Trajectory, t_ns: int, measured: Array, done: Callable[[TrajectoryOutcome], None]
     ) -> None:
@@ -173,9 +181,9 @@ class TrajectoryFollower:
             position: (k,) measured now.
             velocity: (k,) measured now.
         """
+        desired = self._command
+        self.state = FollowerState(t_ns, desired.position, desired.velocity, position, velocity)
         if self._goal is not None:
-            desired = self._command
-            self.state = FollowerState(t_ns, desired.position, desired.velocity, position, velocity)
             self._judge(self._goal, t_ns, position, velocity)
         if self._goal is not None:
             self._advance(self._goal, t_ns, dt_ns)

@@ -51,6 +51,9 @@ class RobotController:
         gripper: GripperConfig,
     ) -> None:
         self._names = world.joint_names
+        self._timeout_ns = round(trajectory.command_timeout * 1e9)
+        self._commanded_ns: dict[TrajectoryFollower | GripperFollower, int] = {}
+        self._now_ns = world.t_ns
         self._targets = world.read_joints().position
         lead, limits = world.target_lead_s(), world.effort_limits()
         self.arms: dict[str, TrajectoryFollower] = {}
@@ -106,19 +109,22 @@ class RobotController:
         return tuple(name for f in following if f.busy for name in f.group.names if name in command.positions)
 
     def command(self, command: PositionCommand) -> None:
-        """Go to the positions of a checked command, with bounded speed."""
+        """Go to the positions of a checked command, with bounded speed; hold when no other follows in time."""
         positions = command.positions
         for arm in self.arms.values():
             target = np.array([positions.get(name, np.nan) for name in arm.group.names])
             if not np.all(np.isnan(target)):
                 arm.set_target(target)
+                self._commanded_ns[arm] = self._now_ns
         for gripper in self.grippers.values():
             if gripper.group.names[0] in positions:
                 gripper.set_target(positions[gripper.group.names[0]])
+                self._commanded_ns[gripper] = self._now_ns
 
     def reset(self, state: JointReadout) -> None:
         """Hold the positions of a world that was reset; goals that run are aborted."""
         self._targets[:] = state.position
+        self._commanded_ns.clear()
         for side, arm in self.arms.items():
             arm.reset(state.position[self._columns[side]])
         for side, gripper in self.grippers.items():
@@ -126,6 +132,8 @@ class RobotController:
 
     def update(self, state: JointReadout, dt_ns: int) -> Array:
         """Actuator targets (n,) for the tick of `dt_ns` that begins at `state`; valid until the next call."""
+        self._now_ns = state.t_ns
+        self._watch(state.t_ns)
         for side, arm in self.arms.items():
             at = self._columns[side]
             self._targets[at] = arm.update(state.t_ns, dt_ns, state.position[at], state.velocity[at])
@@ -135,6 +143,13 @@ class RobotController:
                 state.t_ns, dt_ns, float(state.position[i]), float(state.velocity[i]), float(state.effort[i])
             )
         return self._targets
+
+    def _watch(self, t_ns: int) -> None:
+        """Hold where position commands have ceased."""
+        for follower, since_ns in list(self._commanded_ns.items()):
+            if t_ns - since_ns > self._timeout_ns:
+                follower.halt()
+                del self._commanded_ns[follower]
 
     def effort_limits(self) -> dict[int, float]:
         """Effort limits of the grippers by joint index, N."""

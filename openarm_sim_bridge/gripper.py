@@ -119,6 +119,11 @@ class GripperFollower:
         if self._done is None:
             self._aim(position, 0.0, 0.0)
 
+    def halt(self) -> None:
+        """Stop the ramp where it is, because commands ceased; what is held stays held, a goal goes on."""
+        if self._done is None:
+            self._target[:] = self._command.position
+
     def start(self, goal: GripperGoal, position: float, effort: float, done: Callable[[GripperOutcome], None]) -> None:
         """Work on a checked goal from now on; one that runs is aborted.
 

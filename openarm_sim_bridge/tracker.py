@@ -31,6 +31,10 @@ class Tracker:
         self.position[:] = position
         self.velocity[:] = 0.0
 
+    def stopping_place(self) -> Array:
+        """Position (k,) at which it comes to rest when it begins to brake now."""
+        return self.position + self.velocity * np.abs(self.velocity) / (2.0 * self._a_max)
+
     def step(self, target: Array, dt: float, v_max: ArrayLike | None = None) -> None:
         """Move on for `dt` seconds; arrives without overshoot from rest.
 

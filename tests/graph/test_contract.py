@@ -26,7 +26,9 @@ QOS = {
     "best effort": (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
 }
 #: What rclpy and actions add by themselves, what is listened to, and what is beside a camera that is only looked at.
-UNTOLD = re.compile(r"/_action/|^/rosout$|^/parameter_events$|^/joint_commands$|^/spectator/color/camera_info$")
+UNTOLD = re.compile(
+    r"/_action/|^/rosout$|^/parameter_events$|^/joint_commands$|/joint_trajectory$|^/spectator/color/camera_info$"
+)
 
 pytestmark = pytest.mark.graph
 

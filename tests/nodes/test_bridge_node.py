@@ -16,6 +16,7 @@ import pytest
 from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Duration
 from control_msgs.action import FollowJointTrajectory, ParallelGripperCommand
+from control_msgs.msg import JointTrajectoryControllerState
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, Vector3, WrenchStamped
 from openarm_interfaces.msg import ObjectStateArray
@@ -370,6 +371,24 @@ def test_a25_a_trajectory_is_followed(bench: Bench) -> None:
     assert len(feedback) > 5
     assert feedback[-1].feedback.joint_names == list(ARM)
     assert abs(feedback[-1].feedback.error.positions[0]) < 0.05
+
+
+def test_the_topics_of_the_trajectory_controller(bench: Bench) -> None:
+    """joint_trajectory is followed without an action; controller_state tells reference and feedback."""
+    controller = "/right_joint_trajectory_controller"
+    states = bench.collect(JointTrajectoryControllerState, f"{controller}/controller_state", 10)
+    publisher = bench.ros.node.create_publisher(JointTrajectory, f"{controller}/joint_trajectory", QOS_COMMAND)
+    bench.ros.spin_until(lambda: publisher.get_subscription_count() and states, 5.0, "the controller's topics")
+    assert states[-1].joint_names == list(ARM)
+    np.testing.assert_allclose(states[-1].feedback.positions, HOME, atol=0.01)
+    publisher.publish(trajectory_goal((1.0, [*NEAR_HOME[:6], float("nan")])).trajectory)  # refused, in the log
+    publisher.publish(trajectory_goal((1.0, NEAR_HOME)).trajectory)
+    bench.ros.spin_until(
+        lambda: np.allclose([bench.position(name) for name in ARM], NEAR_HOME, atol=0.02), 10.0, "the arm to arrive"
+    )
+    bench.ros.spin_until(lambda: np.allclose(states[-1].reference.positions, NEAR_HOME, atol=1e-6), 5.0, "its state")
+    np.testing.assert_allclose(states[-1].error.positions, 0.0, atol=0.02)
+    assert np.all(np.diff([stamp_to_ns(m.header.stamp) for m in states]) >= 0)
 
 
 @pytest.mark.parametrize(

@@ -212,6 +212,41 @@ def test_commands_for_a_joint_that_follows_a_goal_are_told() -> None:
     np.testing.assert_allclose(world.read_joints().position, [0.6, 0.02], atol=0.01)
 
 
+def test_p23_stale_commands_hold() -> None:
+    """Commands that cease leave the arm at rest soon after half a second, short of its target; a stream arrives."""
+    world = World(mujoco.MjSpec.from_string(MODEL), joint_names=("j1", "f1"), home={"f1": 0.01})
+    config = TrajectoryConfig(command_velocity=0.5)
+    controller = RobotController({"right": ARM}, {"right": GRIPPER}, world, config, GripperConfig(velocity=0.02))
+
+    def run(seconds: float, again: bool) -> list[float]:
+        out: list[float] = []
+        for i in range(round(seconds * 100)):
+            if i == 0 or (again and i % 20 == 0):
+                controller.command(controller.check_command(["j1", "f1"], [0.9, 0.04]))
+            world.set_targets(controller.update(world.read_joints(), world.period_ns))
+            world.step_tick()
+            out.append(float(world.read_joints().position[0]))
+        return out
+
+    way = run(1.5, again=False)
+    assert 0.15 < way[-1] < 0.35
+    assert max(way) < way[-1] + 0.01  # no way back
+    assert np.ptp(way[-40:]) < 1e-3
+    assert 0.015 < world.read_joints().position[1] < 0.03  # the gripper too
+    np.testing.assert_allclose([run(3.0, again=True)[-1], world.read_joints().position[1]], [0.9, 0.04], atol=0.01)
+
+
+def test_p23_a_trajectory_needs_no_stream() -> None:
+    world, controller = make_controller()
+    controller.command(controller.check_command(["j1"], [0.1]))
+    arm = controller.arms["right"]
+    arm.start(arm.check(Trajectory(("j1",), np.array([1.5]), np.array([[0.6]]))), 0, np.zeros(1), lambda _o: None)
+    for _ in range(180):
+        world.set_targets(controller.update(world.read_joints(), world.period_ns))
+        world.step_tick()
+    assert world.read_joints().position[0] == pytest.approx(0.6, abs=0.01)
+
+
 def test_targets_stand_in_the_order_of_the_world_and_reset_holds() -> None:
     world, controller = make_controller()
     targets = controller.update(world.read_joints(), world.period_ns)
