@@ -151,16 +151,16 @@ class GraspClient:
                 f"no action /grasp/pick within {self._timeout:g} s: is the graph up (./openarm up), with the same"
                 " ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE?",
             )
-        sent = self._client.send_goal_async(goal, self._feedback(on_feedback))
+        sent = self._begin(self._client.send_goal_async, goal, self._feedback(on_feedback))
         handle = self._wait(sent, self._timeout, "acceptance of the goal")
         if not handle.accepted:
             raise OpenArmError(Code.BUSY, "the grasp node rejected the goal")
         self._goal = handle
         try:
-            answer = self._wait(handle.get_result_async(), timeout, "the end of the grasp")
+            answer = self._wait(self._begin(handle.get_result_async), timeout, "the end of the grasp")
         except BaseException:
             # Whatever keeps the caller from waiting (a deadline, Ctrl-C): nobody would see the arm go on.
-            _done(handle.cancel_goal_async()).wait(2.0)
+            _done(self._begin(handle.cancel_goal_async)).wait(2.0)
             raise
         finally:
             self._goal = None
@@ -172,7 +172,7 @@ class GraspClient:
         """Ask the running pick to stop; it returns with CANCELLED, the arm holding where it is."""
         goal = self._goal
         if goal is not None:
-            goal.cancel_goal_async()
+            self._begin(goal.cancel_goal_async)
 
     def _feedback(self, on_feedback: OnFeedback | None) -> Callable[[Any], None] | None:
         if on_feedback is None:
@@ -186,6 +186,17 @@ class GraspClient:
                 self._callback_error = error
 
         return deliver
+
+    def _begin(self, ask: Callable[..., Future], *args: Any) -> Future:
+        """Send a request from the background thread; the returned future is done when the answer is there.
+
+        rclpy files a request only after it has sent it: sent from another thread, a fast answer would find nobody.
+        """
+
+        async def exchange() -> Any:
+            return await ask(*args)
+
+        return self._executor.create_task(exchange)
 
     def _wait(self, future: Future, timeout: float, what: str) -> Any:
         done = _done(future)

@@ -105,7 +105,7 @@ def test_dry_run_plans_and_moves_nothing(up: Any, observer: Observer) -> None:
     assert max(float(abs(sample.p_world - track[0].p_world).max()) for sample in track) < 1e-3
 
 
-def test_grasp_by_service_lifts_and_places_and_a_second_one_is_refused_at_once(
+def test_a01_b06_grasp_by_service_lifts_and_places_and_a_second_one_is_refused_at_once(
     domain: int, observer: Observer, client: GraspClient
 ) -> None:
     wait_scene(observer, load_scene("demo"), 0, JudgeConfig())

@@ -471,7 +471,7 @@ def test_a_blocked_arm_ends_with_its_tolerance_and_holds(bench: Bench) -> None:
 
 # --- grippers
 @pytest.mark.parametrize("position", [0.005, 0.035])
-def test_p22_the_gripper_reaches_its_goal(bench: Bench, position: float) -> None:
+def test_p22_b55_the_gripper_reaches_its_goal(bench: Bench, position: float) -> None:
     answer = bench.grip(position)
     assert answer.status == GoalStatus.STATUS_SUCCEEDED
     assert answer.result.reached_goal
@@ -540,7 +540,7 @@ def test_bad_gripper_goals_are_rejected(bench: Bench) -> None:
 
 
 # --- commands
-def test_a16_a23_position_commands_may_be_partial_and_unknown_names_are_ignored(bench: Bench) -> None:
+def test_a16_a23_b55_position_commands_may_be_partial_and_unknown_names_are_ignored(bench: Bench) -> None:
     publisher = bench.ros.node.create_publisher(JointState, "/joint_commands", QOS_COMMAND)
     bench.ros.spin_until(lambda: publisher.get_subscription_count(), 5.0)
     publisher.publish(JointState(name=["openarm_right_joint4", "tail", FINGER], position=[1.5, 9.0, 0.02]))
@@ -617,7 +617,7 @@ def test_p25_another_scene_is_loaded_while_time_goes_on(bench: Bench) -> None:
     assert [o.name for o in got[-1].objects] == names
 
 
-def test_spawn_adds_an_object_and_names_what_is_wrong(bench: Bench) -> None:
+def test_b16_spawn_adds_an_object_on_the_table_and_names_what_is_wrong(bench: Bench) -> None:
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
     size, pose = Vector3(x=0.04, y=0.04, z=0.04), PoseStamped()
     pose.pose.position.x, pose.pose.position.y = 0.4, 0.0
