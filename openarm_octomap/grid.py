@@ -18,7 +18,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.lattice import DEPTH, Lattice
 from openarm_common.octomap_codec import Leaves, OctreeEncoder, Payload
 from openarm_octomap import end_kernels, kernels
-from openarm_octomap.config import GridConfig
+from openarm_octomap.config import GridConfig, UnknownPolicy
 from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN, Depth
 
 Array = NDArray[np.float64]
@@ -268,6 +268,13 @@ class OccupancyGrid:
         out = np.full(index.shape[0], UNKNOWN, np.uint8)
         out[inside] = states[tuple(index[inside].T)]
         return out
+
+    def blocked_at(
+        self, points: ArrayLike, unknown: UnknownPolicy = "occupied", depth: int = DEPTH
+    ) -> NDArray[np.bool_]:
+        """Whether points (n, 3), m, must be kept clear of, at any depth; `unknown` says what unknown cells count as."""
+        states = self.states_at(points, depth)
+        return np.asarray((states == OCCUPIED) | ((states == UNKNOWN) & (unknown == "occupied")))
 
     def centres(self, state: int = OCCUPIED) -> Array:
         """Centres (n, 3), m, of the cells of a state."""

@@ -236,6 +236,15 @@ def test_a75_coarse_queries_keep_what_is_occupied() -> None:
         grid.coarse(0)
 
 
+def test_each_query_says_what_unknown_counts_as() -> None:
+    grid = OccupancyGrid(GridConfig(**SMALL))
+    grid.integrate([scan(floor(box=(slice(20, 28), slice(28, 36), 890)))], 0)
+    occupied, free, unknown = (0.0, 0.0, 0.11), (0.0, 0.0, 0.3), (0.0, 0.0, -0.03)
+    assert grid.blocked_at([occupied, free, unknown]).tolist() == [True, False, True]
+    assert grid.blocked_at([occupied, free, unknown], "free").tolist() == [True, False, False]
+    assert grid.blocked_at([free], "free", depth=10).tolist() == [True]  # the coarse cell holds the box
+
+
 def test_decay_forgets_what_nobody_looked_at() -> None:
     grid = OccupancyGrid(GridConfig(decay_s=2.0, **SMALL))
     s = 1_000_000_000
