@@ -79,7 +79,7 @@ class Film:
         milliseconds = round(1000.0 / (ANIMATION_FPS * ANIMATION_SPEED))
         animation.durations = [milliseconds] * len(self._small)
         animation.loop_count = 0
-        options = [cv2.IMWRITE_WEBP_QUALITY, 65] if path.suffix == ".webp" else []
+        options = [cv2.IMWRITE_WEBP_QUALITY, 90] if path.suffix == ".webp" else []
         return bool(cv2.imwriteanimation(str(path), animation, options))
 
     def _work(self) -> None:
