@@ -147,6 +147,7 @@ class ArmActionServer:
         return self._finish(handle, outcome)
 
     def _start(self, trajectory: Trajectory, done: Callable[[TrajectoryOutcome], None]) -> None:
+        self._simulation.check_able()
         state = self._simulation.world.read_joints()
         self._follower.start(trajectory, state.t_ns, state.position[self._columns], done)
 
@@ -203,6 +204,7 @@ class GripperActionServer:
 
     def _judge(self, request: ParallelGripperCommand.Goal) -> GoalResponse:
         try:
+            self._simulation.check_able()
             self._follower.check(_gripper_goal_of(request.command, self._joint))
         except OpenArmError as error:
             self._node.get_logger().error(f"{self._side} gripper goal rejected: {error}")

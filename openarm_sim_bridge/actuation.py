@@ -138,6 +138,10 @@ class TrajectoryFollower:
         self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, "the simulated world was reset")
         self._hold(position)
 
+    def abort(self, why: str) -> None:
+        """Give up a running goal."""
+        self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, why)
+
     def set_target(self, target: Array) -> None:
         """Go to a position (k,), NaN for joints that stay as they are; ignored while a trajectory is followed."""
         if self._goal is None:

@@ -130,6 +130,11 @@ class RobotController:
         for side, gripper in self.grippers.items():
             gripper.reset(float(state.position[self._fingers[side]]))
 
+    def abort(self, why: str) -> None:
+        """Give up all goals, because the world can't go on."""
+        for follower in (*self.arms.values(), *self.grippers.values()):
+            follower.abort(why)
+
     def update(self, state: JointReadout, dt_ns: int) -> Array:
         """Actuator targets (n,) for the tick of `dt_ns` that begins at `state`; valid until the next call."""
         self._now_ns = state.t_ns

@@ -114,6 +114,10 @@ class GripperFollower:
         self._target[0] = position
         self.effort_limit = self._max_effort
 
+    def abort(self, why: str) -> None:
+        """Give up a running goal."""
+        self._finish(End.ABORTED, float(self._command.position[0]), 0.0, why)
+
     def set_target(self, position: float) -> None:
         """Go to a position, m, with the default effort; ignored while a goal is worked on."""
         if self._done is None:

@@ -123,6 +123,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         """Position targets; a part of the joints will do."""
         logger = self.get_logger()
         try:
+            self._simulation.check_able()
             command = self._controller.check_command(message.name, message.position)
         except OpenArmError as error:
             logger.error(f"/joint_commands refused: {error}", throttle_duration_sec=1.0)

@@ -7,13 +7,19 @@ runs between two ticks; they never wait for physics, and physics never waits for
 
 from __future__ import annotations
 
+import os
+import tempfile
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_sim_bridge.controller import RobotController
@@ -22,6 +28,7 @@ from openarm_sim_bridge.world import JointReadout, World
 from openarm_sim_bridge.world_faults import WorldFaults
 
 T = TypeVar("T")
+Array = NDArray[np.float64]
 
 
 class Observer(Protocol):
@@ -57,6 +64,7 @@ class Simulation:
         observe: Called at the end of every tick that is told of.
         speed: Simulated seconds a wall second; 0 is as fast as it can. Faster than real time, `observe` is still called
             about once a period of wall time.
+        dump_folder: Gets the last second before physics diverged; None: the system's folder for temporary files.
         crashed: Called when the thread ends by an error that nobody expected.
         clock: Monotonic wall clock, ns.
     """
@@ -71,6 +79,7 @@ class Simulation:
         observe: Observer,
         *,
         speed: float = 1.0,
+        dump_folder: Path | None = None,
         crashed: Callable[[Exception], None] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
@@ -82,6 +91,8 @@ class Simulation:
         #: What goes wrong on purpose; to be changed through `call` only.
         self.faults = WorldFaults(world.joint_names, world.period_ns)
         self._observe = observe
+        self._dump_folder = dump_folder or Path(tempfile.gettempdir())
+        self._history: deque[tuple[JointReadout, Array]] = deque(maxlen=max(1, 1_000_000_000 // world.period_ns))
         self._crashed = crashed
         self._clock = clock
         self._pacer = Pacer(world.period_ns, speed)
@@ -152,6 +163,7 @@ class Simulation:
     def restart(self) -> None:
         """Go on after the world was reset or exchanged: forget goals and faults. For `call`."""
         self.fault = ""
+        self._history.clear()
         self._end_stepping("the world was reset")
         self.controller.reset(self.world.read_joints())
         self.world.set_effort_limits(self.controller.effort_limits())
@@ -196,14 +208,17 @@ class Simulation:
         steps = min(world.steps_per_tick, self._steps_left) if self._paused else world.steps_per_tick
         self._pacer.ticked(now_ns)
         self.faults.prepare(world)
-        wanted = controller.update(world.read_joints(), steps * world.timestep_ns)
-        world.set_targets(self.faults.targets(wanted))
+        state = world.read_joints()
+        targets = self.faults.targets(controller.update(state, steps * world.timestep_ns))
+        self._history.append((state, targets.copy()))
+        world.set_targets(targets)
         world.set_effort_limits(self.faults.effort_limits(controller.effort_limits()))
         try:
             world.step(steps)
         except OpenArmError as error:
-            self.fault = error.message
-            self._end_stepping(error.message)
+            self.fault = f"{error.message} {self._dump()}"
+            self._end_stepping(self.fault)
+            controller.abort(self.fault)
             return
         self.real_time_factor.add(now_ns, world.t_ns)
         last = self._paused and steps == self._steps_left
@@ -216,6 +231,33 @@ class Simulation:
             if self._steps_left == 0 and self._stepped is not None:
                 stepped, self._stepped = self._stepped, None
                 stepped.set_result(world.t_ns)
+
+    def check_able(self) -> None:
+        """Say so when nothing can be commanded.
+
+        Raises:
+            OpenArmError: NOT_READY, with the fault.
+        """
+        if self.fault:
+            raise OpenArmError(Code.NOT_READY, f"no command is taken until the world is reset: {self.fault}")
+
+    def _dump(self) -> str:
+        """Write the last second to a file, and say where."""
+        path = self._dump_folder / f"openarm_diverged_{os.getpid()}_{self.world.t_ns}.npz"
+        states, targets = [state for state, _ in self._history], [target for _, target in self._history]
+        try:
+            np.savez(
+                path,
+                joint_names=np.array(self.world.joint_names),
+                t_ns=np.array([state.t_ns for state in states]),
+                position=np.array([state.position for state in states]),
+                velocity=np.array([state.velocity for state in states]),
+                effort=np.array([state.effort for state in states]),
+                target=np.array(targets),
+            )
+        except OSError as error:
+            return f"The last second could not be written to {path}: {error}."
+        return f"The last second is in {path}."
 
     def _end_stepping(self, why: str) -> None:
         self._steps_left = 0

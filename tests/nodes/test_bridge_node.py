@@ -600,6 +600,27 @@ def test_p25_reset_puts_the_robot_back_and_aborts_what_runs(bench: Bench) -> Non
     assert np.all(np.diff(stamps) > 0)
 
 
+def test_a_diverged_world_takes_no_command_until_it_is_reset(bench: Bench, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a file there
+    simulation = bench.node._simulation
+    monkeypatch.setattr(simulation, "_dump_folder", tmp_path)
+    got = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    _, running = bench.follow(trajectory_goal((3.0, NEAR_HOME)))
+    bench.spin_sim(0.3)
+    simulation.call(lambda: simulation.world.data.qvel.fill(np.nan))
+    answer = bench.ros.result(running, 5.0)
+    assert answer.status == GoalStatus.STATUS_ABORTED
+    assert "diverged" in answer.result.error_string
+    assert "The last second is in" in answer.result.error_string
+    _, refused = bench.follow(trajectory_goal((1.0, NEAR_HOME)))
+    assert "until the world is reset" in bench.ros.result(refused, 5.0).result.error_string
+    goal = ParallelGripperCommand.Goal(command=JointState(name=[FINGER], position=[0.02]))
+    assert not bench.ros.send_goal(bench.gripper_client(), goal)[0].accepted
+    bench.ros.spin_until(lambda: any("diverged" in s.message for m in got for s in m.status), 5.0, "/diagnostics")
+    assert bench.call(ResetWorld, "/sim/reset_world").success
+    assert bench.grip(0.02).result.reached_goal
+
+
 def test_p25_another_scene_is_loaded_while_time_goes_on(bench: Bench) -> None:
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
     answer = bench.call(ResetWorld, "/sim/reset_world", scene="random", seed=7)

@@ -129,13 +129,31 @@ def test_a_diverged_world_stands_until_it_is_reset(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a file there
-    bench.wait(lambda: len(bench.states) > 3)
+    bench.simulation._dump_folder = tmp_path
+    bench.wait(lambda: len(bench.states) > 30)
+    outcomes: list[TrajectoryOutcome] = []
+    arm, state = bench.controller.arms["right"], bench.states[-1][1]
+    goal = arm.check(Trajectory(("j1",), np.array([5.0]), np.array([[0.6]])))
+    bench.simulation.call(lambda: arm.start(goal, bench.world.t_ns, state.position[:1], outcomes.append)).result(1.0)
+    bench.simulation.check_able()
     bench.simulation.call(lambda: bench.world.data.qvel.fill(np.nan)).result(1.0)
     deadline = time.monotonic() + 5.0
     while not bench.simulation.fault:
         assert time.monotonic() < deadline
         bench.simulation.call(lambda: None).result(1.0)
     assert "diverged" in bench.simulation.fault
+    bench.simulation.call(lambda: None).result(1.0)  # the tick has ended
+    assert outcomes[0].end is End.ABORTED
+    assert "diverged" in outcomes[0].text
+    with pytest.raises(OpenArmError, match=r"until the world is reset.*diverged") as caught:
+        bench.simulation.check_able()
+    assert caught.value.code is Code.NOT_READY
+    (dump,) = tmp_path.glob("openarm_diverged_*.npz")
+    assert str(dump) in bench.simulation.fault
+    with np.load(dump) as data:
+        assert data["joint_names"].tolist() == ["j1", "f1"]
+        assert len(data["t_ns"]) == len(data["position"]) == len(data["target"]) > 30
+        assert np.all(np.diff(data["t_ns"]) == 10_000_000)
 
     def reset() -> None:
         bench.world.reset()
