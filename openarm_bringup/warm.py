@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from openarm_calibration.warm import warm as warm_calibration
 from openarm_common.cameras import Intrinsics
 from openarm_motion.warm import warm as warm_motion
 from openarm_octomap.warm import warm as warm_octomap
@@ -25,6 +26,7 @@ def warm_perception() -> None:
 def main() -> None:
     """Warm all packages that have kernels."""
     warm_perception()
+    warm_calibration()
     warm_motion()
     warm_octomap()
 
