@@ -154,17 +154,17 @@ def plan_approach(
         left = max(end - time.monotonic(), 0.1)
         try:
             goals = np.array([candidate.approach.q[0] for candidate in candidates])
-            path = arm.plan(checks.free, now, goals, left if k == len(groups) - 1 else 0.5 * left)
+            free = arm.plan_certified(checks.free, now, goals, left if k == len(groups) - 1 else 0.5 * left)
         except OpenArmError as error:
-            if error.code != Code.NO_PLAN:
+            if error.code not in (Code.NO_PLAN, Code.IN_COLLISION):
                 raise
             ids = dict.fromkeys(request.targets[c.target].id for c in candidates)
-            refusals += [Refused(id, Code.NO_PLAN, error.message) for id in ids]
+            refusals += [Refused(id, error.code, error.message) for id in ids]
             continue
-        best = candidates[path.goal]
+        best = candidates[free.path.goal]
         return ApproachPlan(
             chosen=best.target,
-            transfer=arm.time_free(path, now.scale),
+            transfer=free.trajectory,
             approach=arm.time_line(best.approach, now.scale),
             retreat=arm.time_line(best.retreat, now.scale),
             refusals=tuple(refusals),

@@ -6,6 +6,7 @@ Everything that is planned goes through here; it holds no state between requests
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.cartesian import Line
+from openarm_motion.certificate import Certificate, certify
 from openarm_motion.collision import Box, CollisionScene, Contact, Surroundings
 from openarm_motion.collision_robot import CollisionRobot
 from openarm_motion.config import MotionConfig
@@ -30,6 +32,19 @@ Array = NDArray[np.float64]
 
 #: A joint this far outside its limits is a wrong reading, not sag; rad.
 _SAG = 0.05
+
+
+#: How many times finer the steps of the searches are that follow one whose result did not pass the dense look.
+_FINENESS = (1.0, 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class CertifiedPlan:
+    """A path, the same timed, and what it was looked at with."""
+
+    path: PlannedPath
+    trajectory: Trajectory
+    certificate: Certificate
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,14 +223,16 @@ class Arm:
                 f"the {self.name} arm starts in collision: {contact}; free it by hand or correct the obstacle",
             )
 
-    def plan(self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float) -> PlannedPath:
+    def plan(
+        self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float, fineness: float = 1.0
+    ) -> PlannedPath:
         """Free path to one of several configurations (k, n), an earlier one preferred.
 
         Raises:
             OpenArmError: NO_PLAN, saying what is in the way of the straight joint line; CANCELLED.
         """
         search = self.config.planning
-        query = self.query(scene, now, goals, time_limit)
+        query = self.query(scene, now, goals, time_limit, fineness)
         try:
             return self._planner.plan(query)
         except OpenArmError as error:
@@ -225,13 +242,35 @@ class Arm:
             blocked = "" if hit is None else f"; on the direct way {scene.contacts(hit)[0]}"
             raise OpenArmError(Code.NO_PLAN, error.message + blocked) from error
 
-    def query(self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float) -> PlanQuery:
-        """What a planner is asked for a path to one of several configurations (k, n)."""
+    def plan_certified(self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float) -> CertifiedPlan:
+        """Free path to one of several configurations, timed, and looked at densely on the exact layer.
+
+        Where the dense look finds what the search stepped over, the search is repeated with finer steps.
+
+        Raises:
+            OpenArmError: as `plan`; IN_COLLISION, when the finest search did not help.
+        """
+        end = time.monotonic() + time_limit
+        fault = ""
+        for fineness in _FINENESS:
+            path = self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
+            trajectory = self.time_free(path, now.scale)
+            try:
+                return CertifiedPlan(path, trajectory, certify(scene, trajectory))
+            except OpenArmError as error:
+                fault = error.message
+        raise OpenArmError(Code.IN_COLLISION, f"the {self.name} arm's plan did not pass the dense look: {fault}")
+
+    def query(
+        self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float, fineness: float = 1.0
+    ) -> PlanQuery:
+        """What a planner is asked for a path to one of several goals (k, n); steps are `fineness` times finer."""
         search = self.config.planning
+        step, travel = search.edge_step / fineness, search.edge_travel / fineness
         limits = self.limits(now.scale)
 
         def edge_free(a: Array, b: Array) -> bool:
-            return scene.edge_free(a, b, search.edge_step, search.edge_travel)
+            return scene.edge_free(a, b, step, travel)
 
         return PlanQuery(
             start=now.start,
@@ -245,7 +284,7 @@ class Arm:
             seed=search.seed,
             stopped=now.stopped,
             fast=cache(lambda: FastScene([scene])),
-            resolution=(search.edge_step, search.edge_travel),
+            resolution=(step, travel),
             limits=(limits.velocity, limits.acceleration, limits.jerk),
         )
 

@@ -127,4 +127,4 @@ def _free_scene(arm: Arm, now: Situation, around: Around) -> CollisionScene:
 
 
 def _plan(arm: Arm, scene: CollisionScene, now: Situation, goals: Array) -> Trajectory:
-    return arm.time_free(arm.plan(scene, now, goals, arm.config.planning.time_limit), now.scale)
+    return arm.plan_certified(scene, now, goals, arm.config.planning.time_limit).trajectory

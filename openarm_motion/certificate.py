@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Proof that a timed trajectory is free: looked at densely on the exact layer, with room for a robot that lags behind.
+
+A plan keeps the clearance of its scene where the search looked. The certificate looks again, as the controller will
+interpolate, so closely that no point of the arm moves further than `travel` between two looks, and asks for a share of
+the clearance there. Half a look away from a sample no point has moved further than half of `travel`. m, rad, s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.collision import CollisionScene
+from openarm_motion.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+#: Share of the clearance that must be left between the looks of the search.
+_SHARE = 0.5
+#: No point of the arm moves further between two looks, m.
+_TRAVEL = 0.004
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What was looked at.
+
+    Attributes:
+        states: How many states.
+        travel: No point of the arm moves further between two of them, m.
+        share: Share of each pair's clearance that was found everywhere.
+    """
+
+    states: int
+    travel: float
+    share: float
+
+
+def certify(
+    scene: CollisionScene, trajectory: Trajectory, travel: float = _TRAVEL, share: float = _SHARE
+) -> Certificate:
+    """Look at a trajectory densely.
+
+    Args:
+        scene: What it was planned in; its clearances are reduced meanwhile, not for good.
+        trajectory: As it goes to the controller.
+        travel: Greatest way of a point between two looks, m.
+        share: Share of each positive clearance to ask for; overlaps that are allowed stay so.
+
+    Raises:
+        OpenArmError: IN_COLLISION, with the time and the pair.
+    """
+    times = _times(trajectory, scene.levers, travel)
+    states = trajectory.at(times)[0]
+    with scene.lenient(share):
+        for k in _ends_first(len(states)):
+            if scene.collides(states[k]):
+                raise OpenArmError(
+                    Code.IN_COLLISION, f"after {times[k]:.2f} s of the trajectory {scene.contacts(states[k])[0]}"
+                )
+    return Certificate(len(states), travel, share)
+
+
+def _times(trajectory: Trajectory, levers: Array, travel: float) -> Array:
+    """Moments between which no point moves further than `travel`, by the way that each joint turns."""
+    way = np.abs(np.diff(trajectory.q, axis=0)) @ levers
+    parts = [
+        np.linspace(trajectory.t[i], trajectory.t[i + 1], max(1, int(np.ceil(w / travel))), endpoint=False)
+        for i, w in enumerate(way)
+    ]
+    return np.concatenate([*parts, trajectory.t[-1:]])
+
+
+def _ends_first(n: int) -> list[int]:
+    """All indices, each tenth first: a collision is found early."""
+    return [*range(0, n, 10), *(k for k in range(n) if k % 10)]
