@@ -3,8 +3,9 @@
 
     python benchmarks/motion.py [--quick] [--only PREFIX] [--json PATH]
 
-Problems are drawn from seeds. Peers run in the same process on the same problems: pinocchio's kinematics with damped
-least squares written in Python, and the same search with every check made by coal, called from Python.
+Problems are drawn from seeds; obstacles are boxes. Peers run in the same process on the same problems: pinocchio's
+kinematics with damped least squares written in Python, and OMPL's RRTConnect with every check made by coal, called
+from Python. The time to make the scene that a plan searches in is a row of its own, not part of the plan's.
 """
 
 from __future__ import annotations
