@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import random
-import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -18,6 +16,7 @@ from openarm_bringup import environment, report, runs
 from openarm_bringup.graph import Graph, load_graph
 from openarm_bringup.session import running_graph
 from openarm_bringup.trial import Ask, Trial, choose_target, run_trial
+from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import load_scene
 
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
 
 SPECTATOR = "/spectator/color/image_raw"
 DETECTION = "/detection_image"
-#: Domains whose ports lie below those that Linux gives to other programs.
-DOMAINS = range(1, 102)
 
 
 @dataclass(frozen=True)
@@ -72,35 +69,13 @@ class DemoResult:
     error: OpenArmError | None = None
 
 
-def free_domain(tries: int = 50) -> int:
-    """Return a random ROS domain whose discovery ports nobody holds.
-
-    Raises:
-        OpenArmError: ENVIRONMENT, when none was found.
-    """
-    for domain in random.sample(DOMAINS, min(tries, len(DOMAINS))):
-        base = 7400 + 250 * domain
-        if all(_port_free(port) for port in (base, base + 10, base + 11)):
-            return domain
-    raise OpenArmError(Code.ENVIRONMENT, f"no free ROS domain among {tries}; pass one with --domain")
-
-
-def _port_free(port: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("0.0.0.0", port))
-        except OSError:
-            return False
-    return True
-
-
 def run_demo(options: DemoOptions, listeners: Listeners | None = None) -> DemoResult:
     """Run the demonstration to its end; the graph is stopped whatever happens.
 
     Raises:
         OpenArmError: What is wrong with the options; what happens later is in the result.
     """
-    domain = free_domain() if options.domain is None else options.domain
+    domain = reserve_domain() if options.domain is None else options.domain
     overrides = {"domain": domain, "scene": "random" if options.seeds else options.scene}
     if options.seeds:
         overrides["seed"] = options.seeds[0]

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from openarm_common.domain import reserve_domain
+from openarm_common.domain import release_domain, reserve_domain
 
 # Before any rclpy is imported: a domain of this process, no traffic beyond this machine, software rendering.
 os.environ["ROS_DOMAIN_ID"] = str(reserve_domain())
@@ -29,6 +29,9 @@ class RosProbe:
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
 
+        # A domain for each test: what an earlier one left behind in this process is not met.
+        self._domain = reserve_domain()
+        os.environ["ROS_DOMAIN_ID"] = str(self._domain)
         rclpy.init()
         self.executor = SingleThreadedExecutor()
         self.nodes: list[Node] = []
@@ -75,6 +78,7 @@ class RosProbe:
                 node.close()
             node.destroy_node()
         rclpy.try_shutdown()
+        release_domain(self._domain)
 
 
 @pytest.fixture

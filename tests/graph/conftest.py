@@ -17,7 +17,7 @@ from typing import Any
 import psutil
 import pytest
 
-from openarm_bringup.demo import free_domain
+from openarm_common.domain import reserve_domain
 
 ROOT = Path(__file__).parents[2]
 
@@ -77,7 +77,7 @@ def start_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Starter]:
 
     def start(*args: str) -> Up:
         folder = tmp_path_factory.mktemp("graph")
-        domain = free_domain()
+        domain = reserve_domain()
         env = {
             **os.environ,
             "OPENARM_RUNS": str(folder / "runs"),

@@ -21,9 +21,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from vision_msgs.msg import Detection3DArray
 
-from openarm_bringup.demo import free_domain
 from openarm_bringup.graph import load_graph
 from openarm_bringup.session import running_graph
+from openarm_common.domain import reserve_domain
 
 STREAMS = ("/overhead/color", "/overhead/depth", "/wrist/color", "/wrist/depth")
 SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -83,7 +83,7 @@ class Counter:
 
 
 async def main(seconds: float) -> None:
-    graph = load_graph("sim", overrides={"domain": free_domain()})
+    graph = load_graph("sim", overrides={"domain": reserve_domain()})
     with tempfile.TemporaryDirectory() as folder:
         async with running_graph(graph, Path(folder)) as supervisor:
             await supervisor.wait_ready()

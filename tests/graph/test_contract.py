@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import subprocess
@@ -16,6 +15,8 @@ import rclpy
 from rclpy.action.graph import get_action_server_names_and_types_by_node
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+from openarm_common.domain import reserve_domain
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -36,7 +37,8 @@ pytestmark = pytest.mark.graph
 @pytest.fixture(scope="module")
 def graph() -> Iterator[Node]:
     """A probe beside the running graph `sim`."""
-    command = [sys.executable, "-m", "openarm_bringup.cli", "up", "sim", "--domain", os.environ["ROS_DOMAIN_ID"]]
+    domain = reserve_domain()
+    command = [sys.executable, "-m", "openarm_bringup.cli", "up", "sim", "--domain", str(domain)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         assert process.stdout is not None
         lines: list[str] = []
@@ -44,7 +46,7 @@ def graph() -> Iterator[Node]:
             lines.append(line)
             if "is ready after" in line:
                 break
-        rclpy.init()
+        rclpy.init(domain_id=domain)
         node = rclpy.create_node("contract")
         try:
             if process.poll() is not None:

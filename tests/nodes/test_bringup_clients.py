@@ -22,13 +22,12 @@ from openarm_bringup.observer_client import Observer, Step
 from openarm_bringup.readiness_client import ReadinessClient
 from openarm_common.errors import Code, OpenArmError
 
-DOMAIN = {"ROS_DOMAIN_ID": os.environ["ROS_DOMAIN_ID"], "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 LATCHED = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 @pytest.fixture
-def probe() -> Iterator[ReadinessClient]:
-    client = ReadinessClient(DOMAIN)
+def probe(ros) -> Iterator[ReadinessClient]:
+    client = ReadinessClient({name: os.environ[name] for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE")})
     yield client
     client.close()
 
@@ -117,7 +116,7 @@ def test_observer_keeps_tracks_states_and_resets_the_world(ros) -> None:
     spinner = threading.Thread(target=lambda: ros.spin_until(done.is_set, timeout=30.0))
     spinner.start()
     try:
-        with Observer(int(DOMAIN["ROS_DOMAIN_ID"]), steps.append) as observer:
+        with Observer(int(os.environ["ROS_DOMAIN_ID"]), steps.append) as observer:
             observer.wait(lambda: len(observer.track("cube")) >= 3 or None, 10.0, "truth")
             observer.wait(lambda: observer.steps() or None, 10.0, "the latched state")
             track = observer.track("cube")
