@@ -46,9 +46,9 @@ import numpy as np
 import psutil
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.demo import free_domain
 from openarm_bringup.graph import Graph, NodeSpec, Ready, load_graph
 from openarm_bringup.session import running_graph
+from openarm_common.domain import reserve_domain
 
 CAMERAS = ("overhead", "wrist")
 STREAMS = tuple(f"/{camera}/{kind}" for camera in CAMERAS for kind in ("color", "depth"))
@@ -229,11 +229,11 @@ def main() -> None:
     results: list[dict[str, float]] = []
     for run in range(runs):
         print(f"run {run + 1}: load {os.getloadavg()[0]:.2f}", flush=True)
-        results.append(asyncio.run(measure(load_graph("sim", overrides={"domain": free_domain()}), seconds)))
+        results.append(asyncio.run(measure(load_graph("sim", overrides={"domain": reserve_domain()}), seconds)))
     peer: dict[str, float] = {}
     if not args.no_peer:
         print(f"naive bridge: load {os.getloadavg()[0]:.2f}", flush=True)
-        graph = naive(load_graph("sim", overrides={"domain": free_domain()}))
+        graph = naive(load_graph("sim", overrides={"domain": reserve_domain()}))
         peer = asyncio.run(measure(graph, seconds))
     rows = [
         Row(
