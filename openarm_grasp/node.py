@@ -113,7 +113,7 @@ class GraspNode(BaseNode[GraspConfig]):
         while recipe:
             try:
                 self._tell(on_status)
-                outcome = await self._executor.perform(recipe)
+                outcome = await self._executor.performer.perform(recipe)
             except Exception as error:
                 # A fault of this program: the request must still be answered, and the next one served.
                 self.get_logger().error(traceback.format_exc())
@@ -137,7 +137,7 @@ class GraspNode(BaseNode[GraspConfig]):
         arm = self._machine.carrying
         if not arm or request.dry_run:
             return
-        gap = self._executor.gap(arm)
+        gap = self._executor.performer.gap(arm)
         hand = self.config.hand
         if self.config.held.closed_below < gap < 2.0 * (hand.opening - hand.open_tolerance):
             raise OpenArmError(

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Carries out what the state machine asks for, over a link to a robot: no ROS, no clock of its own.
+
+The same code drives a robot behind a node graph (`link_executor`) and a world in this process (a campaign); what
+differs is the `Link`. Every effect is a coroutine that ends: by its work, a deadline, a cancel, or a lost robot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.description import RobotDescription
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot_state import RobotStateBuffer
+from openarm_grasp import effects
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.effects import Effect, Effects, Frames, GoHome, Outcome, Planned, Reach, Result, Trajectory
+from openarm_grasp.evidence import Evidence
+from openarm_grasp.hand import SPEED_WINDOW_NS, HandReader
+from openarm_grasp.observation import in_base
+from openarm_grasp.routing import ARMS
+
+Array = NDArray[np.float64]
+
+
+class Link(Protocol):
+    """How a robot, its cameras and its planner are reached. Base frame, m, rad; robot time in ns."""
+
+    @property
+    def description(self) -> RobotDescription:
+        """The robot."""
+        ...
+
+    @property
+    def states(self) -> RobotStateBuffer:
+        """Its joint states."""
+        ...
+
+    @property
+    def base_frame(self) -> str:
+        """Name of the base frame."""
+        ...
+
+    @property
+    def now_ns(self) -> int:
+        """Robot time."""
+        ...
+
+    def effort(self, joint: str) -> float:
+        """Newest effort of a joint, N or N m; 0 when none is told."""
+        ...
+
+    def check(self) -> None:
+        """Raise when the work shall not go on: CANCELLED, ROBOT_LOST."""
+        ...
+
+    def warn(self, text: str) -> None:
+        """Say something that does not stop the work."""
+        ...
+
+    def stop_looking(self) -> None:
+        """The camera is not needed for now."""
+        ...
+
+    async def until(
+        self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        """Wait for a condition, no longer than `limit` s; `guard` is called at each look and may raise."""
+        ...
+
+    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
+        """Carry out several things at once; all end before this does, then the first error is raised."""
+        ...
+
+    async def observe(self, count: int) -> Frames:
+        """Frames of detections that are taken from now on."""
+        ...
+
+    async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
+        """Plan; raises with the planner's code."""
+        ...
+
+    async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
+        """How far the arm's TCP stays from a point, m by arm; empty when that cannot be said."""
+        ...
+
+    async def follow(
+        self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        """Follow a planned trajectory."""
+        ...
+
+    async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
+        """Move the TCP on a straight line."""
+        ...
+
+    async def move_named(self, arm: str, named: str, effect: GoHome, what: str) -> None:
+        """Move an arm on a free path to a posture."""
+        ...
+
+    async def grip(self, arm: str, joint: str, position: float, what: str) -> bool:
+        """Move the fingers; whether they arrived or push against something."""
+        ...
+
+
+class Performer:
+    """Effects in, outcomes out.
+
+    Args:
+        link: To the robot.
+        config: Parameters.
+    """
+
+    def __init__(self, link: Link, config: GraspConfig) -> None:
+        self._link = link
+        self._config = config
+        self._hands = {arm: HandReader(link.description, link.states, arm) for arm in ARMS}
+
+    def gap(self, arm: str) -> float:
+        """Distance between the fingers, m.
+
+        Raises:
+            OpenArmError: NOT_READY, when no joint state says so.
+        """
+        return self._hands[arm].gap()
+
+    async def perform(self, recipe: Effects) -> Outcome:
+        """Carry out a recipe; the first effect that fails ends it."""
+        if not any(isinstance(effect, effects.Observe) for effect in recipe):
+            self._link.stop_looking()
+        results: list[Result] = []
+        for done, effect in enumerate(recipe):
+            try:
+                self._link.check()
+                result = await self._one(effect)
+            except OpenArmError as error:
+                return Outcome(error.code, error.message, tuple(results), done)
+            if result is not None:
+                results.append(result)
+        return Outcome(Code.OK, "", tuple(results), len(recipe))
+
+    async def _one(self, effect: Effect) -> Result | None:
+        link = self._link
+        match effect:
+            case effects.Together():
+                return await link.together([self._part(part) for part in effect.effects])
+            case effects.Wait():
+                return await self._wait(effect.duration)
+            case effects.Observe():
+                return await link.observe(effect.frames)
+            case effects.ToBase():
+                return self._to_base(effect)
+            case effects.PlanGrasp() | effects.PlanPlace():
+                return await link.plan(effect)
+            case effects.ProbeReach():
+                distances: dict[str, float] = {}
+                for arm in effect.arms:
+                    distances |= await link.reach(arm, effect.T_base_tcp)
+                return Reach(distances)
+            case effects.Execute():
+                return await self._follow(effect)
+            case effects.MoveLinear():
+                return await link.move_linear(effect, f"{effect.arm} arm: {effect.what}")
+            case effects.GoHome():
+                return await self._home(effect)
+            case effects.MoveGripper():
+                return await self._grip(effect)
+            case effects.Measure():
+                return await self._measure(effect)
+
+    def _part(self, effect: Effect) -> Callable[[], Awaitable[None]]:
+        async def carry_out() -> None:
+            await self._one(effect)
+
+        return carry_out
+
+    async def _wait(self, duration: float) -> None:
+        link = self._link
+        end_ns = link.now_ns + round(duration * 1e9)
+        # Simulated time may be slow; one that stands still is noticed by the link.
+        what = f"waiting {duration:g} s of robot time"
+        await link.until(lambda: link.now_ns >= end_ns, 20.0 * duration + 10.0, what)
+
+    def _to_base(self, effect: effects.ToBase) -> Frames:
+        base = self._link.base_frame
+        if effect.frame_id == base:
+            return Frames(effect.frames, base)
+        frames = in_base(effect.frames, lambda t_ns: self._link.states.lookup(base, effect.frame_id, t_ns))
+        return Frames(frames, base)
+
+    # --- moving
+    async def _follow(self, effect: effects.Execute) -> None:
+        def still_held() -> None:
+            gap = self.gap(effect.arm)
+            if effect.carrying and gap <= self._config.held.closed_below:
+                raise OpenArmError(Code.GRASP_LOST, f"{effect.what}: the hand closed to {gap * 1e3:.1f} mm on the way")
+
+        await self._link.follow(effect.arm, effect.trajectory, f"{effect.arm} arm: {effect.what}", still_held)
+
+    async def _home(self, effect: effects.GoHome) -> None:
+        config, link = self._config, self._link
+        for arm in effect.arms:
+            home = link.description.group_state(f"{arm}_arm", config.home_state)
+            _, q = link.states.latest()
+            if max(abs(q[name] - value) for name, value in home.items()) <= config.home_tolerance:
+                continue
+            T_base_tcp = self._hands[arm].T_base_tcp()
+            if T_base_tcp[2, 3] < effect.back_off_below:
+                T_back = T_base_tcp @ se3.make(p=(0.0, 0.0, -config.approach.pregrasp_distance))
+                try:
+                    await self._one(effects.MoveLinear(arm, T_back, "back off"))
+                except OpenArmError as error:
+                    if error.code in (Code.CANCELLED, Code.ROBOT_LOST):
+                        raise
+                    # A kindness to what stands around the hand; the free path home may still be there.
+                    link.warn(error.message)
+            await link.move_named(arm, config.home_state, effect, f"{arm} arm: go {config.home_state}")
+
+    # --- the hand
+    async def _grip(self, effect: effects.MoveGripper) -> None:
+        hand, link, what = self._hands[effect.arm], self._link, f"{effect.arm} hand: {effect.what}"
+        ended_well = await link.grip(effect.arm, hand.joint, effect.position, what)
+        if effect.position > 0.0:
+            # The result may be here before the joint state that shows it.
+            least, end_ns = effect.position - self._config.hand.open_tolerance, link.now_ns + SPEED_WINDOW_NS
+            limit = self._config.limits.answer_timeout
+            await link.until(lambda: hand.finger() >= least or link.now_ns > end_ns, limit, what)
+            if hand.finger() < least:
+                reached = f"{hand.finger() * 1e3:.1f} mm of {effect.position * 1e3:.0f} mm"
+                raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers stopped at {reached}")
+        elif not ended_well:
+            raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers neither arrived nor met anything")
+
+    async def _measure(self, effect: effects.Measure) -> Evidence:
+        hand, link, limit = self._hands[effect.arm], self._link, 20.0 * effect.settle + 10.0
+        ready_ns = link.now_ns + SPEED_WINDOW_NS
+        await link.until(lambda: link.now_ns >= ready_ns, limit, "reading the hand")
+        end_ns = ready_ns + round(effect.settle * 1e9)
+        still = self._config.held.max_speed
+        rest = "waiting for the fingers to rest"
+        await link.until(lambda: link.now_ns >= end_ns or abs(hand.gap_speed()) < still, limit, rest)
+        return hand.evidence(effect.expected, link.effort(hand.joint), effect.T_base_tcp)
