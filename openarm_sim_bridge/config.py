@@ -26,6 +26,9 @@ class BridgeConfig(Config):
     depth_encoding: Literal["16UC1", "32FC1"] = Field(default="16UC1", description="whole millimetres, or metres")
     images: bool = Field(default=True, description="whether there are cameras; false saves their process")
     speed: float = Field(default=1.0, ge=0.0, le=100.0, description="simulated seconds a second; 0: as fast as it can")
+    thread_priority: int = Field(
+        default=50, ge=0, le=99, description="of the process under SCHED_FIFO, where the system allows it; 0: ordinary"
+    )
     paused: bool = Field(default=False, description="start with simulated time standing still")
     tf_rate: float = Field(default=50.0, gt=0.0, le=100.0, description="of /tf, Hz of simulated time")
     ground_truth_rate: float = Field(

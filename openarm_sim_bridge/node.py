@@ -34,6 +34,7 @@ from openarm_sim_bridge.fault_executor import FaultServices
 from openarm_sim_bridge.faults import Fault
 from openarm_sim_bridge.force_publisher import ForcePublisher
 from openarm_sim_bridge.handover import CameraSetup
+from openarm_sim_bridge.priority import use_fifo
 from openarm_sim_bridge.service_executor import SimulationServices
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.stage import Stage
@@ -89,6 +90,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             self, self._simulation, cameras if self._images is not None else (), self._tell_cameras
         )
 
+        self._scheduling = ""
         self._warned: set[str] = set()
         self._drawn = dict.fromkeys(cameras, 0)
         self.create_timer(REPORT_PERIOD_S, self._report, clock=self.wall_clock)
@@ -100,6 +102,12 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._on_scene(scene)
         self._simulation.start()
         self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation is running")
+
+    def keep_time(self) -> None:
+        """Ask the system for real-time scheduling of this process, where the simulation has to wait for the clock."""
+        if 0.0 < self.config.speed <= 1.0:  # as fast as it can, it would take a core from everything else
+            self._scheduling = use_fifo(self.config.thread_priority)
+            self.get_logger().info(f"scheduled as {self._scheduling}")
 
     def close(self) -> None:
         """Stop physics and drawing, then the rest."""
@@ -192,6 +200,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             joint_state_period_p50_ms=f"{period.p50_ms:.2f}",
             joint_state_period_p99_ms=f"{period.p99_ms:.2f}",
             joint_state_period_max_ms=f"{period.max_ms:.2f}",
+            scheduling=self._scheduling,
             wall_time_skipped_s=f"{simulation.skipped_s:.2f}",
             faults_active=" ".join(self._faults.active),
             frames_dropped=images.dropped if images is not None else 0,
@@ -210,6 +219,7 @@ def make() -> MujocoBridge:
         os.environ[PROFILE] = str(config_dir() / "fastdds_small.xml")
     node = MujocoBridge()
     mujoco.set_mju_user_warning(lambda text: node.get_logger().warning(f"MuJoCo: {text}"))  # not into a file
+    node.keep_time()
     gc.collect()
     gc.freeze()  # what is there now stays; later collections are short
     return node
