@@ -184,7 +184,7 @@ def mjcf(board: Board, texture: str) -> str:
   <worldbody>
     <body name="calibration_board">
       <geom name="calibration_board" type="mesh" mesh="calibration_board" material="calibration_board"
-            contype="0" conaffinity="0"/>
+            mass="0.1" contype="0" conaffinity="0"/>
     </body>
   </worldbody>
 </mujoco>

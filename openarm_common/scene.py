@@ -19,7 +19,18 @@ from pydantic import ValidationError
 from openarm_common.config import describe_faults, load_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
-from openarm_common.scene_types import DENSITY, MAX_EDGE, MIN_EDGE, PALETTE, SHAPES, Array, Scene, SceneObject, Table
+from openarm_common.scene_types import (
+    DENSITY,
+    MAX_EDGE,
+    MIN_EDGE,
+    PALETTE,
+    SHAPES,
+    Array,
+    Fixture,
+    Scene,
+    SceneObject,
+    Table,
+)
 
 __all__ = [
     "DENSITY",
@@ -30,6 +41,7 @@ __all__ = [
     "REGION_X",
     "SHAPES",
     "SPACING",
+    "Fixture",
     "Scene",
     "SceneObject",
     "Table",
@@ -58,7 +70,7 @@ def parse_scene(data: Mapping[str, Any], where: str) -> Scene:
     """
     scene = _parse(Scene, data, where)
     faults = [fault for item in scene.objects for fault in _off_table(item, scene.table)]
-    faults += _duplicates("name", (item.name for item in scene.objects))
+    faults += _duplicates("name", (item.name for item in (*scene.objects, *scene.fixtures)))
     faults += _duplicates("label", (item.label for item in scene.objects))
     for a, b in itertools.combinations(scene.objects, 2):
         depth = _overlap(a, b, scene.table)
@@ -189,7 +201,7 @@ def _off_table(item: SceneObject, table: Table) -> list[str]:
 def _duplicates(what: str, values: Iterable[str]) -> list[str]:
     seen: set[str] = set()
     twice = [value for value in values if value in seen or seen.add(value)]
-    return [f"{what} {value!r} is used by two objects; {what}s must be unique in a scene" for value in twice]
+    return [f"{what} {value!r} is used twice; {what}s must be unique in a scene" for value in twice]
 
 
 def _overlap(a: SceneObject, b: SceneObject, table: Table) -> float:

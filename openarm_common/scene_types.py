@@ -170,12 +170,39 @@ class SceneObject(Config):
         return corners @ se3.rot_z(self.yaw)[:2, :2].T + np.array(self.position[:2])
 
 
+class Fixture(Config):
+    """Something fixed to a link of the robot or to the world, such as a calibration board: seen, but not touched.
+
+    `model` is an MJCF file with one body, whose frame is put at `position` with its z and y axis along the given
+    directions of the link.
+    """
+
+    name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")
+    model: str = Field(min_length=1, description="MJCF file in models/, or an absolute path")
+    link: str = Field(default="", description="that carries it; empty is the world")
+    position: tuple[float, float, float] = Field(description="of its origin in the frame of the link, m")
+    z_axis: tuple[float, float, float] = Field(default=(0.0, 0.0, 1.0), description="direction in the link's frame")
+    y_axis: tuple[float, float, float] = Field(default=(0.0, 1.0, 0.0), description="direction in the link's frame")
+
+    @model_validator(mode="after")
+    def _two_directions(self) -> Fixture:
+        if np.linalg.norm(np.cross(self.z_axis, self.y_axis)) < 1e-6:
+            raise ValueError(f"z_axis {self.z_axis} and y_axis {self.y_axis} are parallel or zero")
+        return self
+
+    @property
+    def T_link_fixture(self) -> Array:
+        """Pose in the frame of the link, (4, 4)."""
+        return se3.make(se3.rotation_from_z_y(self.z_axis, self.y_axis), self.position)
+
+
 class Scene(Config):
-    """A table and what is on it."""
+    """A table, what is on it, and what is fixed somewhere."""
 
     name: str = Field(default="scene", min_length=1)
     table: Table = Table()
     objects: tuple[SceneObject, ...] = ()
+    fixtures: tuple[Fixture, ...] = ()
 
     def object(self, name: str) -> SceneObject:
         """Return the object of that name.

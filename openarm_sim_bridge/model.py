@@ -108,7 +108,8 @@ def build_spec(
         An editable model: bodies are named like links, joints and actuators like joints, objects by their names.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, when a camera's parent is not a link, or MuJoCo does not read the URDF.
+        OpenArmError: CONFIG_INVALID, when what carries a camera or a fixture is not a link, or MuJoCo does not read the
+            URDF or a fixture.
     """
     settings = physics or PhysicsConfig()
     spec = robot_spec(description, settings)
@@ -117,6 +118,8 @@ def build_spec(
     scenery.add_table(spec, scene.table, contact)
     for item in scene.objects:
         scenery.add_object(spec, item, scene.table, contact, settings.object_condim)
+    for fixture in scene.fixtures:
+        scenery.add_fixture(spec, fixture)
     scenery.add_cameras(spec, cameras.values(), mount_seed)
     return spec
 

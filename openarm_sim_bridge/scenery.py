@@ -18,7 +18,8 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.cameras import T_LINK_OPTICAL, CameraConfig, true_mount
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import SceneObject, Table
+from openarm_common.resources import models_dir
+from openarm_common.scene import Fixture, SceneObject, Table
 
 _TABLE_RGBA = (0.80, 0.785, 0.76, 1.0)
 _FLOOR_RGBA = (0.48, 0.48, 0.49, 1.0)  # plain: a texture that fills half of an image doubles the cost of drawing it
@@ -120,6 +121,33 @@ def add_object(spec: mujoco.MjSpec, item: SceneObject, table: Table, contact: Ma
     body.add_geom(
         name=item.name, type=kind, size=size, mass=item.mass_kg, rgba=item.rgba, condim=condim, group=1, **contact
     )
+
+
+def add_fixture(spec: mujoco.MjSpec, item: Fixture) -> None:
+    """The body of an MJCF file, fixed to a link or to the world; all its names begin with the fixture's.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when the link or the file does not exist, or the file is no MJCF of one body.
+    """
+    parent = spec.body(item.link) if item.link else spec.worldbody
+    if parent is None:
+        names = ", ".join(body.name for body in spec.bodies)
+        raise OpenArmError(Code.CONFIG_INVALID, f"fixture {item.name!r}: no link {item.link!r}; links: {names}")
+    path = models_dir() / item.model
+    if not path.is_file():
+        raise OpenArmError(Code.CONFIG_INVALID, f"fixture {item.name!r}: there is no file {path}")
+    try:
+        child = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"fixture {item.name!r}: MuJoCo does not read {path}: {error}"
+        ) from error
+    body = child.worldbody.first_body()
+    if body is None:
+        raise OpenArmError(Code.CONFIG_INVALID, f"fixture {item.name!r}: {path} has no body")
+    T_link_fixture = item.T_link_fixture
+    frame = parent.add_frame(pos=T_link_fixture[:3, 3], quat=_quat_wxyz(T_link_fixture))
+    frame.attach_body(body, f"{item.name}_", "")
 
 
 def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig], mount_seed: int | None) -> None:

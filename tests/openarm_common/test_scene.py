@@ -132,8 +132,8 @@ def test_overlapping_objects_are_refused(position: tuple[float, ...], yaw: float
 
 def test_names_and_labels_are_unique() -> None:
     text = refused({"objects": [cube(), cube(position=[0.5, 0.0])]})
-    assert "name 'red_cube' is used by two objects" in text
-    assert "label 'red' is used by two objects" in text
+    assert "name 'red_cube' is used twice" in text
+    assert "label 'red' is used twice" in text
     parse_scene({"objects": [cube(), cube("other", position=[0.5, 0.0], label="second")]}, "here.yaml")
 
 
