@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -159,6 +159,9 @@ class GraspConfig(Config):
     """Parameters of the grasp node."""
 
     scene: str = Field(default="demo", description="scene file whose table the objects stand on")
+    gripper_action: Literal["parallel", "classic"] = Field(
+        default="parallel", description="type of gripper_cmd, as the bridge or the driver serves it"
+    )
     home_state: str = Field(
         default="home", description="SRDF group state of both arms that keeps the camera's view free"
     )

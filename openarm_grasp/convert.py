@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Literal
 
 import numpy as np
+from control_msgs.action import GripperCommand, ParallelGripperCommand
 from geometry_msgs.msg import Point
 from numpy.typing import NDArray
 from openarm_interfaces.action import MoveArm, Pick, PlanApproach
 from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspStatus
 from openarm_interfaces.srv import ComputeIK, Grasp
+from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA
 from vision_msgs.msg import Detection3DArray
 from visualization_msgs.msg import Marker, MarkerArray
@@ -146,6 +149,17 @@ def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
     if not 0 <= result.chosen < offered:
         raise OpenArmError(Code.INTERNAL, f"the planner chose target {result.chosen} of {offered}")
     return Planned(result.chosen, result.transfer, result.approach, result.retreat, result.planning_time)
+
+
+def gripper_goal(
+    action: Literal["parallel", "classic"], joint: str, position: float
+) -> ParallelGripperCommand.Goal | GripperCommand.Goal:
+    """Goal of either gripper action: the driving finger at a position, m, with the controller's own effort."""
+    if action == "classic":
+        goal = GripperCommand.Goal()
+        goal.command.position = position
+        return goal
+    return ParallelGripperCommand.Goal(command=JointState(name=[joint], position=[position]))
 
 
 def reach_request(arm: str, T_base_tcp: Array) -> ComputeIK.Request:

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from control_msgs.action import ParallelGripperCommand
+from control_msgs.action import GripperCommand, ParallelGripperCommand
 from numpy.typing import NDArray
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
 from openarm_interfaces.srv import ComputeIK
@@ -44,8 +44,9 @@ class GraspExecutor:
         self._execute = ActionClient(node, ExecuteTrajectory, "/motion/execute")
         self._move = ActionClient(node, MoveArm, "/motion/move")
         self._ik = node.create_client(ComputeIK, "/motion/compute_ik")
+        gripper_action = ParallelGripperCommand if config.gripper_action == "parallel" else GripperCommand
         self._grippers = {
-            arm: ActionClient(node, ParallelGripperCommand, f"/{arm}_gripper_controller/gripper_cmd") for arm in ARMS
+            arm: ActionClient(node, gripper_action, f"/{arm}_gripper_controller/gripper_cmd") for arm in ARMS
         }
         self.performer = Performer(self, config)
 
@@ -195,8 +196,6 @@ class GraspExecutor:
 
     async def grip(self, arm: str, joint: str, position: float, what: str) -> bool:
         """Ask the gripper's controller."""
-        goal = ParallelGripperCommand.Goal()
-        goal.command.name = [joint]
-        goal.command.position = [position]
+        goal = convert.gripper_goal(self._config.gripper_action, joint, position)
         result = await self._link.goal(self._grippers[arm], goal, self._config.limits.gripper_timeout, what)
         return bool(result.stalled or result.reached_goal)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controllers' actions: FollowJointTrajectory of an arm, ParallelGripperCommand of a gripper.
+"""The controller of an arm on the graph: FollowJointTrajectory and the topics beside it.
 
 A trajectory that is refused (unknown joints, NaN, out of limits, …) is accepted as a goal and aborted at once, because
-only a result can carry the reason to the caller: `error_code` INVALID_GOAL or INVALID_JOINTS and `error_string`. A
-gripper's result has no text, so a gripper goal that is refused is rejected, with the reason in the log.
+only a result can carry the reason to the caller: `error_code` INVALID_GOAL or INVALID_JOINTS and `error_string`.
 """
 
 from __future__ import annotations
@@ -12,19 +11,17 @@ from collections.abc import Callable
 from concurrent.futures import Future as ThreadFuture
 from typing import Any, Generic, TypeVar
 
-from control_msgs.action import FollowJointTrajectory, ParallelGripperCommand
+from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
-from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from openarm_common.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import OpenArmError
 from openarm_common.node import QOS_COMMAND, BaseNode
 from openarm_sim_bridge.actuation import End, FollowerState, TrajectoryFollower, TrajectoryOutcome
-from openarm_sim_bridge.gripper import GripperFollower, GripperGoal, GripperOutcome
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.trajectory import JointTolerance, Trajectory, TrajectoryError, TrajectoryResult
 
@@ -34,7 +31,7 @@ FEEDBACK_PERIOD_S = 0.05
 STATE_PERIOD_S = 0.05
 
 
-class _Waiting(Generic[OutcomeT]):
+class Waiting(Generic[OutcomeT]):
     """Waits in the executor for an outcome that comes from the thread of the simulation."""
 
     def __init__(self, node: BaseNode[Any]) -> None:
@@ -129,7 +126,7 @@ class ArmActionServer:
         return CancelResponse.ACCEPT
 
     async def _execute(self, handle: ServerGoalHandle) -> FollowJointTrajectory.Result:
-        waiting: _Waiting[TrajectoryOutcome] = _Waiting(self._node)
+        waiting: Waiting[TrajectoryOutcome] = Waiting(self._node)
         try:
             trajectory = self._follower.check(_trajectory_of(handle.request))
             self._simulation.call(lambda: self._start(trajectory, waiting.done)).add_done_callback(waiting.started)
@@ -172,77 +169,6 @@ class ArmActionServer:
             self._running.publish_feedback(_feedback(self._follower.group.names, state))
 
 
-class GripperActionServer:
-    """/{side}_gripper_controller/gripper_cmd.
-
-    Args:
-        node: Owner.
-        side: left or right.
-        follower: Of the gripper.
-        simulation: Whose thread works the follower.
-    """
-
-    def __init__(self, node: BaseNode[Any], side: str, follower: GripperFollower, simulation: Simulation) -> None:
-        self._node = node
-        self._side = side
-        self._follower = follower
-        self._simulation = simulation
-        self._joint = follower.group.names[0]
-        self._column = simulation.world.joint_names.index(self._joint)
-        self._server = ActionServer(
-            node,
-            ParallelGripperCommand,
-            f"/{side}_gripper_controller/gripper_cmd",
-            self._execute,
-            goal_callback=self._judge,
-            cancel_callback=self._cancel,
-        )
-
-    def destroy(self) -> None:
-        """Take the action away."""
-        self._server.destroy()
-
-    def _judge(self, request: ParallelGripperCommand.Goal) -> GoalResponse:
-        try:
-            self._simulation.check_able()
-            self._follower.check(_gripper_goal_of(request.command, self._joint))
-        except OpenArmError as error:
-            self._node.get_logger().error(f"{self._side} gripper goal rejected: {error}")
-            return GoalResponse.REJECT
-        return GoalResponse.ACCEPT
-
-    def _cancel(self, _handle: ServerGoalHandle) -> CancelResponse:
-        self._simulation.call(self._follower.cancel)
-        return CancelResponse.ACCEPT
-
-    async def _execute(self, handle: ServerGoalHandle) -> ParallelGripperCommand.Result:
-        waiting: _Waiting[GripperOutcome] = _Waiting(self._node)
-        goal = self._follower.check(_gripper_goal_of(handle.request.command, self._joint))
-        self._simulation.call(lambda: self._start(goal, waiting.done)).add_done_callback(waiting.started)
-        if handle.is_cancel_requested:
-            self._simulation.call(self._follower.cancel)
-        outcome: GripperOutcome | None = await waiting.future
-        result = ParallelGripperCommand.Result()
-        if outcome is None:
-            handle.abort()
-            return result
-        result.state = JointState(name=[self._joint], position=[outcome.position], effort=[outcome.effort])
-        result.state.velocity = [0.0]
-        result.stalled, result.reached_goal = outcome.stalled, outcome.reached_goal
-        if outcome.end is End.SUCCEEDED:
-            handle.succeed()
-        elif outcome.end is End.CANCELLED:
-            handle.canceled()
-        else:
-            handle.abort()
-            self._node.get_logger().warning(f"{self._side} gripper: {outcome.text}")
-        return result
-
-    def _start(self, goal: GripperGoal, done: Callable[[GripperOutcome], None]) -> None:
-        state = self._simulation.world.read_joints()
-        self._follower.start(goal, float(state.position[self._column]), float(state.effort[self._column]), done)
-
-
 def _trajectory_of(goal: FollowJointTrajectory.Goal) -> Trajectory:
     names, t, q, v, a = trajectory_from_msg(goal.trajectory)
 
@@ -259,25 +185,6 @@ def _trajectory_of(goal: FollowJointTrajectory.Goal) -> Trajectory:
         path_tolerance=tolerances(goal.path_tolerance),
         goal_tolerance=tolerances(goal.goal_tolerance),
         goal_time_s=stamp_to_ns(goal.goal_time_tolerance) * 1e-9,
-    )
-
-
-def _gripper_goal_of(command: JointState, joint: str) -> GripperGoal:
-    """Goal of a command that names the finger joint, or no joint at all.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, for other joints or no position.
-    """
-    if list(command.name) not in ([], [joint]) or len(command.position) != 1:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT,
-            f"gripper command of joints {list(command.name)} with {len(command.position)} positions, expected one"
-            f" position of {joint!r}",
-        )
-    return GripperGoal(
-        position=command.position[0],
-        max_effort=command.effort[0] if len(command.effort) else 0.0,
-        max_velocity=command.velocity[0] if len(command.velocity) else 0.0,
     )
 
 

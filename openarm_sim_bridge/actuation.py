@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,6 +47,9 @@ class TrajectoryConfig(Config):
     )
     stop_time: float = Field(default=0.15, gt=0.0, le=2.0, description="a cancelled arm comes to rest in this time, s")
     blend_time: float = Field(default=0.2, gt=0.0, description="a small offset at the start fades in this time, s")
+    new_goal: Literal["replace", "refuse"] = Field(
+        default="replace", description="what a goal does that comes while the arm follows another"
+    )
     feed_forward: bool = Field(default=True, description="lead moving targets by the lag of the actuators")
     command_timeout: float = Field(
         default=0.5, gt=0.0, le=60.0, description="arm and gripper hold when no /joint_commands came for so long, s"
@@ -155,7 +159,7 @@ class TrajectoryFollower:
     def start(
         self, trajectory: Trajectory, t_ns: int, measured: Array, done: Callable[[TrajectoryOutcome], None]
     ) -> None:
-        """Follow a checked trajectory from now on; one that runs is aborted.
+        """Follow a checked trajectory from now on; one that runs is aborted, or the new one refused, as configured.
 
         Args:
             trajectory: From `check`.
@@ -165,8 +169,15 @@ class TrajectoryFollower:
 
         Raises:
             TrajectoryError: OLD_HEADER_TIMESTAMP, when it would have ended already; PATH_TOLERANCE_VIOLATED, when it
-                starts elsewhere; INVALID_GOAL, when its first point can't be reached in time or its start is far away.
+                starts elsewhere; INVALID_GOAL, when its first point can't be reached in time or its start is far away,
+                or the arm is busy and new goals are refused.
         """
+        if self._goal is not None and self._config.new_goal == "refuse":
+            raise TrajectoryError(
+                Code.BUSY,
+                f"the arm follows a trajectory for another {self._goal.spline.end_s - self._goal.tau_s:.2f} s, and new"
+                " goals are refused meanwhile (parameter trajectory.new_goal); cancel it or wait for its end",
+            )
         goal = self._goal_of(trajectory, t_ns, measured, done)
         self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, "a newer trajectory took its place")
         self._goal = goal

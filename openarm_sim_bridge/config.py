@@ -34,6 +34,9 @@ class BridgeConfig(Config):
     ground_truth_rate: float = Field(
         default=20.0, gt=0.0, le=100.0, description="of the judge's topic, Hz of simulated time"
     )
+    gripper_action: Literal["parallel", "classic"] = Field(
+        default="parallel", description="type of gripper_cmd: ParallelGripperCommand, or the older GripperCommand"
+    )
     depth_noise: DepthNoiseConfig = DepthNoiseConfig()
     colour_noise: ColourNoiseConfig = ColourNoiseConfig()
     physics: PhysicsConfig = PhysicsConfig()

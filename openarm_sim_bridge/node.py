@@ -25,7 +25,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, BaseNode, reliable, run
 from openarm_common.resources import config_dir
 from openarm_common.scene import Scene, load_scene
-from openarm_sim_bridge.action_executor import ArmActionServer, GripperActionServer
+from openarm_sim_bridge.action_executor import ArmActionServer
 from openarm_sim_bridge.camera_feed import CameraFeed
 from openarm_sim_bridge.camera_publisher import topic_names
 from openarm_sim_bridge.config import BridgeConfig
@@ -33,6 +33,7 @@ from openarm_sim_bridge.controller import RobotController
 from openarm_sim_bridge.fault_executor import FaultServices
 from openarm_sim_bridge.faults import Fault
 from openarm_sim_bridge.force_publisher import ForcePublisher
+from openarm_sim_bridge.gripper_executor import GripperActionServer
 from openarm_sim_bridge.handover import CameraSetup
 from openarm_sim_bridge.priority import use_fifo
 from openarm_sim_bridge.service_executor import SimulationServices
@@ -82,7 +83,8 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self.create_subscription(JointState, "/joint_commands", self._on_command, QOS_COMMAND)
         self._arms = [ArmActionServer(self, side, arm, self._simulation) for side, arm in controller.arms.items()]
         self._grippers = [
-            GripperActionServer(self, side, gripper, self._simulation) for side, gripper in controller.grippers.items()
+            GripperActionServer(self, side, gripper, self._simulation, config.gripper_action)
+            for side, gripper in controller.grippers.items()
         ]
         self._sim_services = SimulationServices(self, stage, scene, self._simulation, self._on_scene)
 
