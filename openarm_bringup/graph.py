@@ -84,6 +84,7 @@ class NodeSpec(Config):
     restart: Restart = Restart()
     large_messages: bool = Field(default=False, description="publishes images or clouds: a large Fast DDS segment")
     segment_mib: int = Field(default=32, ge=1, le=1024, description="MiB of /dev/shm for large messages")
+    shared_mib: float = Field(default=0.0, ge=0.0, le=1024.0, description="MiB of /dev/shm that it takes by itself")
     env: dict[str, str] = Field(default_factory=dict)
     offers: tuple[str, ...] = Field(default=(), description="topics, services, actions, for `graph draw`")
     uses: tuple[str, ...] = Field(default=(), description="names that other nodes offer, for `graph draw`")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared memory of Fast DDS in /dev/shm: what a graph needs of it, and leaving nothing of it behind."""
+"""Shared memory in /dev/shm, of Fast DDS and of the suite: what a graph needs of it, and leaving nothing behind."""
 
 from __future__ import annotations
 
@@ -23,12 +23,16 @@ _LARGE_EXTRA_MIB = 2.2
 
 _SEGMENT = re.compile(r"^fastrtps_[0-9a-f]{16}$")
 _PORT = re.compile(r"^fastrtps_port(\d+)$")
+#: Distance fields (`openarm_common.distance_field.field_path`), and what one is called while it is made.
+_FIELD = re.compile(r"^openarm_field_([A-Za-z0-9_.-]+)$")
+_UNFINISHED = re.compile(r"^[a-z0-9_]{8}$")
 
 
 def shm_need_mib(graph: Graph, extra_participants: int = 1) -> float:
     """Return how much of /dev/shm the graph takes, MiB, with `extra_participants` beside its nodes (probe, clients)."""
     need = extra_participants * _PLAIN_MIB
     for spec in graph.nodes.values():
+        need += spec.shared_mib
         need += spec.segment_mib + _LARGE_EXTRA_MIB if spec.large_messages else _PLAIN_MIB
     return need
 
@@ -73,13 +77,13 @@ def clean_shm() -> str:
 
 
 def mapped_by(pid: int, shm: Path = SHM) -> set[str]:
-    """Return the names of the Fast DDS segments and ports that a process has mapped; none when it has ended."""
+    """Return the names of segments, ports and distance fields that a process has mapped; none when it has ended."""
     try:
         lines = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         return set()
     names = {line.rpartition("/")[2] for line in lines if f"{shm}/" in line}
-    return {name for name in names if _SEGMENT.match(name) or _PORT.match(name)}
+    return {name for name in names if any(kind.match(name) for kind in (_SEGMENT, _PORT, _FIELD))}
 
 
 def ports_of(domain: int, shm: Path = SHM) -> set[str]:
@@ -89,8 +93,25 @@ def ports_of(domain: int, shm: Path = SHM) -> set[str]:
     return {name for name, match in matches if match and first <= int(match.group(1)) < first + 250}
 
 
+def fields_of(domain: int, shm: Path = SHM) -> set[str]:
+    """Return the names of the distance fields of a ROS domain in /dev/shm, unfinished ones too."""
+    found: set[str] = set()
+    for entry in shm.iterdir():
+        match = _FIELD.match(entry.name)
+        if match and match.group(1).startswith(str(domain)):
+            rest = match.group(1).removeprefix(str(domain))
+            if not rest or _UNFINISHED.match(rest):
+                found.add(entry.name)
+    return found
+
+
+def names_of(domain: int, shm: Path = SHM) -> set[str]:
+    """Return the names of all that a graph in a ROS domain may have left in /dev/shm."""
+    return ports_of(domain, shm) | fields_of(domain, shm)
+
+
 def sweep(names: Iterable[str], shm: Path = SHM) -> list[str]:
-    """Remove those of the named segments and ports that nobody uses any more; return them.
+    """Remove those of the named segments, ports and fields that nobody uses any more; return them.
 
     A process that sends to one that has just died opens its port anew, without the lock by which `fastdds shm clean`
     knows a port; such ports would stay for ever. In use is what is locked, or mapped by any process that can be seen.
@@ -123,7 +144,7 @@ def _locked(path: Path) -> bool:
 def main() -> None:
     """`python -m openarm_bringup.shm DOMAIN`: clean up after a graph whose supervisor is dead."""
     clean_shm()
-    sweep(ports_of(int(sys.argv[1])))
+    sweep(names_of(int(sys.argv[1])))
 
 
 if __name__ == "__main__":

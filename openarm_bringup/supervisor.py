@@ -167,7 +167,7 @@ class Supervisor:
             await self._ask(lambda probe: probe.close())
         self._threads.shutdown()
         mapped = set().union(*(keeper.mapped for keeper in self._keepers.values()))
-        swept = await asyncio.to_thread(lambda: shm.sweep(mapped | shm.ports_of(environment.domain_id(self.graph))))
+        swept = await asyncio.to_thread(lambda: shm.sweep(mapped | shm.names_of(environment.domain_id(self.graph))))
         self._say(f"removed from /dev/shm: {', '.join(swept) or 'nothing'}")
         await self._dismiss_guard()
         runs.remove_record(os.getpid())

@@ -28,7 +28,8 @@ QOS = {
 }
 #: What rclpy and actions add by themselves, what is listened to, and what is beside a camera that is only looked at.
 UNTOLD = re.compile(
-    r"/_action/|^/rosout$|^/parameter_events$|^/joint_commands$|/joint_trajectory$|^/spectator/color/camera_info$"
+    r"/_action/|^/rosout$|^/parameter_events$|^/joint_commands$|/joint_trajectory$|^/cloud_in$"
+    r"|^/spectator/color/camera_info$"
 )
 
 pytestmark = pytest.mark.graph
@@ -70,7 +71,7 @@ def _settled(node: Node) -> dict[str, list[str]]:
 
 def _told_publishers() -> dict[str, list[str]]:
     rows = [(name, rest.split("|")[1].strip()) for name, kind, rest in ROW.findall(README) if "/msg/" in kind]
-    everyone = ["calibration_publisher", "cloud", "detector", "grasp", "motion", "mujoco_bridge"]
+    everyone = ["calibration_publisher", "cloud", "detector", "grasp", "motion", "mujoco_bridge", "octomap"]
     return {name: everyone if who == "all" else sorted(w.strip() for w in who.split(",")) for name, who in rows}
 
 

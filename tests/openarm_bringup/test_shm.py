@@ -13,7 +13,7 @@ import pytest
 
 from openarm_bringup.environment import node_arguments, node_environment
 from openarm_bringup.graph import Graph, NodeSpec
-from openarm_bringup.shm import mapped_by, ports_of, shm_need_mib, sweep
+from openarm_bringup.shm import fields_of, mapped_by, names_of, ports_of, shm_need_mib, sweep
 
 
 def make(folder: Path, name: str, *, lock: bool) -> Path:
@@ -52,6 +52,18 @@ def test_ports_of_a_domain(tmp_path: Path) -> None:
     assert ports_of(67, tmp_path) == {"fastrtps_port24161"}
 
 
+def test_the_distance_field_of_a_killed_map_goes_and_that_of_a_living_one_stays(tmp_path: Path) -> None:
+    """Also one that was never finished; those of other domains and of tests are not touched."""
+    dead = [make(tmp_path, f"openarm_field_4{rest}", lock=False).name for rest in ("", "ab_12xyz")]
+    others = [make(tmp_path, f"openarm_field_{name}", lock=False).name for name in ("43", "4_of_a_test", "toy")]
+    assert fields_of(4, tmp_path) == set(dead)
+    living = tmp_path / others[0]
+    with living.open("r+b") as file, mmap.mmap(file.fileno(), 4096):
+        assert mapped_by(os.getpid(), tmp_path) == {living.name}
+        assert sweep(names_of(4, tmp_path) | names_of(43, tmp_path), tmp_path) == sorted(dead)
+    assert sorted(p.name for p in tmp_path.glob("openarm_*")) == sorted(others)
+
+
 def test_mapped_by_a_process_that_has_ended_is_nothing() -> None:
     assert mapped_by(2**22 + 1) == set()
 
@@ -59,7 +71,9 @@ def test_mapped_by_a_process_that_has_ended_is_nothing() -> None:
 @pytest.fixture
 def graph() -> Graph:
     nodes = {
-        "eye": NodeSpec(module="toy.eye", large_messages=True, segment_mib=8, params={"a.b": 1, "none": None}),
+        "eye": NodeSpec(
+            module="toy.eye", large_messages=True, segment_mib=8, shared_mib=5, params={"a.b": 1, "none": None}
+        ),
         "arm": NodeSpec(command=("python", "arm.py"), remaps={"/a": "/b"}, env={"MODE": "slow"}),
     }
     return Graph(name="toy", domain=9, nodes=nodes)
@@ -76,7 +90,7 @@ def test_only_publishers_of_large_messages_get_the_large_segment(graph: Graph, t
     assert eye["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert "ROS_LOCALHOST_ONLY" not in eye
     assert arm["MODE"] == "slow"
-    assert shm_need_mib(graph) == pytest.approx(8 + 2.2 + 0.65 + 0.65)
+    assert shm_need_mib(graph) == pytest.approx(8 + 5 + 2.2 + 0.65 + 0.65)
 
 
 def test_command_line_of_a_node_carries_name_remaps_and_parameters(graph: Graph, tmp_path: Path) -> None:
