@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from openarm_motion.arm import Arm, segment_time
-from openarm_motion.collision import Box, CollisionScene, Contact, Surroundings, spread
+from openarm_motion.collision import Box, Clearance, CollisionScene, Contact, Surroundings, spread
 from openarm_motion.fast import FastScene
 from openarm_motion.planner import PlanQuery, never
 from openarm_motion.trajectory import JointLimits
@@ -65,6 +66,25 @@ class BothScene:
                 return q
         return None
 
+    @contextmanager
+    def lenient(self, share: float) -> Iterator[None]:
+        """Ask for only a share of each positive distance meanwhile."""
+        with self.first.lenient(share), self.second.lenient(share):
+            yield
+
+    def separation(self, q: ArrayLike) -> float:
+        """Distance of the arms from each other at a configuration (n1 + n2,), what they hold included, m."""
+        a, b = self._put(q)
+        first, second = self.first.robot.arm.moving, self.second.robot.arm.moving
+        nearest = self.first.gap(a, second)
+        # links have been looked at from one side; what the second arm holds has not
+        return min(nearest, self.second.gap(b, first)) if self.second.around.held else nearest
+
+    def placed(self, q: ArrayLike) -> tuple[CollisionScene, CollisionScene]:
+        """Both scenes with the other arm where a configuration (n1 + n2,) has it."""
+        self._put(q)
+        return self.first, self.second
+
     def _put(self, q: ArrayLike) -> tuple[Array, Array]:
         values = np.asarray(q, dtype=np.float64)
         a, b = values[: self._split], values[self._split :]
@@ -88,15 +108,52 @@ class BothArms:
         self.lower: Array = np.concatenate([first.kinematics.lower, second.kinematics.lower])
         self.upper: Array = np.concatenate([first.kinematics.upper, second.kinematics.upper])
 
-    def scene(self, state: Mapping[str, float], boxes: Sequence[Box] = (), separation: float = SEPARATION) -> BothScene:
-        """Surroundings of both arms with the table in them; the arms keep `separation` from each other, m."""
-        scenes: list[CollisionScene] = []
-        for arm in self.arms:
-            keep = arm.config.clearance.model_copy(update={"arms": separation})
-            fixed = frozenset(box.id for box in arm.static)
-            around = Surroundings(state, [*arm.static, *boxes], supports=fixed, fixed=fixed, clearance=keep)
-            scenes.append(CollisionScene(arm.robot, around))
+    def parts(self, values: Array) -> tuple[Array, Array]:
+        """What belongs to each arm, of values (..., n1 + n2)."""
+        return values[..., : self.split], values[..., self.split :]
+
+    def scene(
+        self,
+        state: Mapping[str, float],
+        boxes: Sequence[Box] = (),
+        separation: float = SEPARATION,
+        held: tuple[Sequence[Box], Sequence[Box]] = ((), ()),
+    ) -> BothScene:
+        """Surroundings of both arms with the table in them.
+
+        Args:
+            state: The robot's joints.
+            boxes: Obstacles, base frame.
+            separation: Distance that the arms keep from each other, m.
+            held: Boxes held by each arm, its tool frame. Two held boxes are not looked at against each other.
+        """
+        scenes = [self.scene_of(i, state, boxes, separation, held[i]) for i in range(2)]
         return BothScene(scenes[0], scenes[1], self.split)
+
+    def scene_of(
+        self,
+        index: int,
+        state: Mapping[str, float],
+        boxes: Sequence[Box] = (),
+        separation: float = SEPARATION,
+        held: Sequence[Box] = (),
+    ) -> CollisionScene:
+        """Surroundings of one of the arms, the other one in them where `state` says; arguments as `scene`."""
+        arm = self.arms[index]
+        keep = arm.config.clearance.model_copy(update={"arms": separation})
+        fixed = frozenset(box.id for box in arm.static)
+        around = Surroundings(state, [*arm.static, *boxes], held=held, supports=fixed, fixed=fixed, clearance=keep)
+        return CollisionScene(arm.robot, around)
+
+    def pair_scene(
+        self, state: Mapping[str, float], separation: float, held: tuple[Sequence[Box], Sequence[Box]] = ((), ())
+    ) -> BothScene:
+        """Nothing but the arms and what they hold; arguments as `scene`."""
+        first, second = (
+            CollisionScene(arm.robot, Surroundings(state, held=mine, clearance=Clearance(arms=separation), own=False))
+            for arm, mine in zip(self.arms, held, strict=True)
+        )
+        return BothScene(first, second, self.split)
 
     def limits(self, scale: float) -> JointLimits:
         """Limits of all joints at a velocity scale."""
@@ -107,9 +164,19 @@ class BothArms:
             np.concatenate([a.jerk, b.jerk]),
         )
 
-    def query(self, scene: BothScene, start: Array, goals: Array, scale: float, time_limit: float) -> PlanQuery:
+    def query(
+        self,
+        scene: BothScene,
+        start: Array,
+        goals: Array,
+        scale: float,
+        time_limit: float,
+        stopped: Callable[[], bool] = never,
+        fineness: float = 1.0,
+    ) -> PlanQuery:
         """What a planner is asked for a path (n1 + n2,) to one of several configurations (k, n1 + n2)."""
         search = self.arms[0].config.planning
+        step, travel = search.edge_step / fineness, search.edge_travel / fineness
         limits = self.limits(scale)
         return PlanQuery(
             start=start,
@@ -117,12 +184,12 @@ class BothArms:
             lower=self.lower,
             upper=self.upper,
             collides=scene.collides,
-            edge_free=lambda a, b: scene.edge_free(a, b, search.edge_step, search.edge_travel),
+            edge_free=lambda a, b: scene.edge_free(a, b, step, travel),
             cost=lambda a, b: segment_time(a, b, limits),
             time_limit=time_limit,
             seed=search.seed,
-            stopped=never,
+            stopped=stopped,
             fast=cache(lambda: FastScene([scene.first, scene.second])),
-            resolution=(search.edge_step, search.edge_travel),
+            resolution=(step, travel),
             limits=(limits.velocity, limits.acceleration, limits.jerk),
         )

@@ -8,13 +8,15 @@ the clearance there. Half a look away from a sample no point has moved further t
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision import CollisionScene
+from openarm_motion.collision import Contact
 from openarm_motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -40,9 +42,25 @@ class Certificate:
     share: float
 
 
-def certify(
-    scene: CollisionScene, trajectory: Trajectory, travel: float = _TRAVEL, share: float = _SHARE
-) -> Certificate:
+class Checked(Protocol):
+    """What a trajectory is looked at in: a scene of one arm, or of two."""
+
+    levers: Array
+
+    def collides(self, q: Array) -> bool:
+        """Whether some pair is nearer than it may be."""
+        ...
+
+    def contacts(self, q: Array) -> list[Contact]:
+        """All pairs that are nearer than they may be, the deepest first."""
+        ...
+
+    def lenient(self, share: float) -> AbstractContextManager[None]:
+        """Ask for only a share of each positive distance meanwhile."""
+        ...
+
+
+def certify(scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL, share: float = _SHARE) -> Certificate:
     """Look at a trajectory densely.
 
     Args:
@@ -54,7 +72,7 @@ def certify(
     Raises:
         OpenArmError: IN_COLLISION, with the time and the pair.
     """
-    times = _times(trajectory, scene.levers, travel)
+    times = dense_times(trajectory, scene.levers, travel)
     states = trajectory.at(times)[0]
     with scene.lenient(share):
         for k in _ends_first(len(states)):
@@ -65,7 +83,7 @@ def certify(
     return Certificate(len(states), travel, share)
 
 
-def _times(trajectory: Trajectory, levers: Array, travel: float) -> Array:
+def dense_times(trajectory: Trajectory, levers: Array, travel: float = _TRAVEL) -> Array:
     """Moments between which no point moves further than `travel`, by the way that each joint turns."""
     way = np.abs(np.diff(trajectory.q, axis=0)) @ levers
     parts = [

@@ -239,6 +239,13 @@ class CollisionScene:
         """Move the robot's other joints."""
         self._q = self._robot.configuration(state)
 
+    def gap(self, q: ArrayLike, links: frozenset[str]) -> float:
+        """Smallest distance between what moves and some links, m (< 0: overlap); infinite where no pair is checked."""
+        self._robot.put(self._q, q)
+        pin.updateGeometryPlacements(self._robot.model, self._data, self._geometry, self._geometry_data, self._q)
+        pairs = [k for k, (_, j) in enumerate(self._pair_index) if self._names[j] in links]
+        return min((self._contact(k).distance for k in pairs), default=float("inf"))
+
     def put_other(self, other: CollisionScene, q: ArrayLike) -> None:
         """Move the arm of another scene of the same robot to its configuration (n,)."""
         other._robot.put(self._q, q)

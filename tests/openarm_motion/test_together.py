@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Both arms on their way at once, kept apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion import together
+from openarm_motion.arm import Arm, Situation
+from openarm_motion.both import BothArms
+from openarm_motion.certificate import dense_times
+from openarm_motion.collision import box_from
+from openarm_motion.together import BothGoals, BothPlan, delayed, joined, plan_staggered, plan_together, separation
+
+DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
+
+
+@pytest.fixture(scope="module")
+def both(arms: dict[str, Arm]) -> BothArms:
+    return BothArms(arms["left"], arms["right"])
+
+
+def hand_at(arm: Arm, home: dict[str, float], y: float, x: float = 0.30, z: float = 0.62) -> np.ndarray:
+    """Configurations with the hand over the table, free with the other arm at home."""
+    scene = arm.scene(home)
+    found = [s.q for s in arm.inverse.solutions(se3.make(DOWN, (x, y, z)), 0.05) if not scene.collides(s.q)]
+    return np.array(found[:6])
+
+
+def starting(both: BothArms, state: dict[str, float]) -> Situation:
+    return Situation(state, np.array([state[name] for name in both.names]), 0.5)
+
+
+def apart_all_the_way(both: BothArms, state: dict[str, float], plan: BothPlan) -> float:
+    """Least distance of the arms at looks 5 ms apart, from nothing but the trajectories."""
+    whole = joined(both, plan.trajectories)
+    scene = both.scene(state)
+    states = whole.at(np.arange(0.0, whole.duration, 0.005))[0]
+    return min(scene.separation(q) for q in states[::3])
+
+
+def swapping(both: BothArms, home: dict[str, float]) -> tuple[dict[str, float], BothGoals]:
+    """The left hand is over the middle, where the right one wants to go while the left one goes home."""
+    left, right = both.arms
+    inside = hand_at(left, home, 0.0)[0]
+    state = {**home, **dict(zip(left.names, inside.tolist(), strict=True))}
+    back = np.array([[home[name] for name in left.names]])
+    return state, BothGoals((back, hand_at(right, home, 0.0)))
+
+
+@pytest.mark.parametrize("how", [plan_together, plan_staggered])
+def test_n12_arms_that_take_each_others_place_keep_20_mm_all_the_way(both, home, how) -> None:
+    state, goals = swapping(both, home)
+    plan: BothPlan = how(both, starting(both, state), goals, 10.0)
+    seen = apart_all_the_way(both, state, plan)
+    assert seen >= 0.020
+    assert plan.separation == pytest.approx(seen, abs=0.002)
+    for arm, part, wanted in zip(both.arms, plan.trajectories, goals.goals, strict=True):
+        assert part.names == arm.names
+        np.testing.assert_allclose(part.q[0], [state[name] for name in arm.names], atol=1e-9)
+        assert min(np.abs(part.q[-1] - q).max() for q in wanted) < 1e-9
+
+
+def test_n12_the_arm_in_the_way_goes_first_and_the_other_waits_no_longer_than_it_must(
+    both, home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, goals = swapping(both, home)
+    alone = together._alone
+
+    def slow_left(arms, index, *args):
+        way = alone(arms, index, *args)
+        return replace(way, t=4 * way.t, v=way.v / 4, a=way.a / 16) if index == 0 else way
+
+    monkeypatch.setattr(together, "_alone", slow_left)
+    plan = plan_staggered(both, starting(both, state), goals, 10.0)
+    assert plan.delays[0] == 0.0
+    assert 0.0 < plan.delays[1] < plan.trajectories[0].duration
+    late = plan.trajectories[1]
+    np.testing.assert_array_equal(late.q[0], late.q[1])
+    moving = replace(late, t=late.t[1:] - plan.delays[1], q=late.q[1:], v=late.v[1:], a=late.a[1:])
+    scene = both.scene(state)
+    sooner = delayed(moving, plan.delays[1] - 0.1)
+    assert separation(scene, joined(both, (plan.trajectories[0], sooner))) < 0.024
+    assert separation(scene, joined(both, plan.trajectories)) >= 0.024
+    assert apart_all_the_way(both, state, plan) >= 0.020
+
+
+def test_a_goal_of_both_that_can_not_be_names_the_pair(both, home) -> None:
+    left, right = (hand_at(arm, home, 0.0)[:1] for arm in both.arms)
+    for how in (plan_together, plan_staggered):
+        with pytest.raises(OpenArmError, match=r"openarm_(left|right)_\w+ would (hit|come within)") as caught:
+            how(both, starting(both, home), BothGoals((left, right)), 2.0)
+        assert caught.value.code == Code.IN_COLLISION
+
+
+def test_separation_is_that_of_every_look(both, home) -> None:
+    state, goals = swapping(both, home)
+    whole = joined(both, plan_together(both, starting(both, state), goals, 10.0).trajectories)
+    scene = both.scene(state)
+    every = min(scene.separation(q) for q in whole.at(dense_times(whole, scene.levers, 0.004))[0])
+    assert separation(scene, whole) == pytest.approx(every, abs=1e-9)
+
+
+def test_what_an_arm_holds_keeps_away_from_the_other_arm(both, home) -> None:
+    plate = box_from("plate", (0.0, 0.0, 0.06), (0.05, 0.30, 0.02))
+    scene = both.scene(home, held=((), [plate]))
+    start = np.array([home[name] for name in both.names])
+    assert scene.separation(start) < both.scene(home).separation(start)
