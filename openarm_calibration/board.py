@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
 DICTIONARIES = ("DICT_4X4_100", "DICT_5X5_100", "DICT_6X6_100")
-_SUPERSAMPLE = 4
+#: Samples along each edge of a pixel of a picture.
+_SAMPLES = 8
 
 
 class CircleGrid(Config):
@@ -78,16 +79,31 @@ class CircleGrid(Config):
         return float(extent[0]) + 2.0 * self.border, float(extent[1]) + 2.0 * self.border
 
     def draw(self, pixels_per_metre: float) -> Pixels:
-        """Grey picture (h, w) of the plate; black circles on white."""
-        width, height = (round(edge * pixels_per_metre) for edge in self.size)
-        k = pixels_per_metre * _SUPERSAMPLE
-        image = np.full((height * _SUPERSAMPLE, width * _SUPERSAMPLE), 255, np.uint8)
-        # centres of pixels are at integers: the plate's corner is at (-0.5, -0.5)
-        centre = np.array(image.shape[::-1]) / 2.0 - 0.5
-        for x, y in self.points[:, :2] * k + centre:
-            at = (round(x * 16), round(y * 16))
-            cv2.circle(image, at, round(self.radius * k * 16), (0,), -1, cv2.LINE_AA, shift=4)
-        return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        """Grey picture (h, w) of the plate, to scale within half a pixel of its size; black circles on white."""
+        width, height = self.size
+        return self.picture(round(width * pixels_per_metre), round(height * pixels_per_metre))
+
+    def picture(self, columns: int, rows: int) -> Pixels:
+        """Grey picture (rows, columns) of exactly the plate; its pixels need not be square."""
+        width, height = self.size
+        # places of the samples on the plate, m
+        u = ((np.arange(columns * _SAMPLES) + 0.5) / (columns * _SAMPLES) - 0.5) * width
+        v = ((np.arange(rows * _SAMPLES) + 0.5) / (rows * _SAMPLES) - 0.5) * height
+        image = np.full((rows, columns), 255, np.uint8)
+        for x, y in self.points[:, :2]:
+            left, right, top, bottom = (
+                round(edge)
+                for edge in (
+                    ((x - self.radius) / width + 0.5) * columns - 1, ((x + self.radius) / width + 0.5) * columns + 1,
+                    ((y - self.radius) / height + 0.5) * rows - 1, ((y + self.radius) / height + 0.5) * rows + 1,
+                )
+            )  # fmt: skip
+            across = np.square(u[left * _SAMPLES : right * _SAMPLES] - x)
+            along = np.square(v[top * _SAMPLES : bottom * _SAMPLES] - y)
+            outside = (across[None, :] + along[:, None] > self.radius**2).astype(np.float32) * 255.0
+            shares = outside.reshape(bottom - top, _SAMPLES, right - left, _SAMPLES).mean(axis=(1, 3))
+            image[top:bottom, left:right] = np.minimum(image[top:bottom, left:right], np.rint(shares))
+        return image
 
 
 class Charuco(Config):
@@ -145,15 +161,29 @@ class Charuco(Config):
         return self.columns * self.spacing + 2.0 * self.border, self.rows * self.spacing + 2.0 * self.border
 
     def draw(self, pixels_per_metre: float) -> Pixels:
-        """Grey picture (h, w) of the plate."""
-        width, height = (round(edge * pixels_per_metre) for edge in self.size)
-        k = max(round(self.spacing * pixels_per_metre), 1)
+        """Grey picture (h, w) of the plate, to scale within half a pixel of its size."""
+        width, height = self.size
+        return self.picture(round(width * pixels_per_metre), round(height * pixels_per_metre))
+
+    def picture(self, columns: int, rows: int) -> Pixels:
+        """Grey picture (rows, columns) of exactly the plate; its pixels need not be square."""
+        width, height = self.size
+        fine = 4 if columns * rows < 5_000_000 else 2
+        # whole pixels a square here, then stretched to the samples without smoothing, then averaged
+        k = max(round(self.spacing / width * columns * fine), 70)
         squares = self.board.generateImage((self.columns * k, self.rows * k), marginSize=0)
-        edge = self.border * pixels_per_metre
-        inner = cv2.resize(squares, (width - 2 * round(edge), height - 2 * round(edge)), interpolation=cv2.INTER_AREA)
-        image = np.full((height, width), 255, np.uint8)
-        image[round(edge) : round(edge) + inner.shape[0], round(edge) : round(edge) + inner.shape[1]] = inner
-        return image
+        sx, sy = columns * fine / width, rows * fine / height
+        # sample centres: plate position of square pixel i is border + (i + 0.5) spacing / k
+        to_samples = np.array(
+            [
+                [self.spacing / k * sx, 0.0, (self.border + 0.5 * self.spacing / k) * sx - 0.5],
+                [0.0, self.spacing / k * sy, (self.border + 0.5 * self.spacing / k) * sy - 0.5],
+            ]
+        )
+        samples = cv2.warpAffine(
+            squares, to_samples, (columns * fine, rows * fine), flags=cv2.INTER_NEAREST, borderValue=(255,)
+        )
+        return cv2.resize(samples, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
 Board = CircleGrid | Charuco

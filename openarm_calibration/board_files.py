@@ -21,8 +21,9 @@ _MARGIN = 0.008  # that printers can't reach, m
 #: Of a quarter circle as a cubic curve.
 _KAPPA = 4.0 / 3.0 * (math.sqrt(2.0) - 1.0)
 _THICKNESS = 0.003
-#: Pixels of the texture of a simulated board, for a metre.
-TEXTURE_SCALE = 8000.0
+#: Edge of a simulated board's texture, pixels. A power of two: half of an odd edge is no whole number of pixels, so
+#: that the smaller copies that a renderer makes of it do not quite lie on it, and the board seems 0.06 % too large.
+TEXTURE_EDGE = 2048
 
 
 def write_board(board: Board, path: Path, dpi: int = 300) -> str:
@@ -43,7 +44,8 @@ def write_board(board: Board, path: Path, dpi: int = 300) -> str:
             path.write_bytes(pdf(board))
         else:
             texture = path.with_suffix(".png")
-            texture.write_bytes(png(board, round(TEXTURE_SCALE * 0.0254)))
+            picture = board.picture(TEXTURE_EDGE, TEXTURE_EDGE)
+            texture.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
             path.write_text(mjcf(board, texture.name), encoding="utf-8")
     except OSError as error:
         raise OpenArmError(Code.ENVIRONMENT, f"can't write {path}: {error.strerror}") from error

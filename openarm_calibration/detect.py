@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_calibration.board import Board, Charuco, CircleGrid
+from openarm_calibration.centroids import refined
 from openarm_calibration.projection import fit_poses
 from openarm_common import se3
 from openarm_common.cameras import Intrinsics
@@ -25,6 +26,8 @@ Grey = NDArray[np.uint8]
 #: A plane's image is a homography but for distortion and the eccentricity of the circles, px rms.
 MOST_RESIDUAL = 0.5
 _FEWEST_CORNERS = 8
+#: Of the circles; with more of them in wrong places it is another board.
+_LEAST_SHARE = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +77,12 @@ def _circles(board: CircleGrid, image: Grey) -> Detection:
             pixels = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
             # the resized image's pixel k covers (k + 0.5) / zoom - 0.5
             pixels = (pixels + 0.5) / zoom - 0.5
-            ordered, residual = _ordered(board, pixels)
+            ordered = _ordered(board, pixels)
             if zoom < 3 and _diameter(board, ordered) * zoom < 9.0:
                 break
-            if residual <= MOST_RESIDUAL + 0.01 * _diameter(board, ordered):
-                return Detection(np.arange(len(board.points)), ordered, residual)
+            ids, exact, residual = _refined(board, image, ordered)
+            if len(ids) >= _LEAST_SHARE * len(ordered) and residual <= MOST_RESIDUAL:
+                return Detection(ids, exact, residual)
             raise OpenArmError(
                 Code.NOTHING_DETECTED,
                 f"{len(pixels)} circles do not lie on a plane as {board.label} does: {residual:.2f} px rms, expected at"
@@ -115,8 +119,8 @@ def _diameter(board: CircleGrid, pixels: Array) -> float:
     return board.diameter * float(np.sqrt(hull / outline))
 
 
-def _ordered(board: CircleGrid, pixels: Array) -> tuple[Array, float]:
-    """The order of the marks in which they are the image of the board's front; with its residual, px rms.
+def _ordered(board: CircleGrid, pixels: Array) -> Array:
+    """The order of the marks in which they are the image of the board's front.
 
     The grid finder may start at either end. A mirrored order fits a plane as well, and is told by its chirality.
     """
@@ -129,7 +133,26 @@ def _ordered(board: CircleGrid, pixels: Array) -> tuple[Array, float]:
         residual = _homography_residual(H, board.points[:, :2], flat)
         if np.linalg.det(H[:2, :2] - np.outer(H[:2, 2], H[2, :2]) / H[2, 2]) > 0.0 and residual < least:
             best, least = flat, residual
-    return np.ascontiguousarray(best), float(least)
+    return np.ascontiguousarray(best)
+
+
+def _refined(board: CircleGrid, image: Grey, rough: Array) -> tuple[NDArray[np.int64], Array, float]:
+    """Marks by their grey values: which, where, and their residual, px rms.
+
+    A blob beside a circle is moved to where the others want it; a mark that still is off is left out.
+    """
+    plane = board.points[:, :2]
+    H, _ = cv2.findHomography(plane, rough, cv2.LMEDS)
+    if H is None:  # pyright: ignore[reportUnnecessaryComparison] - None for marks in a heap
+        return np.arange(0), rough[:0], np.inf
+    H = H.astype(np.float64)
+    wanted = _mapped(H, plane)
+    astray = np.linalg.norm(rough - wanted, axis=1) > 0.5 + 0.05 * _diameter(board, rough)
+    exact = refined(image, np.where(astray[:, None], wanted, rough), plane, board.radius, H)
+    away = np.linalg.norm(_mapped(homography(plane, exact), plane) - exact, axis=1)
+    keep = away <= 6.0 * float(np.median(away)) + 0.1
+    ids = np.flatnonzero(keep)
+    return ids, exact[keep], _homography_residual(homography(plane[keep], exact[keep]), plane[keep], exact[keep])
 
 
 def _corners(board: Charuco, image: Grey) -> Detection:
