@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `mujoco_bridge` in process: trajectories of an arm and position commands."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from control_msgs.action import FollowJointTrajectory
+from control_msgs.msg import JointTrajectoryControllerState
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from openarm_common.convert import (
+    stamp_to_ns,
+)
+from openarm_common.node import QOS_COMMAND
+
+
+def test_a25_a_trajectory_is_followed(bench) -> None:
+    feedback: list = []
+    handle, future = bench.follow(bench.goal((1.0, bench.NEAR_HOME)), feedback_callback=feedback.append)
+    assert handle.accepted
+    answer = bench.ros.result(future, 15.0)
+    assert answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result.error_string
+    assert answer.result.error_code == FollowJointTrajectory.Result.SUCCESSFUL
+    np.testing.assert_allclose(bench.arm, bench.NEAR_HOME, atol=0.02)
+    assert len(feedback) > 5
+    assert feedback[-1].feedback.joint_names == list(bench.ARM)
+    assert abs(feedback[-1].feedback.error.positions[0]) < 0.05
+
+
+def test_the_topics_of_the_trajectory_controller(bench) -> None:
+    """joint_trajectory is followed without an action; controller_state tells reference and feedback."""
+    controller = "/right_joint_trajectory_controller"
+    states = bench.collect(JointTrajectoryControllerState, f"{controller}/controller_state", 10)
+    publisher = bench.ros.node.create_publisher(JointTrajectory, f"{controller}/joint_trajectory", QOS_COMMAND)
+    bench.ros.spin_until(lambda: publisher.get_subscription_count() and states, 5.0, "the controller's topics")
+    assert states[-1].joint_names == list(bench.ARM)
+    np.testing.assert_allclose(states[-1].feedback.positions, bench.HOME, atol=0.01)
+    publisher.publish(bench.goal((1.0, [*bench.NEAR_HOME[:6], float("nan")])).trajectory)  # refused, in the log
+    publisher.publish(bench.goal((1.0, bench.NEAR_HOME)).trajectory)
+    bench.ros.spin_until(lambda: np.allclose(bench.arm, bench.NEAR_HOME, atol=0.02), 10.0, "the arm to arrive")
+    bench.ros.spin_until(
+        lambda: np.allclose(states[-1].reference.positions, bench.NEAR_HOME, atol=1e-6), 5.0, "its state"
+    )
+    np.testing.assert_allclose(states[-1].error.positions, 0.0, atol=0.02)
+    assert np.all(np.diff([stamp_to_ns(m.header.stamp) for m in states]) >= 0)
+
+
+HOME, NEAR = (-0.2, 2.2, 0.0, 1.2, 0.0, 0.0, 0.4), (-0.1, 2.1, 0.1, 1.3, 0.1, 0.1, 0.3)
+RIGHT = tuple(f"openarm_right_joint{i}" for i in range(1, 8))
+NOWHERE = float("nan")
+Result = FollowJointTrajectory.Result
+
+
+@pytest.mark.parametrize(
+    ("points", "names", "code", "text"),
+    [
+        ([(1.0, NEAR)], (*RIGHT[:6], "elbow"), Result.INVALID_JOINTS, "unknown joint 'elbow'"),
+        ([(1.0, NEAR[:6])], RIGHT[:6], Result.INVALID_JOINTS, "missing joint 'openarm_right_joint7'"),
+        ([(1.0, NEAR)], (*RIGHT[:6], RIGHT[0]), Result.INVALID_JOINTS, "duplicate joint 'openarm_right_joint1'"),
+        (
+            [(1.0, (*NEAR[:6], NOWHERE))],
+            RIGHT,
+            Result.INVALID_GOAL,
+            "position of openarm_right_joint7 at point 0 is nan",
+        ),
+        (
+            [(1.0, (*NEAR[:3], 3.0, *NEAR[4:]))],
+            RIGHT,
+            Result.INVALID_GOAL,
+            "position of openarm_right_joint4 at point 0 is 3.0000",
+        ),
+        ([], RIGHT, Result.INVALID_GOAL, "no points"),
+        ([(1.0, NEAR), (0.5, HOME)], RIGHT, Result.INVALID_GOAL, "strictly increasing"),
+    ],
+    ids=["unknown", "missing", "duplicate", "nan", "limits", "empty", "times"],
+)
+def test_p21_bad_trajectories_end_with_the_joint_and_the_value(bench, points, names, code: int, text: str) -> None:
+    _, future = bench.follow(bench.goal(*points, names=names))
+    answer = bench.ros.result(future, 5.0)
+    assert answer.status == GoalStatus.STATUS_ABORTED
+    assert answer.result.error_code == code
+    assert text in answer.result.error_string
+    assert np.abs(bench.arm - bench.HOME).max() < 0.01
+
+
+def test_p21_cancel_holds(bench) -> None:
+    handle, future = bench.follow(bench.goal((4.0, bench.NEAR_HOME)))
+    bench.spin_sim(2.0)
+    bench.ros.result(handle.cancel_goal_async())
+    assert bench.ros.result(future, 5.0).status == GoalStatus.STATUS_CANCELED
+    bench.spin_sim(0.3)
+    held = bench.arm
+    assert np.abs(held - bench.HOME).max() > 0.02
+    assert np.abs(held - bench.NEAR_HOME).max() > 0.02
+    bench.spin_sim(1.0)
+    np.testing.assert_allclose(bench.arm, held, atol=0.003)
+
+
+def test_p21_a_newer_trajectory_takes_over_and_a_bad_one_does_not(bench) -> None:
+    _, first = bench.follow(bench.goal((3.0, bench.NEAR_HOME)))
+    bench.spin_sim(0.5)
+    _, bad = bench.follow(bench.goal())
+    assert bench.ros.result(bad, 5.0).status == GoalStatus.STATUS_ABORTED
+    assert not first.done()
+    _, second = bench.follow(bench.goal((1.0, bench.HOME)))
+    assert "newer" in bench.ros.result(first, 5.0).result.error_string
+    assert bench.ros.result(second, 10.0).status == GoalStatus.STATUS_SUCCEEDED
+
+
+def test_p21_a_newer_trajectory_is_refused_where_that_is_asked_for(bridge) -> None:
+    bench = bridge(images=False, trajectory__new_goal="refuse")
+    _, first = bench.follow(bench.goal((1.5, bench.NEAR_HOME)))
+    bench.spin_sim(0.5)
+    _, second = bench.follow(bench.goal((1.0, bench.HOME)))
+    answer = bench.ros.result(second, 5.0)
+    assert answer.status == GoalStatus.STATUS_ABORTED
+    assert answer.result.error_code == FollowJointTrajectory.Result.INVALID_GOAL
+    assert "trajectory.new_goal" in answer.result.error_string
+    assert bench.ros.result(first, 10.0).status == GoalStatus.STATUS_SUCCEEDED
+    np.testing.assert_allclose(bench.arm, bench.NEAR_HOME, atol=0.02)
+    _, third = bench.follow(bench.goal((1.0, bench.HOME)))
+    assert bench.ros.result(third, 10.0).status == GoalStatus.STATUS_SUCCEEDED
+
+
+def test_a_blocked_arm_ends_with_its_tolerance_and_holds(bench) -> None:
+    below_table = bench.posture(lambda T: [*(T[:3, 3] - [0.30, -0.25, 0.30])])
+    _, future = bench.follow(bench.goal((3.0, below_table)))
+    answer = bench.ros.result(future, 20.0)
+    assert answer.status == GoalStatus.STATUS_ABORTED
+    assert answer.result.error_code == FollowJointTrajectory.Result.PATH_TOLERANCE_VIOLATED
+    assert "openarm_right_joint" in answer.result.error_string
+    bench.spin_sim(0.5)
+    assert bench.node._simulation.world.body_pose(bench.TCP)[2, 3] > 0.38
+    efforts = np.abs(bench.joints[-1].effort)
+    assert efforts.max() < 5.0  # it does not go on pushing
+
+
+# --- commands
+def test_a16_a23_b55_position_commands_may_be_partial_and_unknown_names_are_ignored(bench) -> None:
+    publisher = bench.ros.node.create_publisher(JointState, "/joint_commands", QOS_COMMAND)
+    bench.ros.spin_until(lambda: publisher.get_subscription_count(), 5.0)
+    publisher.publish(JointState(name=["openarm_right_joint4", "tail", bench.FINGER], position=[1.5, 9.0, 0.02]))
+    bench.ros.spin_until(
+        lambda: (
+            abs(bench.position("openarm_right_joint4") - 1.5) < 0.01
+            and abs(bench.position(bench.FINGER) - 0.02) < 0.001
+        ),
+        10.0,
+        "the joints to arrive",
+    )
+    assert bench.node._warned == {"tail"}
+    velocities = [m.velocity[m.name.index("openarm_right_joint4")] for m in bench.joints]
+    assert max(velocities) < 1.2 * bench.node.config.trajectory.command_velocity  # no jump
+    assert bench.position("openarm_right_joint1") == pytest.approx(bench.HOME[0], abs=0.01)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), 99.0])
+def test_bad_position_commands_are_refused_as_a_whole(bench, bad: float) -> None:
+    publisher = bench.ros.node.create_publisher(JointState, "/joint_commands", QOS_COMMAND)
+    bench.ros.spin_until(lambda: publisher.get_subscription_count(), 5.0)
+    publisher.publish(JointState(name=["openarm_right_joint4", "openarm_right_joint1"], position=[1.5, bad]))
+    bench.spin_sim(0.5)
+    assert bench.position("openarm_right_joint4") == pytest.approx(bench.HOME[3], abs=0.01)

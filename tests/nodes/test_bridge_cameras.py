@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `mujoco_bridge` in process: images, CameraInfo, depth."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+
+import numpy as np
+import pytest
+from openarm_interfaces.srv import ResetWorld
+from sensor_msgs.msg import CameraInfo, Image
+
+from openarm_common.cameras import load_cameras
+from openarm_common.convert import (
+    depth_to_metres,
+    image_to_array,
+    intrinsics_from_info,
+    stamp_to_ns,
+)
+from openarm_common.node import QOS_SENSOR
+
+
+def test_a26_a28_a30_images_info_and_joint_states_belong_together(seeing) -> None:
+    colour = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
+    depth = seeing.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
+    infos = seeing.collect(CameraInfo, "/overhead/color/camera_info", QOS_SENSOR)
+    depth_infos = seeing.collect(CameraInfo, "/overhead/depth/camera_info", QOS_SENSOR)
+    seeing.ros.spin_until(lambda: len(colour) > 30 and len(depth) > 30, 20.0, "images")
+    image, info = colour[-1], infos[-1]
+    assert (image.width, image.height, image.encoding, image.header.frame_id) == (
+        640,
+        480,
+        "rgb8",
+        "overhead_color_optical_frame",
+    )
+    assert (depth[-1].encoding, depth[-1].header.frame_id) == ("16UC1", "overhead_color_optical_frame")
+    assert info.k[4] == pytest.approx(240.0 / math.tan(math.radians(30.0)), abs=1e-6)
+    assert info.k[0] == info.k[4]
+    assert (info.k[2], info.k[5]) == (319.5, 239.5)
+    assert list(info.k) == list(depth_infos[-1].k)
+    # Best effort: a starved probe may miss the info of one image or another, but stamps that are near are equal.
+    images, told, ticks = (
+        np.array([stamp_to_ns(m.header.stamp) for m in got]) for got in (colour + depth, infos, seeing.joints)
+    )
+    assert np.isin(images, ticks).sum() > 10
+    assert np.all(images % 10_000_000 == 0)  # of a tick
+    seeing.ros.spin_until(
+        lambda: len({stamp_to_ns(m.header.stamp) for m in colour} & {stamp_to_ns(m.header.stamp) for m in infos}) > 5,
+        20.0,
+        "infos with the stamps of images",
+    )
+    distance = np.abs(images[:, None] - told).min(axis=1)
+    assert np.all((distance == 0) | (distance >= 30_000_000))
+    pixels, z = image_to_array(image), depth_to_metres(depth[-1])
+    assert pixels.std() > 10.0
+    # The table top, seen by a camera whose mount is nominal: planar depth of a plane.
+    T = load_cameras()["overhead"].T_parent_optical
+    v, u = np.array([430, 430, 460]), np.array([320, 100, 550])
+    rays = intrinsics_from_info(info)
+    points = rays.deproject(np.stack([u, v], axis=-1), z[v, u].astype(float))
+    heights = (points @ T[:3, :3].T + T[:3, 3])[:, 2]
+    np.testing.assert_allclose(heights, 0.40, atol=1e-3)
+
+
+def test_p24_cameras_without_subscribers_draw_nothing(seeing) -> None:
+    seeing.spin_sim(0.5)
+    assert not any(seeing.node._images.rendered.values())
+    subscription = seeing.ros.node.create_subscription(Image, "/wrist/color/image_raw", lambda _m: None, QOS_SENSOR)
+    seeing.ros.spin_until(lambda: seeing.node._images.rendered["wrist"] > 3, 15.0, "wrist images")
+    assert seeing.node._images.rendered["overhead"] == 0
+    seeing.ros.node.destroy_subscription(subscription)
+    seeing.spin_sim(0.8)
+    drawn = seeing.node._images.rendered["wrist"]
+    seeing.spin_sim(0.5)
+    assert seeing.node._images.rendered["wrist"] == drawn
+
+
+def test_camera_info_alone_needs_no_drawing(seeing) -> None:
+    infos = seeing.collect(CameraInfo, "/wrist/depth/camera_info", QOS_SENSOR)
+    seeing.ros.spin_until(lambda: len(infos) > 10, 5.0, "camera info")
+    assert infos[-1].header.frame_id == "wrist_color_optical_frame"
+    assert not any(seeing.node._images.rendered.values())
+
+
+def test_images_come_again_after_their_process_was_killed(seeing) -> None:
+    images = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
+    seeing.ros.spin_until(lambda: len(images) > 3, 20.0, "images")
+    feed, before = seeing.node._images, seeing.t_ns
+    os.kill(feed.pid, signal.SIGKILL)
+    seeing.ros.spin_until(lambda: "code -9" in feed.fault, 5.0, "its death to be told")
+    n = len(images)
+    seeing.ros.spin_until(lambda: len(images) > n + 3, 20.0, "images again")
+    seeing.ros.spin_until(lambda: feed.fault == "", 5.0, "the fault to be over")
+    stamps = [stamp_to_ns(m.header.stamp) for m in seeing.joints if stamp_to_ns(m.header.stamp) > before]
+    assert np.diff(stamps).max() < 300_000_000  # the robot went on meanwhile; a starved probe may miss some
+
+
+def test_the_drawn_world_is_the_one_that_was_loaded(seeing) -> None:
+    images = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
+    seeing.ros.spin_until(lambda: len(images) > 3, 20.0, "images")
+
+    def red() -> int:
+        pixels = image_to_array(images[-1]).astype(int)
+        return int(((pixels[..., 0] > 120) & (pixels[..., 1] < 60) & (pixels[..., 2] < 60)).sum())
+
+    assert red() > 100
+    assert seeing.call(ResetWorld, "/sim/reset_world", scene="empty").success
+    seeing.ros.spin_until(lambda: red() == 0, 5.0, "an image without the cube")
+
+
+def test_a47_depth_in_metres_by_parameter(bridge) -> None:
+    bench = bridge(depth_encoding="32FC1", scene="empty")
+    depth = bench.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
+    bench.ros.spin_until(lambda: depth, 20.0, "a depth image")
+    assert depth[-1].encoding == "32FC1"
+    assert np.nanmedian(depth_to_metres(depth[-1])) == pytest.approx(0.8, abs=0.2)
+
+
+def test_a52_noisy_depth_by_parameter(bridge) -> None:
+    bench = bridge(depth_noise__enabled=True, scene="empty")
+    depth = bench.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
+    bench.ros.spin_until(lambda: len(depth) > 1, 20.0, "depth images")
+    z = depth_to_metres(depth[-1])[400:440, 300:340]
+    columns = z - np.nanmean(z, axis=1, keepdims=True)  # the table is level along a row
+    fx = load_cameras()["overhead"].intrinsics.fx
+    assert np.nanstd(columns) == pytest.approx(np.nanmean(z) ** 2 * 0.08 / (fx * 0.05), rel=0.2)

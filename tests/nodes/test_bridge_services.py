@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `mujoco_bridge` in process: reset, pause, step, spawn."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, Vector3
+from openarm_interfaces.msg import ObjectStateArray
+from openarm_interfaces.srv import ResetWorld, SetPause, SpawnObject, StepSimulation
+from sensor_msgs.msg import JointState
+
+from openarm_common.convert import (
+    stamp_to_ns,
+)
+from openarm_common.node import QOS_COMMAND
+
+
+def test_p25_pause_and_step(bench) -> None:
+    assert not bench.call(StepSimulation, "/sim/step", steps=5).success  # it runs
+    assert bench.call(SetPause, "/sim/set_pause", paused=True).success
+    bench.ros.spin_until(
+        lambda: len(bench.joints) > 2 and bench.joints[-1].header.stamp == bench.joints[-2].header.stamp,
+        5.0,
+        "time to stand",
+    )
+    before = bench.t_ns
+    n = len(bench.joints)
+    bench.ros.spin_until(lambda: len(bench.joints) >= n + 3, 5.0, "signs of life")
+    assert bench.t_ns == before
+    answer = bench.call(StepSimulation, "/sim/step", steps=203)
+    assert answer.success, answer.message
+    bench.ros.spin_until(lambda: bench.t_ns == before + 203 * 2_000_000, 5.0, "203 steps of 2 ms")
+    assert not bench.call(StepSimulation, "/sim/step", steps=0).success
+    assert bench.call(SetPause, "/sim/set_pause", paused=False).success
+    bench.spin_sim(0.2)
+
+
+def test_p25_reset_puts_the_robot_back_and_aborts_what_runs(bench) -> None:
+    _, future = bench.follow(bench.goal((3.0, bench.NEAR_HOME)))
+    bench.spin_sim(1.5)
+    before, began = bench.t_ns, time.monotonic()
+    answer = bench.call(ResetWorld, "/sim/reset_world")
+    assert time.monotonic() - began < 0.5
+    assert answer.success
+    assert "reset" in bench.ros.result(future, 5.0).result.error_string
+    bench.spin_sim(0.3)
+    assert bench.t_ns > before
+    np.testing.assert_allclose(bench.arm, bench.HOME, atol=0.01)
+    stamps = np.array([stamp_to_ns(m.header.stamp) for m in bench.joints])
+    assert np.all(np.diff(stamps) > 0)
+
+
+def test_a_diverged_world_takes_no_command_until_it_is_reset(bench, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a file there
+    simulation = bench.node._simulation
+    monkeypatch.setattr(simulation, "_dump_folder", tmp_path)
+    got = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    _, running = bench.follow(bench.goal((3.0, bench.NEAR_HOME)))
+    bench.spin_sim(0.3)
+    simulation.call(lambda: simulation.world.data.qvel.fill(np.nan))
+    answer = bench.ros.result(running, 5.0)
+    assert answer.status == GoalStatus.STATUS_ABORTED
+    assert "diverged" in answer.result.error_string
+    assert "The last second is in" in answer.result.error_string
+    _, refused = bench.follow(bench.goal((1.0, bench.NEAR_HOME)))
+    assert "until the world is reset" in bench.ros.result(refused, 5.0).result.error_string
+    assert not bench.send_grip(JointState(name=[bench.FINGER], position=[0.02]))[0].accepted
+    bench.ros.spin_until(lambda: any("diverged" in s.message for m in got for s in m.status), 5.0, "/diagnostics")
+    assert bench.call(ResetWorld, "/sim/reset_world").success
+    assert bench.grip(0.02).result.reached_goal
+
+
+def test_p25_another_scene_is_loaded_while_time_goes_on(bench) -> None:
+    got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
+    answer = bench.call(ResetWorld, "/sim/reset_world", scene="random", seed=7)
+    assert answer.success, answer.message
+    bench.ros.spin_until(
+        lambda: got and got[-1].objects and got[-1].objects[0].name != "red_cube", 5.0, "the new objects"
+    )
+    names = [o.name for o in got[-1].objects]
+    bad = bench.call(ResetWorld, "/sim/reset_world", scene="nowhere")
+    assert not bad.success
+    assert "SCENE_INVALID" in bad.message
+    assert "demo" in bad.message
+    n = len(got)
+    bench.ros.spin_until(lambda: len(got) > n + 2, 5.0)
+    assert [o.name for o in got[-1].objects] == names
+
+
+def test_b16_spawn_adds_an_object_on_the_table_and_names_what_is_wrong(bench) -> None:
+    got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
+    size, pose = Vector3(x=0.04, y=0.04, z=0.04), PoseStamped()
+    pose.pose.position.x, pose.pose.position.y = 0.4, 0.0
+    assert bench.call(
+        SpawnObject, "/sim/spawn_object", name="extra", shape="box", size=size, color="purple", pose=pose
+    ).success
+    bench.ros.spin_until(lambda: any(o.name == "extra" for m in got for o in m.objects), 5.0, "the object")
+    extra = next(o for o in got[-1].objects if o.name == "extra")
+    assert extra.pose.position.z == pytest.approx(0.42, abs=0.002)
+    for change, text in (
+        ({"name": "extra"}, "already"),
+        ({"name": "other"}, "overlap"),
+        ({"name": "other", "shape": "cone"}, "box, cylinder"),
+        ({"name": "other", "color": "pink"}, "red"),
+    ):
+        answer = bench.call(
+            SpawnObject,
+            "/sim/spawn_object",
+            **({"shape": "box", "size": size, "color": "orange", "pose": pose} | change),
+        )
+        assert not answer.success, change
+        assert text in answer.message
+    assert bench.call(ResetWorld, "/sim/reset_world").success
+    n = len(got)
+    bench.ros.spin_until(lambda: len(got) > n + 3, 5.0)
+    assert all(o.name != "extra" for o in got[-1].objects)

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node `mujoco_bridge` in process: names, types, QoS, rates, frames, diagnostics, and how its process ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Duration
+from control_msgs.action import FollowJointTrajectory
+from diagnostic_msgs.msg import DiagnosticArray
+from openarm_interfaces.msg import ObjectStateArray
+from rclpy.action import ActionClient
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import Float64, String
+from tf2_msgs.msg import TFMessage
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from openarm_common.convert import (
+    stamp_to_ns,
+    transform_to_matrix,
+)
+from openarm_common.description import RobotDescription
+from openarm_common.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF, QOS_TF
+
+
+def test_a15_a16_a17_names_types_and_qos(seeing) -> None:
+    node = seeing.ros.node
+    assert "mujoco_bridge" in node.get_node_names()
+    seeing.ros.spin_until(lambda: node.count_publishers("/spectator/color/image_raw"), 5.0, "the cameras' node")
+    seeing.spin_sim(0.5)  # and the rest of its topics
+    offered = {
+        "/clock": ("rosgraph_msgs/msg/Clock", False, False),
+        "/joint_states": ("sensor_msgs/msg/JointState", True, False),
+        "/robot_description": ("std_msgs/msg/String", True, True),
+        "/tf": ("tf2_msgs/msg/TFMessage", True, False),
+        "/tf_static": ("tf2_msgs/msg/TFMessage", True, True),
+        "/overhead/color/image_raw": ("sensor_msgs/msg/Image", False, False),
+        "/overhead/color/camera_info": ("sensor_msgs/msg/CameraInfo", False, False),
+        "/overhead/depth/image_raw": ("sensor_msgs/msg/Image", False, False),
+        "/overhead/depth/camera_info": ("sensor_msgs/msg/CameraInfo", False, False),
+        "/wrist/color/image_raw": ("sensor_msgs/msg/Image", False, False),
+        "/wrist/depth/image_raw": ("sensor_msgs/msg/Image", False, False),
+        "/spectator/color/image_raw": ("sensor_msgs/msg/Image", False, False),
+        "/sim/ground_truth/objects": ("openarm_interfaces/msg/ObjectStateArray", True, False),
+        "/sim/real_time_factor": ("std_msgs/msg/Float64", True, False),
+        "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", True, False),
+    }
+    for topic, (kind, is_reliable, latched) in offered.items():
+        owner = "mujoco_cameras" if topic.startswith(("/overhead", "/wrist", "/spectator")) else "mujoco_bridge"
+        (info,) = [i for i in node.get_publishers_info_by_topic(topic) if i.node_name == owner]
+        assert info.topic_type == kind, topic
+        assert (info.qos_profile.reliability == ReliabilityPolicy.RELIABLE) == is_reliable, topic
+        assert (info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL) == latched, topic
+    (commands,) = node.get_subscriptions_info_by_topic("/joint_commands")
+    assert commands.topic_type == "sensor_msgs/msg/JointState"
+    assert commands.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    assert QOS_COMMAND.depth == 10
+    services = dict(node.get_service_names_and_types())
+    for name, kind in (
+        ("reset_world", "ResetWorld"),
+        ("set_pause", "SetPause"),
+        ("step", "StepSimulation"),
+        ("spawn_object", "SpawnObject"),
+    ):
+        assert services[f"/sim/{name}"] == [f"openarm_interfaces/srv/{kind}"]
+    assert seeing.joints[0].name == [
+        f"openarm_{s}_{j}" for s in ("left", "right") for j in (*(f"joint{i}" for i in range(1, 8)), "finger_joint1")
+    ]
+    np.testing.assert_allclose(seeing.arm, seeing.HOME, atol=0.01)
+
+
+def test_a18_a19_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
+    factors = bench.collect(Float64, "/sim/real_time_factor", 5)
+    clocks = bench.collect(Clock, "/clock", QOS_CLOCK)
+    bench.spin_sim(1.0)  # discovery is over
+    first, wall = bench.t_ns, time.monotonic()
+    bench.spin_sim(3.0)
+    ratio = (bench.t_ns - first) * 1e-9 / (time.monotonic() - wall)
+    assert ratio == pytest.approx(1.0, abs=0.1)
+    steps = np.diff([stamp_to_ns(m.header.stamp) for m in bench.joints])
+    assert np.mean(steps == 10_000_000) > 0.98  # a tick each; a starved probe may miss some
+    assert np.all(steps % 10_000_000 == 0)
+    assert np.all(steps > 0)
+    assert factors
+    assert factors[-1].data == pytest.approx(1.0, abs=0.1)
+    assert len(clocks) > 300
+    assert np.median(np.diff(bench.joint_arrivals[-300:])) == pytest.approx(0.01, abs=0.0015)
+
+
+def test_a73_the_tree_of_frames_is_complete_and_has_no_gaps(bench) -> None:
+    static = bench.collect(TFMessage, "/tf_static", QOS_STATIC_TF)
+    moving = bench.collect(TFMessage, "/tf", QOS_TF)
+    bench.ros.spin_until(lambda: static, 5.0, "/tf_static")
+    bench.spin_sim(1.0)
+    parents = {t.child_frame_id: t.header.frame_id for m in static + moving for t in m.transforms}
+    description = RobotDescription.load()
+    assert {j.child: j.parent for j in description.joints.values()}.items() <= parents.items()
+    for alias, parent in (
+        ("base_link", "openarm_body_link0"),
+        ("left_arm_base", "openarm_left_link0"),
+        ("right_arm_base", "openarm_right_link0"),
+        ("table", "openarm_body_link0"),
+    ):
+        assert parents[alias] == parent
+    assert set(parents.values()) - set(parents) == {"world"}  # one root
+    stamps = np.array([stamp_to_ns(m.transforms[0].header.stamp) for m in moving]) * 1e-9
+    assert np.diff(stamps).max() <= 0.1
+    assert len(stamps) / (stamps[-1] - stamps[0]) == pytest.approx(50.0, rel=0.05)
+    by_stamp = {stamp_to_ns(m.header.stamp): m for m in bench.joints}
+    last = next(m for m in reversed(moving) if stamp_to_ns(m.transforms[0].header.stamp) in by_stamp)
+    state = by_stamp[stamp_to_ns(last.transforms[0].header.stamp)]
+    poses = description.link_poses(dict(zip(state.name, state.position, strict=True)))
+    for t in last.transforms:
+        T = np.linalg.inv(poses[t.header.frame_id]) @ poses[t.child_frame_id]
+        np.testing.assert_allclose(transform_to_matrix(t.transform), T, atol=1e-9)
+
+
+def test_robot_description_is_latched(bench) -> None:
+    got = bench.collect(String, "/robot_description", QOS_LATCHED)
+    bench.ros.spin_until(lambda: got, 5.0, "/robot_description")
+    assert got[0].data == RobotDescription.load().urdf
+
+
+def test_ground_truth_is_the_only_outlet_of_object_poses(bench) -> None:
+    got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
+    bench.ros.spin_until(lambda: len(got) > 10, 5.0, "ground truth")
+    assert got[-1].header.frame_id == "world"
+    cube = next(o for o in got[-1].objects if o.name == "red_cube")
+    assert (cube.label, cube.size.x) == ("red", 0.05)
+    assert cube.pose.position.z == pytest.approx(0.425, abs=0.001)
+    stamps = np.array([stamp_to_ns(m.header.stamp) for m in got]) * 1e-9
+    assert np.diff(stamps).mean() == pytest.approx(0.05, abs=0.005)
+    kinds = dict(bench.ros.node.get_topic_names_and_types())
+    assert [t for t, k in kinds.items() if "openarm_interfaces/msg/ObjectStateArray" in k] == [
+        "/sim/ground_truth/objects"
+    ]
+
+
+def test_diagnostics_tell_how_well_it_keeps_up(seeing) -> None:
+    got = seeing.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    seeing.ros.spin_until(lambda: any(s.message == "running" for m in got for s in m.status), 5.0, "a status")
+    values = {v.key: v.value for s in got[-1].status for v in s.values}
+    assert {
+        "real_time_factor",
+        "joint_state_period_p99_ms",
+        "joint_state_period_max_ms",
+        "frames_overhead",
+        "frames_wrist",
+    } <= set(values)
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_p34_a_signal_ends_the_process_in_order(ros, stop: signal.Signals) -> None:
+    """With cameras on and a trajectory under way: no error is told, and the exit code is 0."""
+    joints: list[JointState] = []
+    images: list[Image] = []
+    ros.node.create_subscription(JointState, "/joint_states", joints.append, QOS_COMMAND)
+    ros.node.create_subscription(Image, "/overhead/color/image_raw", images.append, QOS_SENSOR)
+    client = ActionClient(ros.node, FollowJointTrajectory, "/right_joint_trajectory_controller/follow_joint_trajectory")
+    command = [sys.executable, "-m", "openarm_sim_bridge.node", "--ros-args", "-p", "scene:=empty"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
+        try:
+            ros.spin_until(lambda: joints and images, 30.0, "joint states and images of the process")
+            names = [name for name in joints[-1].name if name.startswith("openarm_right_joint")]
+            away = JointTrajectoryPoint(positions=[-0.1, 2.1, 0.1, 1.3, 0.1, 0.1, 0.3], time_from_start=Duration(sec=5))
+            trajectory = JointTrajectory(joint_names=names, points=[away])
+            handle, _ = ros.send_goal(client, FollowJointTrajectory.Goal(trajectory=trajectory))
+            assert handle.accepted
+            process.send_signal(stop)
+            _, errors = process.communicate(timeout=10.0)
+        finally:
+            process.kill()
+    assert process.returncode == 0
+    assert "Traceback" not in errors, errors
+    assert "rror" not in errors, errors

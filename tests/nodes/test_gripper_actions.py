@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two types of gripper_cmd: what the bridge serves and what the grasp node asks for go by the same parameter."""
+
+from __future__ import annotations
+
+import pytest
+from action_msgs.msg import GoalStatus
+from control_msgs.action import GripperCommand
+from control_msgs.msg import GripperCommand as Command
+from rclpy.action import ActionClient, get_action_names_and_types
+from rclpy.parameter import Parameter
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.node import GraspNode
+
+NAME = "/right_gripper_controller/gripper_cmd"
+TYPES = {"parallel": "ParallelGripperCommand", "classic": "GripperCommand"}
+
+
+def client_of(bench) -> ActionClient:
+    return ActionClient(bench.ros.node, GripperCommand, NAME)
+
+
+@pytest.mark.parametrize("position", [0.005, 0.035, 0.025])
+def test_p22_the_classic_action_reaches_the_real_joint(bridge, position: float) -> None:
+    bench = bridge(images=False, gripper_action="classic")
+    goal = GripperCommand.Goal(command=Command(position=position, max_effort=10.0))
+    handle, future = bench.ros.send_goal(client_of(bench), goal)
+    assert handle.accepted
+    answer = bench.ros.result(future, 15.0)
+    assert answer.status == GoalStatus.STATUS_SUCCEEDED
+    assert (answer.result.reached_goal, answer.result.stalled) == (True, False)
+    assert answer.result.position == pytest.approx(position, abs=0.001)
+    assert bench.position(bench.FINGER) == pytest.approx(position, abs=0.001)
+    bad, _ = bench.ros.send_goal(client_of(bench), GripperCommand.Goal(command=Command(position=0.2)))
+    assert not bad.accepted
+
+
+@pytest.mark.parametrize("action", TYPES)
+def test_the_grasp_node_speaks_the_type_that_the_bridge_serves(bridge, action: str) -> None:
+    bench = bridge(images=False, gripper_action=action)
+    ros = bench.ros
+    overrides = [Parameter("gripper_action", value=action)]
+    grasp = ros.add(GraspNode(parameter_overrides=overrides))
+    faults: list[OpenArmError] = []
+
+    async def grip() -> bool:
+        try:
+            await grasp._executor._link.begin(list)
+            return await grasp._executor.grip("right", bench.FINGER, 0.03, "open")
+        except OpenArmError as error:  # one that left the task would end the executor
+            faults.append(error)
+            return False
+
+    assert ros.result(ros.executor.create_task(grip), 20.0), faults
+    assert bench.position(bench.FINGER) == pytest.approx(0.03, abs=0.001)
+    assert dict(get_action_names_and_types(ros.node))[NAME] == [f"control_msgs/action/{TYPES[action]}"]
+
+
+def test_a_wrong_type_is_refused_by_name(ros) -> None:
+    with pytest.raises(OpenArmError, match=r"gripper_action.*'parallel' or 'classic'") as caught:
+        GraspNode(parameter_overrides=[Parameter("gripper_action", value="suction")])
+    assert caught.value.code is Code.CONFIG_INVALID
