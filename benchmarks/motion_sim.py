@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans executed in MuJoCo, judged by its contacts with the robot itself, the table and obstacles (N-11, N-12).
+
+    python -m benchmarks.motion_sim [--plans 1000] [--both 200] [--blind 20] [--first-seed 1000]
+        [--runs FILE] [--json PATH]
+
+Core and physics in one process, without DDS and faster than real time. Each scene is drawn from its seed: a table with
+boxes on it and in the air, ten plans one after the other from wherever the arm stands. Trajectories go through the
+bridge's own follower to the actuators; contacts are looked at after every step of the physics, the distance of the arms
+ten milliseconds apart. The planner knows the boxes' sizes and poses and nothing of the judge. What is done already
+(`--runs`, a line a scene) is not done again, so the command goes on where it was stopped. `--blind` plans know nothing
+of the boxes in the air: they show that the judge sees contacts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.motion_problems import around_box, random_free, table_boxes
+from benchmarks.report import Row, write_report
+from openarm_common import se3
+from openarm_common.cameras import load_cameras
+from openarm_common.description import RobotDescription
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.housings import with_housings
+from openarm_common.scene import load_scene
+from openarm_motion import moves
+from openarm_motion.arm import Arm, Situation
+from openarm_motion.both import BothArms
+from openarm_motion.collision import Box, box_from
+from openarm_motion.config import MotionConfig
+from openarm_motion.together import BothGoals, plan_staggered, plan_together
+from openarm_motion.trajectory import Trajectory
+from openarm_sim_bridge.actuation import TrajectoryConfig, TrajectoryOutcome
+from openarm_sim_bridge.controller import RobotController
+from openarm_sim_bridge.gripper import GripperConfig
+from openarm_sim_bridge.model import PhysicsConfig, build_spec
+from openarm_sim_bridge.stage import Stage
+from openarm_sim_bridge.trajectory import Trajectory as Commanded
+from openarm_sim_bridge.world import World
+
+Array = NDArray[np.float64]
+
+#: Plans of one scene.
+_A_SCENE = 10
+#: Goals that are drawn for one plan before the scene is given up.
+_DRAWS = 40
+#: Distances of the arms are looked for up to here, m.
+_FAR = 0.3
+#: Faults of a request that make another goal be drawn: drawn goals may well be out of reach or blocked.
+_REFUSED = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN, Code.LIMITS)
+
+
+@dataclass
+class Seen:
+    """What the judge saw of one plan."""
+
+    kind: str
+    code: str = "OK"
+    contacts: list[str] = field(default_factory=list)
+    separation: float = _FAR
+    duration: float = 0.0
+    planning: float = 0.0
+    refused: int = 0
+
+
+class Stand:
+    """The simulated robot among boxes, and who moves it."""
+
+    def __init__(self, description: RobotDescription, boxes: tuple[Box, ...]) -> None:
+        scene = load_scene("empty")
+        stage = Stage(description, {}, None, PhysicsConfig())
+        spec = build_spec(description, scene, {}, None, PhysicsConfig())
+        for box in boxes:
+            quaternion = np.roll(se3.quat_xyzw_from_matrix(box.T[:3, :3]), 1)
+            spec.worldbody.add_geom(
+                name=box.id, type=mujoco.mjtGeom.mjGEOM_BOX, size=box.size / 2, pos=box.T[:3, 3], quat=quaternion
+            )
+        self.world = World(spec, joint_names=stage.joint_names, home=stage.home)
+        self._controller = RobotController(
+            stage.arms(), stage.grippers(), self.world, TrajectoryConfig(), GripperConfig()
+        )
+        self._geoms = [
+            [
+                g
+                for g in range(self.world.model.ngeom)
+                if self._body(g).startswith(f"openarm_{side}_") and self._solid(g)
+            ]
+            for side in ("left", "right")
+        ]
+        #: Pairs that touch before anything has moved, for example closed fingers.
+        self._usual = set(self._touching())
+
+    def state(self) -> dict[str, float]:
+        """Joints by name."""
+        return dict(zip(self.world.joint_names, self.world.read_joints().position.tolist(), strict=True))
+
+    def run(self, parts: Mapping[str, Trajectory], seen: Seen, *, distances: bool) -> None:
+        """Execute trajectories, one an arm, begun at the same moment."""
+        world, outcomes = self.world, dict[str, TrajectoryOutcome]()
+        for side, part in parts.items():
+            follower = self._controller.arms[side]
+            order = [world.joint_names.index(name) for name in follower.group.names]
+            command = follower.check(Commanded(part.names, part.t, part.q, part.v, part.a))
+            measured = world.read_joints().position[order]
+            follower.start(command, world.t_ns, measured, lambda outcome, side=side: outcomes.update({side: outcome}))
+        contacts: set[str] = set()
+        while len(outcomes) < len(parts):
+            world.set_targets(self._controller.update(world.read_joints(), world.period_ns))
+            for _ in range(world.steps_per_tick):
+                world.step(1)
+                contacts |= set(self._touching()) - self._usual
+            if distances:
+                seen.separation = min(seen.separation, self._separation(seen.separation))
+        seen.contacts = sorted(contacts)
+        faults = [outcome.text for outcome in outcomes.values() if outcome.result != 0]
+        if faults:
+            seen.code = f"EXECUTION_FAILED: {faults[0]}"
+
+    def _touching(self) -> Iterator[str]:
+        data = self.world.data
+        for contact in data.contact[: data.ncon]:
+            if contact.dist < 0.0:
+                yield " - ".join(sorted(self._name(int(g)) for g in (contact.geom1, contact.geom2)))
+
+    def _separation(self, limit: float) -> float:
+        model, data = self.world.model, self.world.data
+        for a in self._geoms[0]:
+            for b in self._geoms[1]:
+                far = float(np.linalg.norm(data.geom_xpos[a] - data.geom_xpos[b]))
+                if far - model.geom_rbound[a] - model.geom_rbound[b] < limit:
+                    limit = min(limit, mujoco.mj_geomDistance(model, data, a, b, limit, None))
+        return limit
+
+    def _solid(self, geom: int) -> bool:
+        return bool(self.world.model.geom_contype[geom] or self.world.model.geom_conaffinity[geom])
+
+    def _body(self, geom: int) -> str:
+        return self.world.model.body(int(self.world.model.geom_bodyid[geom])).name
+
+    def _name(self, geom: int) -> str:
+        body = self._body(geom)
+        return self.world.model.geom(geom).name or "nameless" if body == "world" else body
+
+
+def scene_boxes(arms: Mapping[str, Arm], home: Mapping[str, float], rng: np.random.Generator) -> tuple[Box, ...]:
+    """Boxes on the table and in the air, none of them at the robot's home."""
+    boxes = list(table_boxes(rng, 5))
+    for i in range(2):
+        place, size = rng.uniform([0.25, -0.5, 0.55], [0.65, 0.5, 0.95]), rng.uniform(0.05, 0.15, 3)
+        boxes.append(box_from(f"air{i}", place, size, se3.rot_z(float(rng.uniform(-3.0, 3.0)))))
+    free: list[Box] = []
+    for box in boxes:
+        starts = [(arm, np.array([home[name] for name in arm.names])) for arm in arms.values()]
+        if not any(arm.scene(home, [box]).collides(q) for arm, q in starts):
+            free.append(box)
+    return tuple(free)
+
+
+def single(
+    arm: Arm, state: dict[str, float], boxes: tuple[Box, ...], rng: np.random.Generator
+) -> tuple[str, Trajectory]:
+    """One random plan: to joints, to a pose beside a box, or along a line."""
+    now = arm.situation(state, scale=float(rng.choice([0.3, 0.5, 1.0])))
+    around, kind = moves.Around(boxes), str(rng.choice(["joints", "joints", "pose", "pose", "line"]))
+    if kind == "joints":
+        collides = arm.scene(state, boxes).collides
+        return kind, moves.to_joints(arm, now, random_free(arm, rng, collides).tolist(), around)
+    if kind == "pose":
+        collides = arm.scene(state, boxes).collides
+        found = around_box(arm, boxes[int(rng.integers(len(boxes)))], rng, collides, 1)
+        if not found:
+            raise OpenArmError(Code.UNREACHABLE, "no free pose beside that box")
+        return kind, moves.to_pose(arm, now, arm.kinematics.fk(found[0]), around)
+    pose = arm.kinematics.fk(now.start)
+    pose[:3, 3] += rng.uniform(-0.15, 0.15, 3)
+    return kind, moves.to_pose_on_line(arm, now, pose, around)
+
+
+def run_blind(
+    arms: Mapping[str, Arm], description: RobotDescription, home: Mapping[str, float], seed: int
+) -> list[Seen]:
+    """As `run_single`, without the boxes in the planner's eyes."""
+    return run_single(arms, description, home, seed, blind=True)
+
+
+def run_single(
+    arms: Mapping[str, Arm], description: RobotDescription, home: Mapping[str, float], seed: int, *, blind: bool = False
+) -> list[Seen]:
+    """The plans of one scene, the arms in turns."""
+    rng = np.random.default_rng(seed)
+    boxes = scene_boxes(arms, home, rng)
+    known = tuple(box for box in boxes if not (blind and box.id.startswith("air")))
+    stand, out = Stand(description, boxes), list[Seen]()
+    for k in range(_A_SCENE):
+        arm, refused = list(arms.values())[k % 2], 0
+        while refused < _DRAWS:
+            begin = time.perf_counter()
+            try:
+                kind, plan = single(arm, stand.state(), known, rng)
+            except OpenArmError as error:
+                if error.code not in _REFUSED:
+                    raise
+                refused += 1
+                continue
+            seen = Seen(kind, planning=time.perf_counter() - begin, duration=plan.duration, refused=refused)
+            stand.run({arm.name: plan}, seen, distances=False)
+            out.append(seen)
+            break
+    return out
+
+
+def run_both(
+    arms: Mapping[str, Arm], description: RobotDescription, home: Mapping[str, float], seed: int
+) -> list[Seen]:
+    """Plans of both arms of one scene, together and staggered in turns."""
+    rng = np.random.default_rng(seed)
+    boxes = scene_boxes(arms, home, rng)
+    stand, both, out = Stand(description, boxes), BothArms(arms["left"], arms["right"]), list[Seen]()
+    for k in range(_A_SCENE):
+        refused = 0
+        while refused < _DRAWS:
+            state = stand.state()
+            begin = time.perf_counter()
+            goals = tuple(middle_goals(arm, state, boxes, rng) for arm in both.arms)
+            now = Situation(state, np.array([state[name] for name in both.names]), float(rng.choice([0.3, 0.5, 1.0])))
+            how = plan_staggered if k % 2 else plan_together
+            try:
+                plan = how(both, now, BothGoals((goals[0], goals[1]), boxes), 2.0)
+            except OpenArmError as error:
+                if error.code not in _REFUSED:
+                    raise
+                refused += 1
+                continue
+            seen = Seen(how.__name__, planning=time.perf_counter() - begin, refused=refused)
+            seen.duration = max(part.duration for part in plan.trajectories)
+            stand.run(dict(zip(("left", "right"), plan.trajectories, strict=True)), seen, distances=True)
+            out.append(seen)
+            break
+    return out
+
+
+def middle_goals(arm: Arm, state: dict[str, float], boxes: tuple[Box, ...], rng: np.random.Generator) -> Array:
+    """Configurations with the hand in the space that both arms share, where it is free of the boxes."""
+    alone = {**state, **dict.fromkeys((n for n in state if arm.name not in n), 0.0)}
+    collides = arm.scene(alone, boxes).collides
+    for _ in range(_DRAWS):
+        R = se3.rot_z(float(rng.uniform(-3.0, 3.0))) @ se3.rot_x(float(np.pi - rng.uniform(0.0, 1.2)))
+        pose = se3.make(R, rng.uniform([0.20, -0.25, 0.50], [0.45, 0.25, 0.85]))
+        found = [s.q for s in arm.inverse.solutions(pose, arm.config.planning.joint_margin) if not collides(s.q)]
+        if found:
+            return np.array([found[i] for i in rng.permutation(len(found))[:6]])
+    return random_free(arm, rng, collides)[None]
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--plans", type=int, default=1000, help="plans of one arm")
+    parser.add_argument("--both", type=int, default=200, help="plans of both arms")
+    parser.add_argument("--blind", type=int, default=20, help="plans that know nothing of the boxes in the air")
+    parser.add_argument("--first-seed", type=int, default=1000)
+    parser.add_argument("--runs", type=Path, default=Path("runs/motion_sim.jsonl"), help="a line a scene; continued")
+    parser.add_argument("--json", type=Path, default=None)
+    args = parser.parse_args()
+    plain = RobotDescription.load()
+    home = {n: q for side in ("left", "right") for n, q in plain.group_state(f"{side}_arm", "home").items()}
+    home |= {plain.finger_joint("left"): 0.0, plain.finger_joint("right"): 0.0}
+    table = load_scene("empty").table
+    static = [box_from("table", (*table.centre, table.top_z - 0.5 * table.thickness), table.extents)]
+    robot = with_housings(plain, load_cameras().values())
+    arms = {side: Arm(side, robot, MotionConfig(), static) for side in ("left", "right")}
+    args.runs.parent.mkdir(parents=True, exist_ok=True)
+    done = _done(args.runs)
+    rows: list[Row] = []
+    for name, count, run in (
+        ("n11", args.plans, run_single),
+        ("n12", args.both, run_both),
+        ("blind", args.blind, run_blind),
+    ):
+        seen: list[Seen] = []
+        seed = args.first_seed
+        while len(seen) < count:
+            if (name, seed) not in done:
+                found = run(arms, plain, home, seed)
+                with args.runs.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps({"what": name, "seed": seed, "plans": [asdict(s) for s in found]}) + "\n")
+                done[name, seed] = found
+                bad = sum(bool(s.contacts) or s.code != "OK" for s in found)
+                print(f"{name} seed {seed}: {len(found)} plans, {bad} bad", flush=True)
+            seen += done[name, seed]
+            seed += 1
+        rows += _rows(name, seen[:count])
+    write_report(rows, args.json)
+
+
+def _done(path: Path) -> dict[tuple[str, int], list[Seen]]:
+    if not path.is_file():
+        return {}
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return {(line["what"], line["seed"]): [Seen(**plan) for plan in line["plans"]] for line in lines}
+
+
+def _rows(name: str, seen: list[Seen]) -> list[Row]:
+    if not seen:
+        return []
+    touched, n = [s for s in seen if s.contacts], len(seen)
+    for s in touched:
+        print(f"{name}: {s.kind}: {', '.join(s.contacts)}")
+    failed = [s for s in seen if s.code != "OK"]
+    for s in failed:
+        print(f"{name}: {s.kind}: {s.code}")
+    if name == "blind":
+        return [Row("blind_contacts", len(touched), "", "higher", 1, n=n)]
+    planning = np.array([s.planning for s in seen])
+    rows = [
+        Row(f"{name}_contacts", len(touched), "", "lower", 0, n=n),
+        Row(f"{name}_failed", len(failed), "", "lower", 0, n=n),
+        Row(f"{name}_refused_draws", sum(s.refused for s in seen), "", "lower", None, n=n),
+        Row(f"{name}_plan_p95_ms", float(np.percentile(planning, 95)) * 1e3, "ms", "lower", None, n=n),
+        Row(f"{name}_moved_s", sum(s.duration for s in seen), "s", "higher", None, n=n),
+    ]
+    if name == "n12":
+        rows.append(Row("n12_separation_mm", min(s.separation for s in seen) * 1e3, "mm", "higher", 20.0, n=n))
+    return rows
+
+
+if __name__ == "__main__":
+    main()
