@@ -30,6 +30,7 @@ def build_app() -> App:
     """Return the application with all its commands."""
     from openarm_bringup import (
         calibrate_cli,
+        campaign_cli,
         checks_cli,
         demo_cli,
         doctor_cli,
@@ -51,6 +52,7 @@ def build_app() -> App:
     app.command(up_cli.up)
     app.command(pick_cli.pick)
     app.command(demo_cli.demo)
+    app.command(campaign_cli.campaign)
     app.command(checks_cli.test)
     app.command(checks_cli.check)
     app.command(doctor_cli.doctor)

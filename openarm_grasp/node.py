@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -21,10 +20,11 @@ from openarm_common.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene import load_scene
 from openarm_grasp import convert
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.effects import GraspOutcome, GraspRequest, Outcome
+from openarm_grasp.effects import GraspOutcome, GraspRequest
 from openarm_grasp.executor import GraspExecutor
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
+from openarm_grasp.performer import run_request
 from openarm_grasp.routing import ARMS
 from openarm_grasp.states import State
 
@@ -109,20 +109,8 @@ class GraspNode(BaseNode[GraspConfig]):
             self._running = False
 
     async def _run(self, request: GraspRequest, on_status: OnStatus | None) -> GraspOutcome:
-        recipe = self._machine.step(request, self._executor.now_ns)
-        while recipe:
-            try:
-                self._tell(on_status)
-                outcome = await self._executor.performer.perform(recipe)
-            except Exception as error:
-                # A fault of this program: the request must still be answered, and the next one served.
-                self.get_logger().error(traceback.format_exc())
-                outcome = Outcome(Code.INTERNAL, f"{type(error).__name__}: {error}; see the log of the grasp node")
-            recipe = self._machine.step(outcome, self._executor.now_ns)
-        self._tell(on_status)
-        result = self._machine.outcome
-        if result is None:
-            raise OpenArmError(Code.INTERNAL, "the grasp machine ended without an outcome")
+        link = self._executor
+        result = await run_request(self._machine, link.performer, link, request, lambda: self._tell(on_status))
         report = f"{result.code}: {result.message} (arm {result.arm or '-'}, attempts {result.attempts})"
         self.get_logger().info(report) if result.success else self.get_logger().warning(report)
         self.diagnose(True, report, state=self._machine.state.value)

@@ -7,6 +7,7 @@ differs is the `Link`. Every effect is a coroutine that ends: by its work, a dea
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Protocol
 
@@ -19,9 +20,22 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot_state import RobotStateBuffer
 from openarm_grasp import effects
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.effects import Effect, Effects, Frames, GoHome, Outcome, Planned, Reach, Result, Trajectory
+from openarm_grasp.effects import (
+    Effect,
+    Effects,
+    Frames,
+    GoHome,
+    GraspOutcome,
+    GraspRequest,
+    Outcome,
+    Planned,
+    Reach,
+    Result,
+    Trajectory,
+)
 from openarm_grasp.evidence import Evidence
 from openarm_grasp.hand import SPEED_WINDOW_NS, HandReader
+from openarm_grasp.machine import GraspMachine
 from openarm_grasp.observation import in_base
 from openarm_grasp.routing import ARMS
 
@@ -245,3 +259,27 @@ class Performer:
         rest = "waiting for the fingers to rest"
         await link.until(lambda: link.now_ns >= end_ns or abs(hand.gap_speed()) < still, limit, rest)
         return hand.evidence(effect.expected, link.effort(hand.joint), effect.T_base_tcp)
+
+
+async def run_request(
+    machine: GraspMachine, performer: Performer, link: Link, request: GraspRequest, tell: Callable[[], None]
+) -> GraspOutcome:
+    """Carry out one request from beginning to end; `tell` is called after each transition.
+
+    Raises:
+        OpenArmError: BUSY or INVALID_ARGUMENT, when the machine does not take the request.
+    """
+    recipe = machine.step(request, link.now_ns)
+    while recipe:
+        try:
+            tell()
+            outcome = await performer.perform(recipe)
+        except Exception as error:
+            # A fault of this program: the request must still be answered, and the next one served.
+            link.warn(traceback.format_exc())
+            outcome = Outcome(Code.INTERNAL, f"{type(error).__name__}: {error}; see the log of the grasp node")
+        recipe = machine.step(outcome, link.now_ns)
+    tell()
+    if machine.outcome is None:
+        raise OpenArmError(Code.INTERNAL, "the grasp machine ended without an outcome")
+    return machine.outcome

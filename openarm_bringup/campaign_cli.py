@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm campaign`: many seeded scenes, judged by ground truth, with intervals and everything about each failure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from openarm_bringup.outcome import Outcome
+from openarm_common.errors import Code
+
+if TYPE_CHECKING:
+    from openarm_bringup.campaign import CampaignOptions
+
+
+def campaign(
+    *,
+    seeds: str = "0-9",
+    set_: Annotated[str, Parameter(name="--set")] = "nominal",
+    workers: int = 1,
+    noise: Annotated[bool, Parameter(negative=())] = False,
+    mount_seeds: str | None = None,
+    effort: bool = True,
+    out: Path | None = None,
+    accept: float = 0.99,
+) -> Outcome:
+    """Run seeded scenes faster than real time, without DDS, through the same grasp, planner, detector and physics.
+
+    Leaves a folder with campaign.json, .csv, .html and, of every scene that did not go as expected, pictures, cloud,
+    joint trace and reason. With --out of an earlier run, the seeds that are done are not run again.
+
+    Args:
+        seeds: Such as 0-99 or 1,4,7-9.
+        set_: nominal, clutter, faults.
+        workers: Processes.
+        noise: Depth as noisy as a D435's.
+        mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.
+        effort: Whether the force of the fingers counts as evidence.
+        out: Folder of the campaign; a new one below runs/ when not given.
+        accept: Share of scenes that must go as expected.
+    """
+    from openarm_bringup import runs
+    from openarm_bringup.campaign import CampaignOptions
+    from openarm_bringup.demo import parse_seeds
+
+    options = CampaignOptions(
+        set_name=set_,
+        seeds=parse_seeds(seeds),
+        workers=max(1, workers),
+        noise=noise,
+        mount_seeds=parse_seeds(mount_seeds) if mount_seeds is not None else (),
+        use_effort=effort,
+    )
+    folder = out if out is not None else runs.new_run_dir()
+    return _run(options, folder.resolve(), accept)
+
+
+def _run(options: CampaignOptions, folder: Path, accept: float) -> Outcome:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from openarm_bringup.campaign import run_campaign, write_reports
+    from openarm_bringup.campaign_report import figures, summarise
+
+    console = Console(stderr=True, highlight=False)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        bar = progress.add_task("scenes", total=len(options.seeds))
+        bad = 0
+
+        def show(row: dict[str, Any]) -> None:
+            nonlocal bad
+            bad += not row["as_expected"]
+            progress.update(bar, advance=1, description=f"scenes ({bad} not as expected)")
+            if not row["as_expected"]:
+                text = f"seed {row['seed']} ({row['kind']}): {row['outcome']}: {row['code']}: {row['message']}"
+                console.print(text, style="red", markup=False)
+
+        result = run_campaign(options, folder, show)
+    data = write_reports(result)
+    text = "\n".join(f"{name:<44} {value}" for name, value in figures(data))
+    good = sum(bool(row["as_expected"]) for row in result.rows)
+    summary = summarise(result.rows)
+    success = bool(result.rows) and good >= accept * len(result.rows) and summary["false_success"] == 0
+    message = f"{good} of {len(result.rows)} scenes went as expected. Report: {folder}/campaign.html"
+    data = {"folder": str(folder), **{key: data[key] for key in ("summary", "settings", "scenes_per_hour", "wall_s")}}
+    return Outcome(success, message, Code.OK if success else Code.PLACE_FAILED, data, text)

@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The performer's link to a robot in this process: planner and controllers are called, time passes in ticks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Awaitable, Callable, Coroutine, Generator, Mapping, Sequence
+from functools import cache
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_bringup.campaign_robot import SimRobot
+from openarm_common.cameras import load_cameras
+from openarm_common.description import RobotDescription
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.housings import with_housings
+from openarm_common.robot_state import RobotStateBuffer
+from openarm_common.scene import Table
+from openarm_grasp import effects
+from openarm_grasp.candidates import Box as GraspBox
+from openarm_grasp.candidates import GraspCandidate
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.effects import Frames, GoHome, Planned
+from openarm_grasp.place import PlaceTarget
+from openarm_motion import moves
+from openarm_motion.approach import ApproachRequest, Target, plan_approach
+from openarm_motion.arm import Arm, Situation
+from openarm_motion.checks import Motion, check_against_others, check_trajectory
+from openarm_motion.collision import Box, box_from
+from openarm_motion.config import MotionConfig
+from openarm_motion.trajectory import Trajectory
+from openarm_sim_bridge.actuation import End, TrajectoryOutcome
+from openarm_sim_bridge.gripper import GripperGoal, GripperOutcome
+from openarm_sim_bridge.trajectory import Trajectory as FollowedTrajectory
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+#: Simulated time that a plan takes, s: a robot's world goes on while it thinks.
+PLANNING_S = 0.1
+
+
+class _Turn:
+    """Awaited by coroutines of this link: gives one control tick."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        yield
+
+
+class DirectLink:
+    """Implements `openarm_grasp.performer.Link`.
+
+    Args:
+        robot: The robot.
+        config: Parameters of the grasp.
+    """
+
+    def __init__(self, robot: SimRobot, config: GraspConfig) -> None:
+        self.robot = robot
+        self._config = config
+        self._arms = arms_at(robot.scene.table)
+        self._running: dict[str, tuple[Motion, int]] = {}
+        self.planning_s: list[float] = []
+        self.warnings: list[str] = []
+        self.cancelled = ""
+        #: So many plans find no way, on purpose.
+        self.plans_to_fail = 0
+        #: Called after each tick; what it raises ends what is waited for.
+        self.watch: Callable[[], None] = lambda: None
+
+    def run(self, work: Coroutine[Any, Any, T]) -> T:
+        """Carry out a coroutine of this link, one tick a turn."""
+        while True:
+            try:
+                work.send(None)
+            except StopIteration as end:
+                return end.value
+            self.robot.tick()
+
+    # --- the robot
+    @property
+    def description(self) -> RobotDescription:
+        """The robot."""
+        return self.robot.description
+
+    @property
+    def states(self) -> RobotStateBuffer:
+        """Its joint states."""
+        return self.robot.states
+
+    @property
+    def base_frame(self) -> str:
+        """Name of the base frame."""
+        return self.robot.description.root
+
+    @property
+    def now_ns(self) -> int:
+        """Stamp of the newest joint state."""
+        return self.robot.states.latest()[0]
+
+    def effort(self, joint: str) -> float:
+        """Newest effort of a joint, N or N m."""
+        return self.robot.efforts.get(joint, 0.0)
+
+    def check(self) -> None:
+        """Raise when the grasp shall not go on: CANCELLED, ROBOT_LOST."""
+        self.watch()
+        if self.cancelled:
+            raise OpenArmError(Code.CANCELLED, self.cancelled)
+        if self.robot.silent_s > self._config.limits.joint_state_timeout:
+            raise OpenArmError(Code.ROBOT_LOST, f"joint states have been silent for {self.robot.silent_s:.1f} s")
+
+    def warn(self, text: str) -> None:
+        """Keep a warning for the report."""
+        self.warnings.append(text)
+
+    # --- waiting and looking
+    async def until(
+        self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        """Wait for a condition, `limit` s of simulated time."""
+        deadline_ns = self.robot.t_ns + round(limit * 1e9)
+        while not done():
+            self.check()
+            if guard is not None:
+                guard()
+            if self.robot.t_ns > deadline_ns:
+                raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
+            await _Turn()
+
+    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
+        """Carry out several things at once."""
+        left = [part().__await__() for part in parts]
+        faults: list[Exception] = []
+        while True:
+            for work in list(left):
+                try:
+                    next(work)
+                except StopIteration:
+                    left.remove(work)
+                except OpenArmError as error:
+                    left.remove(work)
+                    faults.append(error)
+            if not left:
+                break
+            await _Turn()
+        if faults:
+            raise faults[0]
+
+    async def observe(self, count: int) -> Frames:
+        """Frames that are taken from now on.
+
+        Raises:
+            OpenArmError: STALE_DATA, when they do not come; CANCELLED; ROBOT_LOST.
+        """
+        since_ns, robot = self.now_ns, self.robot
+        robot.look("overhead")
+        robot.frames.clear()
+        limit = self._config.detect.frame_timeout
+
+        def fresh() -> list[Any]:
+            return [frame for frame in robot.frames if frame.t_ns >= since_ns]
+
+        try:
+            await self.until(lambda: len(fresh()) >= count, limit, "looking")
+        except OpenArmError as error:
+            if error.code is not Code.TIMEOUT:
+                raise
+            seen = f"{len(fresh())} of {count} frames came within {limit:g} s"
+            raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
+        return Frames(tuple(fresh()[-count:]), self.base_frame)
+
+    def stop_looking(self) -> None:
+        """Nothing is detected for now."""
+        self.robot.look("")
+
+    # --- planning
+    async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
+        """Plan in this thread; a constant time passes for the robot.
+
+        Raises:
+            OpenArmError: With the planner's code.
+        """
+        arm = self._arms[effect.arm]
+        start = effect.after.q[-1] if isinstance(effect, effects.PlanPlace) and _is_plan(effect.after) else ()
+        now = self._situation(arm, start)
+        began = time.perf_counter()
+        try:
+            if self.plans_to_fail > 0:
+                self.plans_to_fail -= 1
+                raise OpenArmError(Code.NO_PLAN, f"{arm.name} arm: no path, on purpose")
+            plan = plan_approach(arm, now, request_of(effect))
+        finally:
+            self.planning_s.append(time.perf_counter() - began)
+            await self.pass_time(PLANNING_S)
+        return Planned(plan.chosen, plan.transfer, plan.approach, plan.retreat, self.planning_s[-1])
+
+    async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
+        """How far the arm's TCP stays from a point, in any orientation."""
+        solver = self._arms[arm]
+        best = solver.inverse.nearest(T_base_tcp, self._situation(solver).start, position_only=True)
+        return {arm: float(best.position_error)}
+
+    def _situation(self, arm: Arm, start: Sequence[float] | Array = ()) -> Situation:
+        return arm.situation(self.robot.states.latest()[1], list(start), self._config.velocity_scale)
+
+    async def pass_time(self, seconds: float) -> None:
+        """Let simulated time pass."""
+        end_ns = self.robot.t_ns + round(seconds * 1e9)
+        while self.robot.t_ns < end_ns:
+            await _Turn()
+
+    # --- moving
+    async def follow(
+        self, arm: str, trajectory: effects.Trajectory, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        """Follow a planned trajectory and see that the arm has arrived.
+
+        Raises:
+            OpenArmError: As /motion/execute; CANCELLED; ROBOT_LOST; from `guard`.
+        """
+        if not isinstance(trajectory, Trajectory):
+            raise OpenArmError(Code.INTERNAL, f"{type(trajectory).__name__} is no trajectory of the planner")
+        try:
+            await self._follow(self._arms[arm], trajectory, what, guard)
+        except OpenArmError as error:
+            if error.code in (Code.CANCELLED, Code.ROBOT_LOST, Code.GRASP_LOST):
+                raise
+            raise OpenArmError(error.code, f"{what}: {error.message}") from error
+
+    async def _follow(self, arm: Arm, plan: Trajectory, what: str, guard: Callable[[], None] | None) -> None:
+        robot, state = self.robot, self.robot.states.latest()[1]
+        motion = check_trajectory(arm, plan.names, plan.t, plan.q, plan.v, state)
+        others = [
+            Motion(m.names, m.t - (robot.t_ns - since) * 1e-9, m.q)
+            for name, (m, since) in self._running.items()
+            if name != arm.name
+        ]
+        check_against_others(arm, motion, state, others)
+        follower = robot.controller.arms[arm.name]
+        ends: list[TrajectoryOutcome] = []
+        checked = follower.check(FollowedTrajectory(tuple(plan.names), plan.t, plan.q, plan.v, plan.a))
+        measured = robot.world.read_joints().position[robot.columns(arm.names)]
+        follower.start(checked, robot.t_ns, measured, ends.append)
+        self._running[arm.name] = (motion, robot.t_ns)
+        try:
+            await self.until(lambda: bool(ends), motion.duration + arm.config.execution.overtime, what, guard)
+        except OpenArmError:
+            follower.cancel()
+            for _ in range(100):
+                if ends:
+                    break
+                await _Turn()
+            raise
+        finally:
+            del self._running[arm.name]
+        if ends[0].end is not End.SUCCEEDED:
+            raise OpenArmError(Code.EXECUTION_FAILED, f"controller of the {arm.name} arm: {ends[0].text}")
+
+    async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
+        """Move the TCP on a straight line."""
+        arm = self._arms[effect.arm]
+        await self._move(arm, lambda now: moves.to_pose_on_line(arm, now, effect.T_base_tcp, moves.Around()), what)
+
+    async def move_named(self, arm: str, named: str, effect: GoHome, what: str) -> None:
+        """Move an arm on a free path to a posture."""
+        solver, around = self._arms[arm], moves.Around(boxes_of(effect.obstacles))
+        await self._move(solver, lambda now: moves.to_named(solver, now, named, around), what)
+
+    async def _move(self, arm: Arm, plan: Callable[[Situation], Trajectory], what: str) -> None:
+        try:
+            trajectory = plan(self._situation(arm))
+        except OpenArmError as error:
+            raise OpenArmError(error.code, f"{what}: {error.message}") from error
+        await self.pass_time(PLANNING_S)
+        await self.follow(arm.name, trajectory, what)
+
+    async def grip(self, arm: str, joint: str, position: float, what: str) -> bool:
+        """Move the fingers; whether they arrived or push against something."""
+        robot = self.robot
+        follower = robot.controller.grippers[arm]
+        state, column = robot.world.read_joints(), robot.columns([joint])[0]
+        ends: list[GripperOutcome] = []
+        goal = follower.check(GripperGoal(position))
+        follower.start(goal, float(state.position[column]), float(state.effort[column]), ends.append)
+        try:
+            await self.until(lambda: bool(ends), self._config.limits.gripper_timeout, what)
+        except OpenArmError:
+            follower.cancel()
+            raise
+        return ends[0].stalled or ends[0].reached_goal
+
+
+def _is_plan(trajectory: effects.Trajectory | None) -> bool:
+    return isinstance(trajectory, Trajectory)
+
+
+def boxes_of(boxes: Sequence[GraspBox]) -> tuple[Box, ...]:
+    """Boxes of the grasp as the planner's."""
+    return tuple(Box(box.id, box.T_frame_box, box.size) for box in boxes)
+
+
+def request_of(effect: effects.PlanGrasp | effects.PlanPlace) -> ApproachRequest:
+    """What the planner is asked for a grasp or a place."""
+    if isinstance(effect, effects.PlanGrasp):
+        return ApproachRequest(
+            targets=tuple(_target(way) for way in effect.candidates),
+            obstacles=boxes_of((*effect.obstacles, effect.target)),
+            touchable=frozenset({effect.target.id}),
+            attached_after=True,
+        )
+    return ApproachRequest(
+        targets=tuple(_target(way) for way in effect.targets),
+        obstacles=boxes_of(effect.obstacles),
+        attached=boxes_of((effect.held,)),
+        detached_after=True,
+    )
+
+
+def _target(way: GraspCandidate | PlaceTarget) -> Target:
+    return Target(way.id, way.T_base_tcp, way.approach_offset, way.retreat_offset, way.score)
+
+
+@cache
+def arms_at(table: Table) -> Mapping[str, Arm]:
+    """Both arms behind a table; made once a process."""
+    config = MotionConfig()
+    description = RobotDescription.load()
+    robot = with_housings(description, load_cameras().values())
+    x, y = table.centre
+    static = (box_from("table", (x, y, table.top_z - 0.5 * table.thickness), table.extents),)
+    return {name: Arm(name, robot, config, static) for name in config.arms}
