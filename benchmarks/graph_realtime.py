@@ -18,14 +18,15 @@ prints the worst of N runs for rtf, period, loss and latency, and the mean for c
 Budget, in cores, for these rates (a 100 Hz subscription costs an rclpy process 0.05 to 0.10):
 
     process                 work                                                             cores
-    mujoco_bridge           physics 100 Hz x 5 steps, /joint_states /clock 100 Hz, /tf 50 Hz  0.30
-    mujoco_cameras          60 frames a second of colour and depth, 12 ms each                0.75
-    cloud                   60 clouds a second of 307,200 points                              0.30
+    mujoco_bridge           physics 100 Hz x 5 steps, /joint_states /clock 100 Hz, /tf 50 Hz  0.20
+    mujoco_cameras          60 frames a second of colour and depth                            0.50
+    cloud                   60 clouds a second of 307,200 points                              0.25
+    octomap                 both depth cameras at 2 Hz, self-filter, /joint_states 100 Hz     0.25
+    motion                  /joint_states 100 Hz, map                                         0.15
     detector                idle unless somebody listens to detections                        0.02
-    motion                  /joint_states 100 Hz                                              0.10
     grasp                   idle unless a grasp runs                                          0.02
     calibration_publisher   latched                                                           0.01
-    sum                                                                                       1.50
+    sum                                                                                       1.40
 """
 
 from __future__ import annotations
