@@ -12,7 +12,7 @@ import json
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -94,19 +94,21 @@ def run_campaign(options: CampaignOptions, folder: Path, on_row: Callable[[Row],
     left = [seed for seed in options.seeds if seed not in done]
     began = time.monotonic()
     try:
-        with (
-            (folder / ROWS).open("a", encoding="utf-8") as file,
-            contextlib.closing(_rows(options, left, folder)) as new,
-        ):
+        with contextlib.closing(_rows(options, left, folder)) as new:
             for row in new:
-                file.write(json.dumps(row, default=str) + "\n")
-                file.flush()
-                campaign.rows.append(row)
+                keep_row(campaign, row)
                 on_row(row)
     finally:
         campaign.wall_s = time.monotonic() - began
         write_reports(campaign)
     return campaign
+
+
+def keep_row(campaign: Campaign, row: Row) -> None:
+    """Take a row that has come, and write it down at once."""
+    with (campaign.folder / ROWS).open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row, default=str) + "\n")
+    campaign.rows.append(row)
 
 
 def read_rows(folder: Path, options: CampaignOptions) -> list[Row]:
@@ -136,7 +138,7 @@ def read_rows(folder: Path, options: CampaignOptions) -> list[Row]:
     return [row for row in rows if row["seed"] in set(options.seeds)]
 
 
-def _rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Iterator[Row]:
+def _rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Generator[Row, None, None]:
     """Rows as they come; the order of seeds with one worker."""
     if options.workers == 1:
         for seed in seeds:

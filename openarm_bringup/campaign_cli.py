@@ -23,6 +23,7 @@ def campaign(
     noise: Annotated[bool, Parameter(negative=())] = False,
     mount_seeds: str | None = None,
     effort: bool = True,
+    graph: Annotated[bool, Parameter(negative=())] = False,
     out: Path | None = None,
     accept: float = 0.99,
 ) -> Outcome:
@@ -38,6 +39,7 @@ def campaign(
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.
         effort: Whether the force of the fingers counts as evidence.
+        graph: Through a node graph of its own, over DDS and in real time, instead of in one process.
         out: Folder of the campaign; a new one below runs/ when not given.
         accept: Share of scenes that must go as expected.
     """
@@ -54,14 +56,15 @@ def campaign(
         use_effort=effort,
     )
     folder = out if out is not None else runs.new_run_dir()
-    return _run(options, folder.resolve(), accept)
+    return _run(options, folder.resolve(), accept, graph=graph)
 
 
-def _run(options: CampaignOptions, folder: Path, accept: float) -> Outcome:
+def _run(options: CampaignOptions, folder: Path, accept: float, *, graph: bool) -> Outcome:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from openarm_bringup.campaign import run_campaign, write_reports
+    from openarm_bringup.campaign_graph import run_graph_campaign
     from openarm_bringup.campaign_report import figures, summarise
 
     console = Console(stderr=True, highlight=False)
@@ -78,7 +81,7 @@ def _run(options: CampaignOptions, folder: Path, accept: float) -> Outcome:
                 text = f"seed {row['seed']} ({row['kind']}): {row['outcome']}: {row['code']}: {row['message']}"
                 console.print(text, style="red", markup=False)
 
-        result = run_campaign(options, folder, show)
+        result = (run_graph_campaign if graph else run_campaign)(options, folder, show)
     data = write_reports(result)
     text = "\n".join(f"{name:<44} {value}" for name, value in figures(data))
     good = sum(bool(row["as_expected"]) for row in result.rows)

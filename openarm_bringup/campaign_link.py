@@ -17,7 +17,6 @@ from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.housings import with_housings
 from openarm_common.robot_state import RobotStateBuffer
-from openarm_common.scene import Table
 from openarm_grasp import effects
 from openarm_grasp.candidates import Box as GraspBox
 from openarm_grasp.candidates import GraspCandidate
@@ -60,7 +59,8 @@ class DirectLink:
     def __init__(self, robot: SimRobot, config: GraspConfig) -> None:
         self.robot = robot
         self._config = config
-        self._arms = arms_at(robot.scene.table)
+        table = robot.scene.table
+        self._arms = arms_behind(table.top_z, table.centre, table.extents)
         self._running: dict[str, tuple[Motion, int]] = {}
         self.planning_s: list[float] = []
         self.warnings: list[str] = []
@@ -184,7 +184,8 @@ class DirectLink:
             OpenArmError: With the planner's code.
         """
         arm = self._arms[effect.arm]
-        start = effect.after.q[-1] if isinstance(effect, effects.PlanPlace) and _is_plan(effect.after) else ()
+        after = effect.after if isinstance(effect, effects.PlanPlace) else None
+        start = after.q[-1] if isinstance(after, Trajectory) else ()
         now = self._situation(arm, start)
         began = time.perf_counter()
         try:
@@ -293,10 +294,6 @@ class DirectLink:
         return ends[0].stalled or ends[0].reached_goal
 
 
-def _is_plan(trajectory: effects.Trajectory | None) -> bool:
-    return isinstance(trajectory, Trajectory)
-
-
 def boxes_of(boxes: Sequence[GraspBox]) -> tuple[Box, ...]:
     """Boxes of the grasp as the planner's."""
     return tuple(Box(box.id, box.T_frame_box, box.size) for box in boxes)
@@ -324,11 +321,9 @@ def _target(way: GraspCandidate | PlaceTarget) -> Target:
 
 
 @cache
-def arms_at(table: Table) -> Mapping[str, Arm]:
-    """Both arms behind a table; made once a process."""
+def arms_behind(top_z: float, centre: tuple[float, float], extents: tuple[float, float, float]) -> Mapping[str, Arm]:
+    """Both arms behind a table top (its height, middle and edges, m); made once a process."""
     config = MotionConfig()
-    description = RobotDescription.load()
-    robot = with_housings(description, load_cameras().values())
-    x, y = table.centre
-    static = (box_from("table", (x, y, table.top_z - 0.5 * table.thickness), table.extents),)
+    robot = with_housings(RobotDescription.load(), load_cameras().values())
+    static = (box_from("table", (*centre, top_z - 0.5 * extents[2]), extents),)
     return {name: Arm(name, robot, config, static) for name in config.arms}

@@ -127,7 +127,8 @@ class _Bench:
             renderer.load(Snapshot(self._model, 0, self._data.qpos.copy()))
             renderer.draw(self._camera.name, self._picture)
             try:
-                found = detect(self._board, cv2.cvtColor(self._picture, cv2.COLOR_RGB2GRAY))
+                grey = np.asarray(cv2.cvtColor(self._picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+                found = detect(self._board, grey)
             except OpenArmError:
                 missed += 1
                 if missed > _NOT_SEEN:

@@ -111,9 +111,9 @@ def _spread(ordered: Sequence[float], digits: int) -> dict[str, float] | None:
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Write one line a scene."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, _COLUMNS, extrasaction="ignore", restval="")
-        writer.writeheader()
-        writer.writerows(rows)
+        writer = csv.writer(file)
+        writer.writerow(_COLUMNS)
+        writer.writerows([row.get(key, "") for key in _COLUMNS] for row in rows)
 
 
 def figures(data: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -167,6 +167,7 @@ def run_trial(
     after_ns: int = 0,
     rules: JudgeConfig | None = None,
     before: Callable[[], None] | None = None,
+    moved: bool = False,
 ) -> Trial:
     """Wait for the scene, ask for a grasp, wait until all is at rest, and judge.
 
@@ -179,13 +180,15 @@ def run_trial(
         after_ns: Ground truth up to this time is of an earlier scene.
         rules: Of the judge.
         before: Called when the scene stands, before the grasp is asked for.
+        moved: Earlier grasps have moved its objects, so it is not waited for.
 
     Raises:
         OpenArmError: TIMEOUT, when the scene does not show; UNKNOWN_OBJECT.
     """
     rules = rules or JudgeConfig()
     item = choose_target(scene, ask.label)
-    wait_scene(observer, scene, after_ns, rules)
+    if not moved:
+        wait_scene(observer, scene, after_ns, rules)
     if before is not None:
         before()
     observer.forget()

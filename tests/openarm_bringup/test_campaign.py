@@ -143,7 +143,6 @@ def test_n02_n24_what_cannot_be_held_is_refused_and_everything_of_it_kept(tmp_pa
 
 
 def test_p16_nothing_that_decides_reads_ground_truth() -> None:
-    import openarm_grasp.performer as performer
 
     for module in (performer, campaign_link):
         text = Path(module.__file__ or "").read_text()
