@@ -7,6 +7,8 @@ freedom is not counted as accuracy. Its inputs are sums over the views (see `ref
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -16,6 +18,12 @@ Array = NDArray[np.float64]
 #: Below these a robot counts as exact: far less than a mark moves by, and the arithmetic stays well conditioned.
 FLOOR_TRANSLATION = 1e-7  # m
 FLOOR_ROTATION = 1e-7  # rad
+#: Chance, before anything is seen, that the robot is exact; the factor within which others are like a typical one.
+_EXACT = 0.3
+_FACTOR = 3.0
+#: Where the average over spreads is taken: their size against a typical robot's, and translation against rotation.
+_LEVELS = np.geomspace(0.015, 30.0, 12)
+_BALANCES = np.geomspace(1.0 / 8.0, 8.0, 5)
 
 
 @njit(cache=True, nogil=True)
@@ -173,7 +181,8 @@ def averaged(full: Array, KMK: Array, both: Array, typical: tuple[float, float])
     """Covariance (p, p) about the present answer, averaged over the spreads that the data allow.
 
     With few poses the spread itself is uncertain, and an answer that takes its best value for true is too sure of
-    itself. The weight is the restricted likelihood times a wide prior (half-Cauchy) around a typical robot.
+    itself. The weight is the restricted likelihood times a prior: either the robot is exact, as in a simulation, or
+    its spread is near that of a typical one, with translation and rotation more or less in proportion.
 
     Args:
         full: See `criterion`.
@@ -181,15 +190,14 @@ def averaged(full: Array, KMK: Array, both: Array, typical: tuple[float, float])
         both: See `criterion`.
         typical: Spread of a typical robot, m and rad.
     """
-    t = np.concatenate([[FLOOR_TRANSLATION], np.geomspace(0.03, 30.0, 8) * typical[0]])
-    r = np.concatenate([[FLOOR_ROTATION], np.geomspace(0.03, 30.0, 8) * typical[1]])
-    spreads = np.stack(np.meshgrid(t, r, indexing="ij"), axis=-1).reshape(-1, 2)
+    level, balance = (grid.ravel() for grid in np.meshgrid(_LEVELS, _BALANCES, indexing="ij"))
+    spreads = np.stack([level * np.sqrt(balance) * typical[0], level / np.sqrt(balance) * typical[1]], axis=1)
+    spreads = np.concatenate([[[FLOOR_TRANSLATION, FLOOR_ROTATION]], spreads])
+    near = np.exp(-0.5 * (np.log(level) ** 2 + np.log(balance) ** 2) / math.log(_FACTOR) ** 2)
+    prior = np.concatenate([[_EXACT], (1.0 - _EXACT) * near / near.sum()])
     size, count = len(full) - 1, len(spreads)
     values, answers, covariances = np.full(count, np.inf), np.zeros((count, size)), np.zeros((count, size, size))
     _answers(full, np.ascontiguousarray(KMK), np.ascontiguousarray(both), spreads, values, answers, covariances)
-    ratio = spreads / np.array(typical)
-    ratio = np.maximum(ratio, 0.03)  # the exact robot stands for all spreads below the grid
-    prior = np.prod(ratio / (1.0 + ratio**2), axis=1)
     weight = prior * np.exp(-0.5 * (values - np.min(values)))
     weight[~np.isfinite(values)] = 0.0
     weight /= weight.sum()

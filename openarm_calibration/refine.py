@@ -21,8 +21,8 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 
 _LOWEST_PX = 1e-3
-#: Repeatability of a good small arm, m and rad: only a centre of a wide prior.
-TYPICAL_ROBOT = (2e-4, 4e-4)
+#: Errors of a small arm, m and rad: only the centre of a wide prior.
+TYPICAL_ROBOT = (4e-4, 8e-4)
 _ITERATIONS = 30
 
 

@@ -72,6 +72,20 @@ def test_noise_is_estimated_from_the_data() -> None:
     assert solve(exact.problem).estimate.noise.translation < 5e-5
 
 
+@pytest.mark.parametrize("robot", [(0.0, 0.0), ROBOT], ids=["exact", "robot"])
+def test_the_covariance_is_honest_where_few_poses_must_tell_the_noise_too(robot: tuple[float, float]) -> None:
+    """60 trials of 6 poses, nothing known beforehand: NEES near 6, and 95 % regions that hold nearly that often."""
+    rng = np.random.default_rng([12, robot[0] > 0])
+    nees = []
+    for k in range(60):
+        truth = synthetic.trial(SETUPS[k % 2], 6, Noise(0.3, *robot), rng)
+        solution = solve(truth.problem, LAX)
+        away = difference(solution.estimate.X[0], truth.X)
+        nees.append(away @ np.linalg.solve(solution.mount_covariance(), away))
+    assert 4.0 < np.mean(nees) < 8.0
+    assert np.mean(np.array(nees) < 12.59) > 0.85
+
+
 def test_scale_and_intrinsics_come_out_right() -> None:
     """A board printed 1 % small is told by its scale; a wrong focal length by freed intrinsics."""
     truth = synthetic.trial("in_hand", 15, Noise(0.1), np.random.default_rng(5))
