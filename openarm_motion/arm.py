@@ -26,6 +26,7 @@ from openarm_motion.fast_planner import FastPlanner
 from openarm_motion.inverse import InverseKinematics
 from openarm_motion.kinematics import ArmKinematics
 from openarm_motion.planner import OmplPlanner, PlannedPath, Planner, PlanQuery, never
+from openarm_motion.seen import NOTHING, Known
 from openarm_motion.trajectory import JointLimits, Trajectory, profile, time_path, time_polyline
 
 Array = NDArray[np.float64]
@@ -56,12 +57,14 @@ class Situation:
         start: (n,) where the arm starts; usually its part of `state`.
         scale: Velocity scale; 0 means the default.
         stopped: Whether the request was cancelled; asked often.
+        known: Bodies of the planning scene and the map.
     """
 
     state: Mapping[str, float]
     start: Array
     scale: float = 0.0
     stopped: Callable[[], bool] = never
+    known: Known = NOTHING
 
 
 class Arm:
@@ -118,6 +121,7 @@ class Arm:
         start: Sequence[float] = (),
         scale: float = 0.0,
         stopped: Callable[[], bool] = never,
+        known: Known = NOTHING,
     ) -> Situation:
         """Check and complete what a request starts from; an empty `start` is the present configuration.
 
@@ -130,7 +134,7 @@ class Arm:
             raise OpenArmError(Code.NOT_READY, f"/joint_states lacks {', '.join(missing)}")
         q = self.configuration(start if len(start) else [state[name] for name in self.names], "start", _SAG)
         self.scale(scale)
-        return Situation(dict(state), q, scale, stopped)
+        return Situation(dict(state), q, scale, stopped, known)
 
     def configuration(self, values: Sequence[float], what: str, tolerance: float = 1e-4) -> Array:
         """Check joint positions and move them into the limits where they are out by no more than `tolerance`.
@@ -179,6 +183,7 @@ class Arm:
         *,
         straight: bool = False,
         gripper: float | None = None,
+        known: Known = NOTHING,
     ) -> CollisionScene:
         """Surroundings of the arm with the table in them.
 
@@ -189,19 +194,22 @@ class Arm:
             touchable: Ids of boxes that the fingers may touch.
             straight: Clearance of straight parts instead of free paths.
             gripper: Position of the finger joints instead of the present one, m.
+            known: Bodies of the planning scene, as certain as the table, and the map.
         """
         clearance = self.config.straight if straight else self.config.clearance
-        fixed = frozenset(box.id for box in self.static)
+        certain = (*self.static, *known.solids)
+        fixed = frozenset(body.id for body in certain)
         return CollisionScene(
             self.robot,
             Surroundings(
                 state=state if gripper is None else self.with_gripper(state, gripper),
-                boxes=[*self.static, *boxes],
+                boxes=[*certain, *boxes],
                 held=held,
                 touchable=touchable,
                 supports=fixed | touchable,
                 fixed=fixed,
                 clearance=clearance,
+                map=known.map,
             ),
         )
 
@@ -283,7 +291,7 @@ class Arm:
             time_limit=time_limit,
             seed=search.seed,
             stopped=now.stopped,
-            fast=cache(lambda: FastScene([scene])),
+            fast=cache(lambda: FastScene([scene], scene.distances)),
             resolution=(step, travel),
             limits=(limits.velocity, limits.acceleration, limits.jerk),
         )

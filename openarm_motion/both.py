@@ -14,6 +14,7 @@ from openarm_motion.arm import Arm, segment_time
 from openarm_motion.collision import Box, Clearance, CollisionScene, Contact, Surroundings, spread
 from openarm_motion.fast import FastScene
 from openarm_motion.planner import PlanQuery, never
+from openarm_motion.seen import NOTHING, Known
 from openarm_motion.trajectory import JointLimits
 
 Array = NDArray[np.float64]
@@ -118,6 +119,7 @@ class BothArms:
         boxes: Sequence[Box] = (),
         separation: float = SEPARATION,
         held: tuple[Sequence[Box], Sequence[Box]] = ((), ()),
+        known: Known = NOTHING,
     ) -> BothScene:
         """Surroundings of both arms with the table in them.
 
@@ -126,8 +128,9 @@ class BothArms:
             boxes: Obstacles, base frame.
             separation: Distance that the arms keep from each other, m.
             held: Boxes held by each arm, its tool frame. Two held boxes are not looked at against each other.
+            known: Bodies of the planning scene and the map.
         """
-        scenes = [self.scene_of(i, state, boxes, separation, held[i]) for i in range(2)]
+        scenes = [self.scene_of(i, state, boxes, separation, held[i], known) for i in range(2)]
         return BothScene(scenes[0], scenes[1], self.split)
 
     def scene_of(
@@ -137,12 +140,16 @@ class BothArms:
         boxes: Sequence[Box] = (),
         separation: float = SEPARATION,
         held: Sequence[Box] = (),
+        known: Known = NOTHING,
     ) -> CollisionScene:
         """Surroundings of one of the arms, the other one in them where `state` says; arguments as `scene`."""
         arm = self.arms[index]
         keep = arm.config.clearance.model_copy(update={"arms": separation})
-        fixed = frozenset(box.id for box in arm.static)
-        around = Surroundings(state, [*arm.static, *boxes], held=held, supports=fixed, fixed=fixed, clearance=keep)
+        certain = (*arm.static, *known.solids)
+        fixed = frozenset(body.id for body in certain)
+        around = Surroundings(
+            state, [*certain, *boxes], held=held, supports=fixed, fixed=fixed, clearance=keep, map=known.map
+        )
         return CollisionScene(arm.robot, around)
 
     def pair_scene(
@@ -189,7 +196,7 @@ class BothArms:
             time_limit=time_limit,
             seed=search.seed,
             stopped=stopped,
-            fast=cache(lambda: FastScene([scene.first, scene.second])),
+            fast=cache(lambda: FastScene([scene.first, scene.second], scene.first.distances)),
             resolution=(step, travel),
             limits=(limits.velocity, limits.acceleration, limits.jerk),
         )

@@ -10,104 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import replace
 from functools import lru_cache
 
 import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 
-from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.collision_robot import CollisionRobot
+from openarm_motion.seen import MAP, DistanceMap
+from openarm_motion.solids import Box, Solid, box_from
+from openarm_motion.surroundings import Clearance, Contact, Surroundings
+
+__all__ = ["Box", "Clearance", "CollisionScene", "Contact", "Solid", "Surroundings", "box_from", "spread"]
 
 Array = NDArray[np.float64]
 
+#: A pair that may stay as near as it is may come nearer by this, m.
+_LESS = 1e-3
 #: Two shapes further apart than this in a report are not worth a number.
 _REPORT_RANGE = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class Box:
-    """An oriented box: `T` (4, 4) of its centre, `size` (3,) full edges, m."""
-
-    id: str
-    T: Array
-    size: Array
-
-    def __post_init__(self) -> None:
-        """Refuse a box that is none.
-
-        Raises:
-            OpenArmError: INVALID_ARGUMENT, naming the box and its size.
-        """
-        if self.size.shape != (3,) or not np.all(np.isfinite(self.size)) or not np.all(self.size > 0.0):
-            raise OpenArmError(
-                Code.INVALID_ARGUMENT, f"box {self.id!r} has size {self.size.tolist()}, expected three edges > 0 m"
-            )
-
-
-class Clearance(Config):
-    """Distances that pairs keep, m; nearer is a collision."""
-
-    own: float = Field(
-        default=0.003, ge=0.0, le=0.05, description="between links of the arm, and to the robot's body, m"
-    )
-    world: float = Field(default=0.010, ge=0.0, le=0.1, description="arm to boxes, m")
-    arms: float = Field(default=0.010, ge=0.0, le=0.1, description="arm to the other arm, m")
-    hand: float = Field(default=0.010, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
-    touch: float = Field(
-        default=0.002, ge=0.0, le=0.05, description="arm and palm to a box that the fingers may touch, m"
-    )
-    rest: float = Field(
-        default=0.0, ge=-0.02, le=0.05, description="held box to what it stands on; < 0 allows overlap, m"
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Surroundings:
-    """What is around an arm in one query.
-
-    Attributes:
-        state: Positions of (at least) the robot's other movable joints; missing ones are taken as 0.
-        boxes: Obstacles, base frame.
-        held: Boxes held by this arm, pose in the tool frame.
-        touchable: Ids of boxes that the fingers may touch.
-        supports: Ids of boxes that a held box may stand on.
-        fixed: Ids of boxes that are where they are said to be; the others are estimates.
-        clearance: Distances to keep.
-        own: Whether the arm is checked against itself and the robot's body; False leaves the other arm and the boxes.
-    """
-
-    state: Mapping[str, float]
-    boxes: Sequence[Box] = ()
-    held: Sequence[Box] = ()
-    touchable: frozenset[str] = frozenset()
-    supports: frozenset[str] = frozenset()
-    fixed: frozenset[str] = frozenset()
-    clearance: Clearance = field(default_factory=Clearance)
-    own: bool = True
-
-
-@dataclass(frozen=True)
-class Contact:
-    """Two things nearer to each other than allowed; `distance` < 0 is how deep they overlap, m."""
-
-    first: str
-    second: str
-    distance: float
-    required: float
-
-    def __str__(self) -> str:
-        """Sentence for a refusal."""
-        if self.distance <= 0.0:
-            return f"{self.first} would hit {self.second} ({-self.distance * 1e3:.0f} mm deep)"
-        return (
-            f"{self.first} would come within {self.distance * 1e3:.1f} mm of {self.second},"
-            f" expected {self.required * 1e3:.0f} mm"
-        )
 
 
 class CollisionScene:
@@ -123,11 +47,16 @@ class CollisionScene:
 
     def __init__(self, robot: CollisionRobot, around: Surroundings) -> None:
         self._robot = robot
+        self._q = robot.configuration(around.state)
+        self._build(around)
+
+    def _build(self, around: Surroundings) -> None:
+        robot = self._robot
         self._around = around
         self._geometry = robot.geometry.copy()
         self._names = [*robot.links]
         self._boxes: dict[str, int] = {}
-        self._q = robot.configuration(around.state)
+        self._solids: dict[str, Solid] = {}
         self.levers = robot.levers
         pairs, required = self._pairs()
         for i, j in pairs:
@@ -149,8 +78,21 @@ class CollisionScene:
         return self._around
 
     def shapes(self) -> list[tuple[int, Array, coal.ShapeBase]]:
-        """Joint, pose (4, 4) in that joint's frame, and geometry of every shape; the robot's come first."""
-        return [(o.parentJoint, np.array(o.placement.homogeneous), o.geometry) for o in self._geometry.geometryObjects]
+        """Joint, pose (4, 4) in that joint's frame, and geometry of every shape but the map; the robot's come first.
+
+        Geometry is a box, a cylinder or a sphere; what has another shape is in the box about it.
+        """
+        found: list[tuple[int, Array, coal.ShapeBase]] = []
+        for o in self._geometry.geometryObjects:
+            if o.name == MAP:
+                continue
+            T, shape = np.array(o.placement.homogeneous), o.geometry
+            solid = self._solids.get(o.name)
+            if not isinstance(shape, coal.Box | coal.Cylinder | coal.Sphere) and solid is not None:
+                T[:3, 3] += T[:3, :3] @ solid.centre
+                shape = coal.Box(*solid.extents.tolist())
+            found.append((o.parentJoint, T, shape))
+        return found
 
     def joint_poses(self) -> list[Array]:
         """Poses (4, 4) of the model's joints with the arm wherever it was last put."""
@@ -158,8 +100,28 @@ class CollisionScene:
         return [np.array(pose.homogeneous) for pose in self._data.oMi]
 
     def required(self) -> list[tuple[int, int, float]]:
-        """Pairs of shapes and the distance that each must keep, m."""
-        return [(i, j, float(d)) for (i, j), d in zip(self._pair_index, self._required, strict=True)]
+        """Pairs of shapes and the distance that each must keep, m; without those with the map."""
+        pairs = zip(self._pair_index, self._required, strict=True)
+        return [(i, j, float(d)) for (i, j), d in pairs if self._names[j] != MAP]
+
+    def map_clearance(self) -> dict[int, float]:
+        """Distance that each shape keeps from a map, m, whether there is one or not."""
+        out = self._from_map()
+        for (i, j), keep in zip(self._pair_index, self._required, strict=True):
+            if self._names[j] == MAP:
+                out[i] = float(keep)
+        return out
+
+    @property
+    def distances(self) -> DistanceMap | None:
+        """The map for fast checks; None without one."""
+        seen = self._around.map
+        return None if seen is None or not len(seen.indices) else seen.distances
+
+    def _from_map(self) -> dict[int, float]:
+        keep, hand = self._around.clearance, self._robot.arm.hand
+        out = {i: keep.hand if self._robot.links[i] in hand else keep.world for i in self._robot.moving}
+        return out | {self._boxes[self._held_name(box.id)]: keep.hand for box in self._around.held}
 
     def collides(self, q: ArrayLike) -> bool:
         """Whether some pair is nearer than it may be at the arm's configuration (n,)."""
@@ -206,13 +168,19 @@ class CollisionScene:
         """
         colliding = self._colliding(q)
         contacts = [self._contact(k) for k in colliding]
-        guessed = {box.id for box in self._around.boxes} - self._around.fixed
+        guessed = ({box.id for box in self._around.boxes} | {MAP}) - self._around.fixed
         for contact in contacts:
             limit = allowance if estimates is None or contact.second not in guessed else estimates
             if contact.distance < -limit:
                 return contact
+        seen = self._around.map
+        if seen is not None and any(c.second == MAP and c.distance < 2.0 * _LESS for c in contacts):
+            # where the robot is there is nothing else: such cells are errors of the map
+            cells = self._cells_at(q, [k for k in colliding if self._names[self._pair_index[k][1]] == MAP])
+            self._build(replace(self._around, map=seen.minus(cells)))
+            return self.relax(q, allowance, estimates)
         for k, contact in zip(colliding, contacts, strict=True):
-            self._required[k] = contact.distance - 1e-3
+            self._required[k] = contact.distance - _LESS
         if colliding:
             self._set_margins()
         return None
@@ -256,11 +224,35 @@ class CollisionScene:
         results = self._geometry_data.collisionResults
         return [k for k in range(len(self._pair_index)) if results[k].isCollision()]
 
+    def _cells_at(self, q: ArrayLike, pairs: Sequence[int]) -> NDArray[np.int64]:
+        """Rows of the map's cells that the shapes of some pairs touch at a configuration."""
+        seen = self._around.map
+        if seen is None:
+            return np.empty(0, np.int64)
+        self._colliding(q)
+        edge, centres, found = seen.lattice.resolution, seen.centres, set[int]()
+        cell = coal.Box(edge, edge, edge)
+        request = coal.DistanceRequest()
+        for k in pairs:
+            i = self._pair_index[k][0]
+            place, shape = self._geometry_data.oMg[i], self._geometry.geometryObjects[i].geometry
+            shape.computeLocalAABB()
+            middle = place.act(np.asarray(shape.aabb_center).ravel())
+            for c in np.flatnonzero(np.linalg.norm(centres - middle, axis=1) < float(shape.aabb_radius) + edge):
+                there = coal.Transform3s(np.eye(3), centres[c])
+                here = coal.Transform3s(place.rotation, place.translation)
+                if coal.distance(shape, here, cell, there, request, coal.DistanceResult()) < 2.0 * _LESS:
+                    found.add(int(c))
+        return np.array(sorted(found), np.int64)
+
     def _contact(self, k: int) -> Contact:
         result = pin.computeDistance(self._geometry, self._geometry_data, k)
         i, j = self._pair_index[k]
-        distance = min(float(result.min_distance), _REPORT_RANGE)
-        return Contact(self._names[i], self._names[j], distance, float(self._required[k]))
+        distance, where = min(float(result.min_distance), _REPORT_RANGE), ""
+        if self._names[j] == MAP and self._around.map is not None:
+            x, y, z = self._around.map.at(np.asarray(result.getNearestPoint2()).ravel())
+            where = f" at ({x:.2f}, {y:.2f}, {z:.2f})"
+        return Contact(self._names[i], self._names[j], distance, float(self._required[k]), where)
 
     def _set_margins(self) -> None:
         for request, margin in zip(self._geometry_data.collisionRequests, self._required.tolist(), strict=True):
@@ -297,28 +289,29 @@ class CollisionScene:
             for h in held:
                 pairs.append((h, b))
                 required.append(keep.rest if box.id in around.supports else keep.hand)
+        if around.map is not None and len(around.map.indices):
+            m = self._put_in(MAP, 0, np.eye(4), around.map.octree)
+            for i, distance in self._from_map().items():
+                pairs.append((i, m))
+                required.append(distance)
         return pairs, required
 
     @staticmethod
     def _held_name(id: str) -> str:
         return f"held {id}"
 
-    def _add(self, name: str, joint: int, T: Array, box: Box) -> int:
-        if name in self._boxes:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"two boxes have the id {box.id!r}; ids must be unique")
-        shape = pin.GeometryObject(name, joint, pin.SE3(T), coal.Box(*box.size.tolist()))
+    def _add(self, name: str, joint: int, T: Array, solid: Solid) -> int:
+        if name in self._boxes or name == MAP:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"two boxes have the id {solid.id!r}; ids must be unique ({MAP!r} is taken)"
+            )
+        self._solids[name] = solid
+        return self._put_in(name, joint, T, solid.geometry)
+
+    def _put_in(self, name: str, joint: int, T: Array, geometry: coal.CollisionGeometry) -> int:
         self._names.append(name)
-        self._boxes[name] = int(self._geometry.addGeometryObject(shape))
+        self._boxes[name] = int(self._geometry.addGeometryObject(pin.GeometryObject(name, joint, pin.SE3(T), geometry)))
         return self._boxes[name]
-
-
-def box_from(id: str, p: ArrayLike, size: ArrayLike, R: Array | None = None) -> Box:
-    """Box of its centre (3,), full edges (3,) and rotation (3, 3)."""
-    T = np.eye(4)
-    T[:3, 3] = p
-    if R is not None:
-        T[:3, :3] = R
-    return Box(id, T, np.asarray(size, dtype=np.float64))
 
 
 @lru_cache(maxsize=512)

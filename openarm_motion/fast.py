@@ -9,7 +9,6 @@ shapes. A scene is a snapshot: boxes that are moved later, and other joints, are
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import coal
 import numpy as np
@@ -19,6 +18,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion import fast_kernels as kernels
 from openarm_motion.collision import CollisionScene
+from openarm_motion.seen import DistanceMap
 
 Array = NDArray[np.float64]
 
@@ -26,23 +26,6 @@ Array = NDArray[np.float64]
 _ROUNDING = 1e-6
 #: Edge of the cells that shapes are cut into before each is put into a sphere, m.
 _CELL = 0.045
-
-
-@dataclass(frozen=True, eq=False)
-class DistanceMap:
-    """Distances (x, y, z), m, between centres of cells, to the nearest occupied one, cut at `reach`.
-
-    Attributes:
-        distances: float32, m.
-        corner: (3,) lower corner of the first cell, base frame, m.
-        resolution: Edge of a cell, m.
-        reach: Where distances are cut, m.
-    """
-
-    distances: NDArray[np.float32]
-    corner: Array
-    resolution: float
-    reach: float
 
 
 class FastScene:
@@ -106,16 +89,11 @@ class _Packer:
                 if pair not in seen:
                     seen.add(pair)
                     self._keep.append((*pair, keep + _ROUNDING))
-            self._cover(scene, index, len(shapes), links)
+            self._cover(scene, index)
 
-    def _cover(self, scene: CollisionScene, index: dict[int, int], count: int, links: int) -> None:
+    def _cover(self, scene: CollisionScene, index: dict[int, int]) -> None:
         """Clearance to the map of what moves."""
-        keep, hand = scene.around.clearance, scene.robot.arm.hand
-        for k in scene.robot.moving:
-            self._covered[index[k]] = keep.hand if scene.robot.links[k] in hand else keep.world
-        for k in range(links, count):
-            if self._bodies[index[k]] > 0:
-                self._covered[index[k]] = keep.hand
+        self._covered.update({index[k]: keep for k, keep in scene.map_clearance().items()})
 
     def _add(
         self,

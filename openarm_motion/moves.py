@@ -94,7 +94,7 @@ def to_pose_on_line(arm: Arm, now: Situation, pose: Array, around: Around) -> Tr
     T_start = arm.kinematics.fk(now.start)
     # a start nearer to a limit than the margin may go on as near
     margin = max(0.0, min(arm.config.planning.joint_margin, arm.kinematics.margin(now.start)))
-    scene = arm.scene(now.state, around.obstacles, around.attached, straight=True)
+    scene = arm.scene(now.state, around.obstacles, around.attached, straight=True, known=now.known)
     arm.relax(scene, now.start)
     faults: list[OpenArmError] = []
     for drift in _DRIFTS if not np.isnan(start.swivel) else (0.0,):
@@ -121,7 +121,7 @@ def unreachable(arm: Arm, pose: Array, *, free_orientation: bool, margin: float 
 
 
 def _free_scene(arm: Arm, now: Situation, around: Around) -> CollisionScene:
-    scene = arm.scene(now.state, around.obstacles, around.attached)
+    scene = arm.scene(now.state, around.obstacles, around.attached, known=now.known)
     arm.relax(scene, now.start)
     return scene
 

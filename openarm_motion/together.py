@@ -76,7 +76,7 @@ def plan_together(both: BothArms, now: Situation, wanted: BothGoals, time_limit:
             CANCELLED.
     """
     end = time.monotonic() + time_limit
-    scene = both.scene(now.state, wanted.obstacles, held=wanted.held)
+    scene = both.scene(now.state, wanted.obstacles, held=wanted.held, known=now.known)
     for arm, part, start in zip(both.arms, scene.placed(now.start), both.parts(now.start), strict=True):
         arm.relax(part, start)
     goals = _pairs(scene, wanted.goals)
@@ -188,13 +188,13 @@ def _alone(
 ) -> Trajectory:
     """The path of one arm with the other one where `state` says."""
     arm, start = both.arms[index], both.parts(now.start)[index]
-    scene = both.scene_of(index, state, wanted.obstacles, held=wanted.held[index])
+    scene = both.scene_of(index, state, wanted.obstacles, held=wanted.held[index], known=now.known)
     arm.relax(scene, start)
     goals = [q for q in wanted.goals[index] if not scene.collides(q)][:_GOALS]
     if not goals:
         contact = scene.contacts(wanted.goals[index][0])[0]
         raise OpenArmError(Code.IN_COLLISION, f"goal of the {arm.name} arm: {contact}")
-    mine = Situation(state, start, now.scale, now.stopped)
+    mine = Situation(state, start, now.scale, now.stopped, now.known)
     return arm.plan_certified(scene, mine, np.array(goals), time_limit).trajectory
 
 
