@@ -21,6 +21,7 @@ from openarm_motion.certificate import Certificate, certify
 from openarm_motion.collision import Box, CollisionScene, Contact, Surroundings
 from openarm_motion.collision_robot import CollisionRobot
 from openarm_motion.config import MotionConfig
+from openarm_motion.failure import PlanFailedError
 from openarm_motion.fast import FastScene
 from openarm_motion.fast_planner import FastPlanner
 from openarm_motion.inverse import InverseKinematics
@@ -226,10 +227,8 @@ class Arm:
         planning = self.config.planning
         contact = scene.relax(start, planning.start_overlap, planning.estimate_overlap)
         if contact is not None:
-            raise OpenArmError(
-                Code.IN_COLLISION,
-                f"the {self.name} arm starts in collision: {contact}; free it by hand or correct the obstacle",
-            )
+            text = f"the {self.name} arm starts in collision: {contact}; free it by hand or correct the obstacle"
+            raise PlanFailedError(Code.IN_COLLISION, text, "start", contact)
 
     def plan(
         self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float, fineness: float = 1.0
@@ -247,8 +246,9 @@ class Arm:
             if error.code != Code.NO_PLAN:
                 raise
             hit = scene.first_hit(now.start, goals[0], search.edge_step, search.edge_travel)
-            blocked = "" if hit is None else f"; on the direct way {scene.contacts(hit)[0]}"
-            raise OpenArmError(Code.NO_PLAN, error.message + blocked) from error
+            contact = None if hit is None else scene.contacts(hit)[0]
+            blocked = "" if contact is None else f"; on the direct way {contact}"
+            raise PlanFailedError(Code.NO_PLAN, error.message + blocked, "search", contact) from error
 
     def plan_certified(self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float) -> CertifiedPlan:
         """Free path to one of several configurations, timed, and looked at densely on the exact layer.
@@ -259,15 +259,16 @@ class Arm:
             OpenArmError: as `plan`; IN_COLLISION, when the finest search did not help.
         """
         end = time.monotonic() + time_limit
-        fault = ""
+        fault, contact = "", None
         for fineness in _FINENESS:
             path = self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
             trajectory = self.time_free(path, now.scale)
             try:
                 return CertifiedPlan(path, trajectory, certify(scene, trajectory))
-            except OpenArmError as error:
-                fault = error.message
-        raise OpenArmError(Code.IN_COLLISION, f"the {self.name} arm's plan did not pass the dense look: {fault}")
+            except PlanFailedError as error:
+                fault, contact = error.message, error.contact
+        text = f"the {self.name} arm's plan did not pass the dense look: {fault}"
+        raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
 
     def query(
         self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float, fineness: float = 1.0

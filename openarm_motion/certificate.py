@@ -15,8 +15,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_motion.collision import Contact
+from openarm_motion.failure import PlanFailedError
 from openarm_motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -70,16 +71,16 @@ def certify(scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL, sha
         share: Share of each positive clearance to ask for; overlaps that are allowed stay so.
 
     Raises:
-        OpenArmError: IN_COLLISION, with the time and the pair.
+        PlanFailedError: IN_COLLISION, with the time and the pair.
     """
     times = dense_times(trajectory, scene.levers, travel)
     states = trajectory.at(times)[0]
     with scene.lenient(share):
         for k in _ends_first(len(states)):
             if scene.collides(states[k]):
-                raise OpenArmError(
-                    Code.IN_COLLISION, f"after {times[k]:.2f} s of the trajectory {scene.contacts(states[k])[0]}"
-                )
+                contact = scene.contacts(states[k])[0]
+                text = f"after {times[k]:.2f} s of the trajectory {contact}"
+                raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
     return Certificate(len(states), travel, share)
 
 

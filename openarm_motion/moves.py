@@ -13,6 +13,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_motion.arm import Arm, Situation, first_contact, segment_time
 from openarm_motion.cartesian import line_contact, solve_line
 from openarm_motion.collision import Box, CollisionScene
+from openarm_motion.failure import PlanFailedError
 from openarm_motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -40,10 +41,10 @@ def to_joints(arm: Arm, now: Situation, goal: Sequence[float], around: Around, w
         OpenArmError: INVALID_ARGUMENT or LIMITS, naming the joint; IN_COLLISION, naming the pair; NO_PLAN; CANCELLED.
     """
     q = arm.configuration(goal, what, _ROUNDING)
-    scene = _free_scene(arm, now, around)
+    scene = free_scene(arm, now, around)
     contact = first_contact(scene, q)
     if contact is not None:
-        raise OpenArmError(Code.IN_COLLISION, f"{what} of the {arm.name} arm: {contact}")
+        raise PlanFailedError(Code.IN_COLLISION, f"{what} of the {arm.name} arm: {contact}", "goal", contact)
     return _plan(arm, scene, now, q[None])
 
 
@@ -66,7 +67,7 @@ def to_pose(arm: Arm, now: Situation, pose: Array, around: Around, *, free_orien
         OpenArmError: UNREACHABLE, with the nearest reachable pose; IN_COLLISION, naming the pair; NO_PLAN; CANCELLED.
     """
     margin = arm.config.planning.joint_margin
-    scene = _free_scene(arm, now, around)
+    scene = free_scene(arm, now, around)
     if free_orientation:
         solutions = arm.inverse.position_solutions(pose, margin, now.start)
     else:
@@ -78,9 +79,8 @@ def to_pose(arm: Arm, now: Situation, pose: Array, around: Around, *, free_orien
     goals = [q for q in ordered if not scene.collides(q)][:_GOALS]
     if not goals:
         contact = scene.contacts(ordered[0])[0]
-        raise OpenArmError(
-            Code.IN_COLLISION, f"pose of the {arm.name} arm: {contact} (all {len(ordered)} configurations collide)"
-        )
+        text = f"pose of the {arm.name} arm: {contact} (all {len(ordered)} configurations collide)"
+        raise PlanFailedError(Code.IN_COLLISION, text, "goal", contact)
     return _plan(arm, scene, now, np.array(goals))
 
 
@@ -96,19 +96,19 @@ def to_pose_on_line(arm: Arm, now: Situation, pose: Array, around: Around) -> Tr
     margin = max(0.0, min(arm.config.planning.joint_margin, arm.kinematics.margin(now.start)))
     scene = arm.scene(now.state, around.obstacles, around.attached, straight=True, known=now.known)
     arm.relax(scene, now.start)
-    faults: list[OpenArmError] = []
+    faults: list[PlanFailedError] = []
     for drift in _DRIFTS if not np.isnan(start.swivel) else (0.0,):
         try:
             line = solve_line(arm.inverse, start, T_start, pose, margin, swivel_change=drift)
         except OpenArmError as error:
-            faults.append(error)
+            faults.append(PlanFailedError(error.code, error.message, "line"))
             continue
         contact = line_contact(scene, line)
         if contact is None:
             return arm.time_line(line, now.scale)
-        faults.append(OpenArmError(Code.IN_COLLISION, f"on the straight line {contact}"))
+        faults.append(PlanFailedError(Code.IN_COLLISION, f"on the straight line {contact}", "line", contact))
     worst = next((fault for fault in faults if fault.code == Code.IN_COLLISION), faults[0])
-    raise OpenArmError(worst.code, f"{arm.name} arm: {worst.message}")
+    raise PlanFailedError(worst.code, f"{arm.name} arm: {worst.message}", "line", worst.contact)
 
 
 def unreachable(arm: Arm, pose: Array, *, free_orientation: bool, margin: float | None = None) -> OpenArmError:
@@ -117,10 +117,16 @@ def unreachable(arm: Arm, pose: Array, *, free_orientation: bool, margin: float 
     kept = arm.config.planning.joint_margin if margin is None else margin
     why = arm.inverse.why_not(pose, kept, position_only=free_orientation)
     hint = "" if free_orientation else "; or leave the orientation free"
-    return OpenArmError(Code.UNREACHABLE, f"{arm.name} arm can't reach ({x:.3f}, {y:.3f}, {z:.3f}) m: {why}{hint}")
+    text = f"{arm.name} arm can't reach ({x:.3f}, {y:.3f}, {z:.3f}) m: {why}{hint}"
+    return PlanFailedError(Code.UNREACHABLE, text, "goal")
 
 
-def _free_scene(arm: Arm, now: Situation, around: Around) -> CollisionScene:
+def free_scene(arm: Arm, now: Situation, around: Around) -> CollisionScene:
+    """What free paths of a request are planned in, the start freed of what it is in contact with.
+
+    Raises:
+        PlanFailedError: IN_COLLISION, when the arm starts in collision.
+    """
     scene = arm.scene(now.state, around.obstacles, around.attached, known=now.known)
     arm.relax(scene, now.start)
     return scene

@@ -20,6 +20,7 @@ from openarm_motion.arm import Situation
 from openarm_motion.both import SEPARATION, BothArms, BothScene
 from openarm_motion.certificate import certify, dense_times
 from openarm_motion.collision import Box
+from openarm_motion.failure import PlanFailedError
 from openarm_motion.fast_planner import FastPlanner
 from openarm_motion.trajectory import Trajectory, time_polyline
 
@@ -193,7 +194,7 @@ def _alone(
     goals = [q for q in wanted.goals[index] if not scene.collides(q)][:_GOALS]
     if not goals:
         contact = scene.contacts(wanted.goals[index][0])[0]
-        raise OpenArmError(Code.IN_COLLISION, f"goal of the {arm.name} arm: {contact}")
+        raise PlanFailedError(Code.IN_COLLISION, f"goal of the {arm.name} arm: {contact}", "goal", contact)
     mine = Situation(state, start, now.scale, now.stopped, now.known)
     return arm.plan_certified(scene, mine, np.array(goals), time_limit).trajectory
 
@@ -210,9 +211,8 @@ def _pairs(scene: BothScene, goals: tuple[Array, Array]) -> Array:
                 break
     if not found:
         contact = scene.contacts(np.concatenate([goals[0][0], goals[1][0]]))[0]
-        raise OpenArmError(
-            Code.IN_COLLISION, f"goals of both arms: {contact} (all {len(order)} pairs of goals collide)"
-        )
+        text = f"goals of both arms: {contact} (all {len(order)} pairs of goals collide)"
+        raise PlanFailedError(Code.IN_COLLISION, text, "goal", contact)
     return np.array(found)
 
 

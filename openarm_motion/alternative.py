@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nearest goal that works, in place of one that an arm can't be planned to. Base frame, m, rad."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import OpenArmError
+from openarm_motion import moves
+from openarm_motion.arm import Arm, Situation
+from openarm_motion.collision import CollisionScene
+from openarm_motion.moves import Around
+
+Array = NDArray[np.float64]
+
+#: Distances from the pose that was asked for that are tried, m.
+_RINGS = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22)
+#: Time for the search of one candidate, s.
+_SEARCH = 0.3
+#: Steps back from a configuration towards the start.
+_STEPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """A goal that a plan was found for.
+
+    Attributes:
+        q: (n,) rad.
+        pose: (4, 4) of the tool there.
+        distance: Of the tool from where it was asked to be, m.
+    """
+
+    q: Array
+    pose: Array
+    distance: float
+
+
+def near_pose(
+    arm: Arm, now: Situation, around: Around, pose: Array, *, free_orientation: bool = False, budget: float = 1.0
+) -> Alternative | None:
+    """The nearest tool pose that the arm can be planned to; None when none is found within `budget` s.
+
+    The orientation is kept, or free where it may be.
+    """
+    end = time.monotonic() + budget
+    scene, asked = moves.free_scene(arm, now, around), pose[:3, 3].copy()
+    nearest = arm.inverse.nearest(pose, now.start, position_only=free_orientation)
+    if not nearest.success:
+        pose = arm.kinematics.fk(nearest.q)
+    for target in _poses_around(pose):
+        if time.monotonic() > end or now.stopped():
+            return None
+        solve = arm.inverse.position_solutions if free_orientation else arm.inverse.solutions
+        found = solve(target, arm.config.planning.joint_margin, now.start)
+        goals = [s.q for s in found if not scene.collides(s.q)]
+        q = _planned(arm, scene, now, np.array(goals[:8])) if goals else None
+        if q is not None:
+            there = arm.kinematics.fk(q)
+            return Alternative(q, there, float(np.linalg.norm(there[:3, 3] - asked)))
+    return None
+
+
+def near_joints(arm: Arm, now: Situation, around: Around, goal: Array, budget: float = 1.0) -> Alternative | None:
+    """The configuration nearest to `goal`, on the way back to the start, that the arm can be planned to."""
+    end = time.monotonic() + budget
+    scene = moves.free_scene(arm, now, around)
+    wanted = arm.kinematics.fk(goal)
+    for u in np.linspace(1.0, 0.0, _STEPS, endpoint=False):
+        if time.monotonic() > end or now.stopped():
+            return None
+        q = now.start + u * (goal - now.start)
+        if not scene.collides(q) and _planned(arm, scene, now, q[None]) is not None:
+            there = arm.kinematics.fk(q)
+            return Alternative(q, there, float(np.linalg.norm(there[:3, 3] - wanted[:3, 3])))
+    return None
+
+
+def _planned(arm: Arm, scene: CollisionScene, now: Situation, goals: Array) -> Array | None:
+    """The goal that a plan reaches in a short time, or None."""
+    try:
+        return np.asarray(arm.plan_certified(scene, now, goals, _SEARCH).trajectory.q[-1])
+    except OpenArmError:
+        return None
+
+
+def _poses_around(pose: Array) -> Iterator[Array]:
+    """The pose itself and others about it, the nearest first: up, back along the tool, aside, forwards, down."""
+    yield pose
+    back = -pose[:3, 2]
+    ways = [
+        np.array([0.0, 0.0, 1.0]),
+        back,
+        *(np.array(w) for w in ((0, 1.0, 0), (0, -1.0, 0), (-1.0, 0, 0), (1.0, 0, 0))),
+    ]
+    for ring in _RINGS:
+        for way in (*ways, np.array([0.0, 0.0, -1.0])):
+            other = pose.copy()
+            other[:3, 3] += ring * way
+            yield other

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans that fail say where, what is in the way, and what would work instead."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from openarm_common import se3
+from openarm_common.errors import Code
+from openarm_motion import moves
+from openarm_motion.alternative import near_joints, near_pose
+from openarm_motion.arm import Arm
+from openarm_motion.collision import box_from
+from openarm_motion.failure import PlanFailedError
+from openarm_motion.moves import Around
+
+DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
+
+
+def test_a_pose_in_a_box_is_refused_with_the_pair_and_the_nearest_pose_above(
+    right: Arm, home: dict[str, float]
+) -> None:
+    now, pose = right.situation(home, scale=1.0), se3.make(DOWN, (0.28, -0.24, 0.50))
+    around = Around([box_from("crate", (0.28, -0.24, 0.45), (0.12, 0.12, 0.10))])
+    with pytest.raises(PlanFailedError) as caught:
+        moves.to_pose(right, now, pose, around)
+    assert (caught.value.code, caught.value.stage) == (Code.IN_COLLISION, "goal")
+    assert caught.value.contact is not None
+    assert caught.value.contact.second == "crate"
+    found = near_pose(right, now, around, pose)
+    assert found is not None
+    np.testing.assert_allclose(found.pose[:3, :3], DOWN, atol=1e-3)
+    assert 0.01 < found.distance <= 0.11
+    assert found.distance == pytest.approx(float(np.linalg.norm(found.pose[:3, 3] - pose[:3, 3])))
+    assert moves.to_joints(right, now, found.q.tolist(), around).duration > 0.0
+
+
+def test_a_pose_out_of_reach_has_the_nearest_in_reach(right: Arm, home: dict[str, float]) -> None:
+    now, pose = right.situation(home, scale=1.0), se3.make(DOWN, (0.62, -0.24, 0.62))
+    with pytest.raises(PlanFailedError) as caught:
+        moves.to_pose(right, now, pose, Around())
+    assert (caught.value.code, caught.value.stage) == (Code.UNREACHABLE, "goal")
+    found = near_pose(right, now, Around(), pose)
+    assert found is not None
+    assert 0.0 < found.distance < 0.35
+
+
+def test_joints_in_a_wall_end_before_it(right: Arm, home: dict[str, float]) -> None:
+    now = right.situation(home, scale=1.0)
+    scene = right.scene(home)
+    goal = next(
+        s.q for s in right.inverse.solutions(se3.make(DOWN, (0.30, -0.10, 0.62)), 0.05) if not scene.collides(s.q)
+    )
+    around = Around([box_from("wall", (0.30, -0.10, 0.62), (0.1, 0.1, 0.1))])
+    with pytest.raises(PlanFailedError) as caught:
+        moves.to_joints(right, now, goal.tolist(), around)
+    assert caught.value.stage == "goal"
+    found = near_joints(right, now, around, goal)
+    assert found is not None
+    assert not right.scene(home, around.obstacles).collides(found.q)
+    assert found.distance < 0.4
+
+
+def test_a_start_in_collision_names_the_pair(right: Arm, home: dict[str, float]) -> None:
+    now = right.situation(home, scale=1.0)
+    hand = right.kinematics.fk(now.start)[:3, 3]
+    around = Around([box_from("brick", hand, (0.2, 0.2, 0.2))])
+    with pytest.raises(PlanFailedError) as caught:
+        moves.to_joints(right, now, now.start.tolist(), around)
+    assert (caught.value.stage, caught.value.code) == ("start", Code.IN_COLLISION)
+    assert caught.value.contact is not None
+    assert caught.value.contact.second == "brick"
+
+
+def test_a_line_that_hits_something_names_it(right: Arm, home: dict[str, float]) -> None:
+    now = right.situation(home, scale=1.0)
+    below = right.kinematics.fk(now.start)
+    below[2, 3] -= 0.08
+    around = Around([box_from("bar", below[:3, 3] - [0, 0, 0.02], (0.03, 0.03, 0.03))])
+    with pytest.raises(PlanFailedError) as caught:
+        moves.to_pose_on_line(right, now, below, around)
+    assert (caught.value.stage, caught.value.code) == ("line", Code.IN_COLLISION)
+    assert caught.value.contact is not None
+    assert caught.value.contact.second == "bar"
