@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_calibration.board import Board, Charuco, CircleGrid
-from openarm_calibration.centroids import refined
+from openarm_calibration.centroids import mapped, refined
 from openarm_calibration.projection import fit_poses
 from openarm_common import se3
 from openarm_common.cameras import Intrinsics
@@ -26,8 +26,8 @@ Grey = NDArray[np.uint8]
 #: A plane's image is a homography but for distortion and the eccentricity of the circles, px rms.
 MOST_RESIDUAL = 0.5
 _FEWEST_CORNERS = 8
-#: Of the circles; with more of them in wrong places it is another board.
-_LEAST_SHARE = 0.9
+#: Of the circles that must be seen well; with fewer it may be another board.
+_LEAST_SHARE = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +83,12 @@ def _circles(board: CircleGrid, image: Grey) -> Detection:
             ids, exact, residual = _refined(board, image, ordered)
             if len(ids) >= _LEAST_SHARE * len(ordered) and residual <= MOST_RESIDUAL:
                 return Detection(ids, exact, residual)
+            if np.isfinite(residual) and residual <= MOST_RESIDUAL:
+                raise OpenArmError(
+                    Code.NOTHING_DETECTED,
+                    f"only {len(ids)} of {len(ordered)} circles of {board.label} are whole, with white around them; is"
+                    " something before the board, or its edge at that of the image?",
+                )
             raise OpenArmError(
                 Code.NOTHING_DETECTED,
                 f"{len(pixels)} circles do not lie on a plane as {board.label} does: {residual:.2f} px rms, expected at"
@@ -139,20 +145,20 @@ def _ordered(board: CircleGrid, pixels: Array) -> Array:
 def _refined(board: CircleGrid, image: Grey, rough: Array) -> tuple[NDArray[np.int64], Array, float]:
     """Marks by their grey values: which, where, and their residual, px rms.
 
-    A blob beside a circle is moved to where the others want it; a mark that still is off is left out.
+    A blob beside a circle is moved to where the others want it; a mark that still is off is left out, and so is one
+    that something else comes near to.
     """
     plane = board.points[:, :2]
-    H, _ = cv2.findHomography(plane, rough, cv2.LMEDS)
-    if H is None:  # pyright: ignore[reportUnnecessaryComparison] - None for marks in a heap
-        return np.arange(0), rough[:0], np.inf
-    H = H.astype(np.float64)
-    wanted = _mapped(H, plane)
+    H = _robust_homography(plane, rough)
+    wanted = mapped(H, plane)
     astray = np.linalg.norm(rough - wanted, axis=1) > 0.5 + 0.05 * _diameter(board, rough)
-    exact = refined(image, np.where(astray[:, None], wanted, rough), plane, board.radius, H)
-    away = np.linalg.norm(_mapped(homography(plane, exact), plane) - exact, axis=1)
-    keep = away <= 6.0 * float(np.median(away)) + 0.1
-    ids = np.flatnonzero(keep)
-    return ids, exact[keep], _homography_residual(homography(plane[keep], exact[keep]), plane[keep], exact[keep])
+    exact, sure = refined(image, np.where(astray[:, None], wanted, rough), plane, board.radius, H)
+    if np.count_nonzero(sure) < 4:
+        return np.flatnonzero(sure), exact[sure], 0.0
+    away = np.linalg.norm(mapped(_robust_homography(plane[sure], exact[sure]), plane) - exact, axis=1)
+    ids = np.flatnonzero(sure & (away <= 6.0 * float(np.median(away[sure])) + 0.1))
+    plane, exact = plane[ids], exact[ids]
+    return ids, exact, _homography_residual(homography(plane, exact), plane, exact) if len(ids) >= 4 else np.inf
 
 
 def _corners(board: Charuco, image: Grey) -> Detection:
@@ -180,10 +186,18 @@ def _corners(board: Charuco, image: Grey) -> Detection:
     return Detection(index, pixels, residual)
 
 
+def _robust_homography(plane: Array, pixels: Array) -> Array:
+    """As `homography`, with up to half of the marks in wrong places."""
+    H, _ = cv2.findHomography(plane, pixels, cv2.LMEDS)
+    if H is None:  # pyright: ignore[reportUnnecessaryComparison] - None for marks in a heap
+        return homography(plane, pixels)
+    return H.astype(np.float64)
+
+
 def homography(plane: Array, pixels: Array) -> Array:
     """Homography (3, 3) from plane points (n, 2) to pixels (n, 2), by normalised least squares."""
     A, b = _normaliser(plane), _normaliser(pixels)
-    x, u = _mapped(A, plane), _mapped(b, pixels)
+    x, u = mapped(A, plane), mapped(b, pixels)
     one, zero = np.ones((len(x), 1)), np.zeros((len(x), 3))
     p = np.concatenate([x, one], axis=1)
     rows = np.concatenate(
@@ -199,13 +213,8 @@ def _normaliser(points: Array) -> Array:
     return np.array([[1 / spread, 0, -middle[0] / spread], [0, 1 / spread, -middle[1] / spread], [0, 0, 1.0]])
 
 
-def _mapped(H: Array, points: Array) -> Array:
-    p = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ H.T
-    return p[:, :2] / p[:, 2:]
-
-
 def _homography_residual(H: Array, plane: Array, pixels: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum((_mapped(H, plane) - pixels) ** 2, axis=1))))
+    return float(np.sqrt(np.mean(np.sum((mapped(H, plane) - pixels) ** 2, axis=1))))
 
 
 def guess_pose(points: Array, pixels: Array, radius: float, intrinsics: Intrinsics) -> tuple[Array, float]:

@@ -137,7 +137,8 @@ def test_a43_a_picture_of_any_shape_is_exactly_the_plate(board: Board) -> None:
         return
     H = np.array([[scale[0], 0.0, 0.0], [0.0, scale[1], 0.0], [0.0, 0.0, 1.0]])
     H[:2, 2] = scale * board.size / 2.0 - 0.5
-    found = refined(image, wanted + np.array([0.7, -0.5]), board.points[:, :2], board.radius, H)
+    found, sure = refined(image, wanted + np.array([0.7, -0.5]), board.points[:, :2], board.radius, H)
+    assert sure.all()
     assert np.abs(found - wanted).max() < 0.01
 
 

@@ -7,12 +7,14 @@ from functools import cache
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from openarm_calibration.board import CircleGrid
 from openarm_calibration.centroids import refined
 from openarm_calibration.detect import detect
 from openarm_common import se3
+from openarm_common.errors import OpenArmError
 
 BOARD = CircleGrid()
 PLANE = BOARD.points[:, :2]
@@ -45,13 +47,14 @@ def picture(blur: float, slope: float, noise: float = 0.0) -> NDArray[np.uint8]:
 
 def test_a_start_half_a_pixel_off_ends_within_a_hundredth() -> None:
     for blur in (0.0, 1.0):
-        found = refined(picture(blur, 0.0), TRUE + np.array([0.4, -0.3]), PLANE, BOARD.radius, H)
+        found, sure = refined(picture(blur, 0.0), TRUE + np.array([0.4, -0.3]), PLANE, BOARD.radius, H)
+        assert sure.all()
         assert np.sqrt(np.mean((found - TRUE) ** 2)) < 0.01
 
 
 def test_uneven_light_does_not_pull_the_centres() -> None:
     """0.2 grey values a pixel: a fifth of the contrast over the board."""
-    found = refined(picture(0.7, 0.2), TRUE, PLANE, BOARD.radius, H)
+    found, _ = refined(picture(0.7, 0.2), TRUE, PLANE, BOARD.radius, H)
     assert np.abs((found - TRUE).mean(axis=0)).max() < 0.005
 
 
@@ -61,15 +64,28 @@ def test_a_circle_at_the_edge_of_the_image_keeps_its_start() -> None:
     start = TRUE - (left, 0.0) + 0.25
     shift = np.eye(3)
     shift[0, 2] = -left
-    found = refined(np.ascontiguousarray(image[:, left:]), start, PLANE, BOARD.radius, shift @ H)
+    found, sure = refined(np.ascontiguousarray(image[:, left:]), start, PLANE, BOARD.radius, shift @ H)
     assert np.array_equal(found[0], start[0])
+    assert not sure[0]
 
 
-def test_a_mark_in_a_wrong_place_is_left_out() -> None:
-    """A sticker over half a circle: the other 43 marks are reported, each within 0.05 px."""
+def test_marks_that_something_covers_or_comes_near_to_are_left_out() -> None:
+    """A sticker over half a circle and a cable beside another; what is reported is right to 0.05 px."""
     image = picture(0.5, 0.0, noise=1.0)
     u, v = np.round(TRUE[20]).astype(int)
     image[v - 4 : v + 5, u - 4 : u + 1] = 190
+    u, v = np.round(TRUE[7]).astype(int)
+    image[v - 3 : v + 4, u + 7] = 60
     detection = detect(BOARD, image)
-    assert list(np.setdiff1d(np.arange(44), detection.ids)) == [20]
+    assert list(np.setdiff1d(np.arange(44), detection.ids)) == [7, 20]
     assert np.abs(detection.pixels - TRUE[detection.ids]).max() < 0.05
+
+
+def test_a_board_behind_something_is_refused_with_the_number_of_whole_circles() -> None:
+    """Lines between the circles: blobs are found, but their surroundings are not white."""
+    image = picture(0.0, 0.0)
+    for centre in TRUE[:20]:
+        u, v = np.round(centre).astype(int)
+        image[v - 3 : v + 4, u + 8] = 60
+    with pytest.raises(OpenArmError, match=r"only 2\d of 44 circles .* are whole, with white around them"):
+        detect(BOARD, image)
