@@ -9,6 +9,7 @@ shapes. A scene is a snapshot: boxes that are moved later, and other joints, are
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import coal
 import numpy as np
@@ -18,7 +19,9 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion import fast_kernels as kernels
 from openarm_motion.collision import CollisionScene
+from openarm_motion.line_kernels import line_free
 from openarm_motion.seen import DistanceMap
+from openarm_motion.shape_kernels import BOX, CYLINDER, SPHERE
 
 Array = NDArray[np.float64]
 
@@ -47,7 +50,7 @@ class FastScene:
 
     def free(self, q: ArrayLike) -> bool:
         """Whether a state (n,) is proven free."""
-        return kernels.near_pair(np.ascontiguousarray(q, dtype=np.float64), self.model, self._work) == -1
+        return not kernels.near(np.ascontiguousarray(q, dtype=np.float64), self.model, self._work)
 
     def free_many(self, states: ArrayLike) -> NDArray[np.bool_]:
         """Whether each of the states (m, n) is proven free."""
@@ -58,7 +61,48 @@ class FastScene:
 
     def edge_free(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.02) -> bool:
         """Whether the straight joint line is free, at the states where the exact layer would look."""
-        return bool(kernels.line_free(a, b, step, travel, self.levers, self.model, self._work))
+        return bool(line_free(a, b, step, travel, self.levers, self.model, self._work))
+
+
+@dataclass(frozen=True, eq=False)
+class _Cluster:
+    """Shapes of one body: the ball about them, in that body."""
+
+    body: int
+    centre: Array
+    radius: float
+
+
+class _Swings:
+    """How far points move when joints turn, at most.
+
+    Args:
+        parents: (n,) body that each joint hangs on.
+        offsets: (n,) from the origin of that body to the joint, m.
+        prismatic: (n,) which joints slide.
+        ends: (n,) furthest that each joint goes from zero, m where it slides.
+    """
+
+    def __init__(self, parents: Sequence[int], offsets: Array, prismatic: NDArray[np.bool_], ends: Array) -> None:
+        self._parents, self._prismatic = parents, prismatic
+        self._offsets: Array = offsets + np.where(prismatic, ends, 0.0)
+
+    def of(self, cluster: _Cluster) -> Array:
+        """(n,) for the points of a cluster as seen from the base, m/rad; 1 m/m for a prismatic joint."""
+        out = np.zeros(len(self._parents))
+        reach = float(np.linalg.norm(cluster.centre)) + cluster.radius
+        body = cluster.body
+        while body > 0:
+            i = body - 1
+            out[i] = 1.0 if self._prismatic[i] else reach
+            reach += float(self._offsets[i])
+            body = self._parents[i]
+        return out
+
+    def between(self, a: _Cluster, b: _Cluster) -> Array:
+        """(n,) for the points of one cluster as seen by another: joints that move both as one body do nothing."""
+        one, two = self.of(a), self.of(b)
+        return np.where((one > 0.0) & (two > 0.0), 0.0, one + two)
 
 
 class _Packer:
@@ -122,9 +166,14 @@ class _Packer:
         parents: list[int] = []
         for chain in chains:
             parents += [0, *range(len(parents) + 1, len(parents) + chain.n)]
+        placements = np.concatenate([chain.placements for chain in chains])
+        prismatic = np.concatenate([chain.prismatic for chain in chains])
+        ends = np.concatenate([np.maximum(np.abs(chain.lower), np.abs(chain.upper)) for chain in chains])
+        swings = _Swings(parents, np.linalg.norm(placements[:, :3, 3], axis=1), prismatic, ends)
         clusters, of = self._clusters()
-        groups, reaches, pairs, keep = self._groups(of)
-        centres = np.array([c for _, c, _ in clusters])
+        groups, reaches, pairs, keep = self._groups(of, clusters)
+        moving = sum(cluster.body > 0 for cluster in clusters)
+        still = [int(row[0]) for row in groups if row[1] >= moving]
         spheres, sphere_groups, bounds = self._spheres()
         field = self._field
         slack = 0.0 if field is None else float(np.sqrt(3.0)) * field.resolution
@@ -134,60 +183,70 @@ class _Packer:
                 Code.INVALID_ARGUMENT,
                 f"distances of the map are cut at {field.reach:.3f} m, expected {need:.3f} m or more",
             )
+        sways = [swings.between(clusters[a], clusters[b]) for a, b in groups[:, :2]]
+        sways += [
+            swings.of(_Cluster(int(body), ball[:3], ball[3]))
+            for (body, _, _), ball in zip(sphere_groups, bounds, strict=True)
+        ]
         return kernels.Model(
-            np.array(parents, np.int64),
-            np.concatenate([chain.placements for chain in chains]),
-            np.concatenate([chain.axes for chain in chains]),
-            np.concatenate([chain.prismatic for chain in chains]),
-            np.array(self._kinds, np.int64),
-            np.array(self._sizes),
-            np.array(self._radii),
-            np.array(self._bodies, np.int64),
-            np.array(self._poses),
-            groups,
-            reaches,
-            np.array([body for body, _, _ in clusters], np.int64),
-            centres,
-            np.array([bound for _, _, bound in clusters]),
-            pairs,
-            keep,
-            spheres,
-            sphere_groups,
-            bounds,
-            np.full((1, 1, 1), np.inf, np.float32) if field is None else np.array(field.distances, np.float32),
-            np.zeros(3) if field is None else np.array(field.corner, np.float64),
-            np.array([1.0 if field is None else field.resolution, slack]),
+            parents=np.array(parents, np.int64),
+            placements=placements,
+            axes=np.concatenate([chain.axes for chain in chains]),
+            prismatic=prismatic,
+            kinds=np.array(self._kinds, np.int64),
+            sizes=np.array(self._sizes),
+            radii=np.array(self._radii),
+            bodies=np.array(self._bodies, np.int64),
+            poses=np.array(self._poses),
+            clusters=np.array([cluster.body for cluster in clusters], np.int64),
+            centres=np.array([cluster.centre for cluster in clusters]),
+            bounds=np.array([cluster.radius for cluster in clusters]),
+            runs=np.searchsorted(still, np.arange(moving + 1)).astype(np.int64),
+            groups=groups,
+            points=np.array([clusters[b].centre for b in groups[:, 1]], np.float64).reshape(-1, 3).T.copy(),
+            reaches=reaches,
+            spans=reaches + np.array([clusters[a].radius + clusters[b].radius for a, b in groups[:, :2]]),
+            swings=np.array(sways, np.float64).reshape(-1, len(parents)),
+            pairs=pairs,
+            keep=keep,
+            spheres=spheres,
+            sphere_groups=sphere_groups,
+            sphere_bounds=bounds,
+            field=np.full((1, 1, 1), np.inf, np.float32) if field is None else np.array(field.distances, np.float32),
+            corner=np.zeros(3) if field is None else np.array(field.corner, np.float64),
+            edge=np.array([1.0 if field is None else field.resolution, slack]),
         )
 
-    def _clusters(self) -> tuple[list[tuple[int, Array, float]], dict[int, int]]:
-        """Shapes of one body are a cluster, each shape that does not move is its own; body, centre, radius."""
+    def _clusters(self) -> tuple[list[_Cluster], dict[int, int]]:
+        """Shapes of one body are a cluster, each shape that does not move is its own; which cluster a shape is in."""
         members: dict[tuple[int, int], list[int]] = {}
         for k, body in enumerate(self._bodies):
             members.setdefault((body, -1 if body else k), []).append(k)
-        out: list[tuple[int, Array, float]] = []
+        out: list[_Cluster] = []
         of: dict[int, int] = {}
-        for (body, _), shapes in members.items():
+        for (body, _), shapes in sorted(members.items(), key=lambda item: item[0][0] == 0):
             places = np.array([self._poses[k][:, 3] for k in shapes])
             centre = 0.5 * (places.min(axis=0) + places.max(axis=0))
             radii = np.array([self._radii[k] for k in shapes])
             of.update(dict.fromkeys(shapes, len(out)))
-            out.append((body, centre, float(np.max(np.linalg.norm(places - centre, axis=1) + radii))))
+            out.append(_Cluster(body, centre, float(np.max(np.linalg.norm(places - centre, axis=1) + radii))))
         return out, of
 
-    def _groups(self, of: dict[int, int]) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
-        bodies = {cluster: self._bodies[k] for k, cluster in of.items()}
-        lone = {cluster: k for k, cluster in of.items() if bodies[cluster] == 0}
-        ordered: dict[tuple[int, int], list[tuple[int, int, float]]] = {}
+    def _groups(
+        self, of: dict[int, int], clusters: list[_Cluster]
+    ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
+        lone = {cluster: k for k, cluster in of.items() if clusters[cluster].body == 0}
+        together: dict[tuple[int, int], list[tuple[int, int, float]]] = {}
         for i, j, keep in self._keep:
-            # what stands still comes second
-            a, b = sorted((of[i], of[j]), key=lambda c: (bodies[c] == 0, c))
-            ordered.setdefault((a, b), []).append((i, j, keep))
+            a, b = sorted((of[i], of[j]))  # what stands still comes second
+            together.setdefault((a, b), []).append((i, j, keep))
         groups: list[tuple[int, int, int, int, int]] = []
         flat: list[tuple[int, int, float]] = []
-        for (a, b), pairs in ordered.items():
+        reaches: list[float] = []
+        for (a, b), pairs in sorted(together.items(), key=lambda item: (item[0][1] not in lone, item[0])):
             groups.append((a, b, len(flat), len(flat) + len(pairs), lone.get(b, -1)))
             flat += pairs
-        reaches = [max(0.0, *(keep for _, _, keep in pairs), 0.0) for pairs in ordered.values()]
+            reaches.append(max(0.0, *(keep for _, _, keep in pairs), 0.0))
         return (
             np.array(groups, np.int64).reshape(-1, 5),
             np.array(reaches, np.float64),
@@ -222,31 +281,31 @@ class _Packer:
 
 def cover(kind: int, size: Array) -> Iterable[tuple[Array, float]]:
     """Spheres (centre (3,), radius) that together hold a shape, in its frame."""
-    if kind == kernels.SPHERE:
+    if kind == SPHERE:
         yield np.zeros(3), float(size[0])
         return
-    half = size if kind == kernels.BOX else np.array([size[0], size[0], size[1]])
+    half = size if kind == BOX else np.array([size[0], size[0], size[1]])
     counts = np.maximum(np.ceil(2.0 * half / _CELL), 1).astype(int)
     cell = 2.0 * half / counts
     for at in np.ndindex(*counts.tolist()):
         centre = -half + (np.array(at) + 0.5) * cell
         beyond = np.maximum(np.abs(centre[:2]) - 0.5 * cell[:2], 0.0)
-        if kind == kernels.CYLINDER and float(np.hypot(*beyond)) > size[0]:
+        if kind == CYLINDER and float(np.hypot(*beyond)) > size[0]:
             continue  # a corner that the cylinder does not reach
         yield centre, 0.5 * float(np.linalg.norm(cell)) + 1e-9
 
 
 def _kind(shape: coal.ShapeBase) -> tuple[int, Array]:
     if isinstance(shape, coal.Box):
-        return kernels.BOX, np.array(shape.halfSide, np.float64)
+        return BOX, np.array(shape.halfSide, np.float64)
     if isinstance(shape, coal.Cylinder):
-        return kernels.CYLINDER, np.array([shape.radius, shape.halfLength, 0.0])
+        return CYLINDER, np.array([shape.radius, shape.halfLength, 0.0])
     if isinstance(shape, coal.Sphere):
-        return kernels.SPHERE, np.array([shape.radius, 0.0, 0.0])
+        return SPHERE, np.array([shape.radius, 0.0, 0.0])
     raise OpenArmError(Code.INVALID_ARGUMENT, f"shape {type(shape).__name__}; valid: box, cylinder, sphere")
 
 
 def _radius(kind: int, size: Array) -> float:
-    if kind == kernels.CYLINDER:
+    if kind == CYLINDER:
         return float(np.hypot(size[0], size[1]))
-    return float(np.linalg.norm(size)) if kind == kernels.BOX else float(size[0])
+    return float(np.linalg.norm(size)) if kind == BOX else float(size[0])

@@ -9,7 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from openarm_motion.fast_kernels import Model, Work, line_free
+from openarm_motion.fast_kernels import Model, Work, near
+from openarm_motion.line_kernels import between_free, line_free
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -65,6 +66,7 @@ def grow(
     """
     np.random.seed(seed)
     n, room, edges = trees.shape[2], trees.shape[1], 0
+    step, travel = resolution[0], resolution[1]
     sample, new = np.empty(n), np.empty(n)
     for iteration in range(iterations):
         a = iteration % 2
@@ -80,7 +82,7 @@ def grow(
         for i in range(n):
             new[i] = trees[a, at, i] + u * (sample[i] - trees[a, at, i])
         edges += 1
-        if not line_free(trees[a, at], new, resolution[0], resolution[1], levers, model, work):
+        if near(new, model, work) or not between_free(trees[a, at], new, step, travel, levers, model, work):
             continue
         end = counts[a]
         trees[a, end] = new
@@ -94,7 +96,10 @@ def grow(
             for i in range(n):
                 sample[i] = trees[b, at, i] + u * (new[i] - trees[b, at, i]) if u < 1.0 else new[i]
             edges += 1
-            if not line_free(trees[b, at], sample, resolution[0], resolution[1], levers, model, work):
+            # the last one is the tip of the other tree: known to be free
+            if u < 1.0 and near(sample, model, work):
+                break
+            if not between_free(trees[b, at], sample, step, travel, levers, model, work):
                 break
             trees[b, counts[b]] = sample
             parents[b, counts[b]] = at

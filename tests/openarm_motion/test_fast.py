@@ -12,7 +12,7 @@ from scipy import ndimage
 from openarm_common import se3
 from openarm_common.description import RobotDescription
 from openarm_common.errors import OpenArmError
-from openarm_motion import fast_kernels as kernels
+from openarm_motion import shape_kernels as kernels
 from openarm_motion.arm import Arm
 from openarm_motion.both import BothArms
 from openarm_motion.collision import Box, CollisionScene, Surroundings, box_from
