@@ -22,6 +22,7 @@ from openarm_grasp.candidates import Box as GraspBox
 from openarm_grasp.candidates import GraspCandidate
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames, GoHome, Planned
+from openarm_grasp.performer import check_deadline
 from openarm_grasp.place import PlaceTarget
 from openarm_motion import moves
 from openarm_motion.approach import ApproachRequest, Target, plan_approach
@@ -65,6 +66,7 @@ class DirectLink:
         self.planning_s: list[float] = []
         self.warnings: list[str] = []
         self.cancelled = ""
+        self.deadline_ns = 0
         #: So many plans find no way, on purpose.
         self.plans_to_fail = 0
         #: Called after each tick; what it raises ends what is waited for.
@@ -109,6 +111,7 @@ class DirectLink:
         self.watch()
         if self.cancelled:
             raise OpenArmError(Code.CANCELLED, self.cancelled)
+        check_deadline(self.now_ns, self.deadline_ns)
         if self.robot.silent_s > self._config.limits.joint_state_timeout:
             raise OpenArmError(Code.ROBOT_LOST, f"joint states have been silent for {self.robot.silent_s:.1f} s")
 

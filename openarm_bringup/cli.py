@@ -35,9 +35,11 @@ def build_app() -> App:
         demo_cli,
         doctor_cli,
         graph_cli,
+        grasp_cli,
         inspect_cli,
         model_cli,
         pick_cli,
+        record_cli,
         up_cli,
     )
 
@@ -52,6 +54,8 @@ def build_app() -> App:
     app.command(up_cli.up)
     app.command(pick_cli.pick)
     app.command(demo_cli.demo)
+    app.command(record_cli.record)
+    app.command(record_cli.replay)
     app.command(campaign_cli.campaign)
     app.command(checks_cli.test)
     app.command(checks_cli.check)
@@ -60,6 +64,7 @@ def build_app() -> App:
     app.command(inspect_cli.logs)
     app.command(model_cli.model)
     app.command(graph_cli.app)
+    app.command(grasp_cli.app)
     app.command(calibrate_cli.app)
     return app
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -20,6 +21,9 @@ def pick(
     *,
     arm: Literal["auto", "left", "right"] = "auto",
     place: tuple[float, float, float] | None = None,
+    yaw: float | None = None,
+    phase: Literal["all", "pick", "place"] = "all",
+    time_limit: float = 0.0,
     dry_run: Annotated[bool, Parameter(negative=())] = False,
     domain: int | None = None,
     timeout: float = 300.0,
@@ -30,13 +34,16 @@ def pick(
         label: What to pick, such as red; without one, what is seen best.
         arm: Which arm.
         place: Where to: x y z of the footprint centre, base frame, m (z is not read: the table); chosen when not given.
+        yaw: Of the object where it is put down, degrees about the vertical; as the hand likes when not given.
+        phase: pick ends with the object in the hand, place puts down what the hand holds; all does both.
+        time_limit: Of the robot, s; then it holds, and the hand keeps what it holds. 0 is none.
         dry_run: Plan and report, do not move.
         domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
         timeout: Longest wait, s.
     """
     from rich.console import Console
 
-    _meet_graph(domain)
+    meet_graph(domain)
     from openarm_grasp.client import GraspClient
 
     console = Console(stderr=True, highlight=False)
@@ -50,10 +57,21 @@ def pick(
 
     with GraspClient() as client:
         try:
-            result = client.pick(label, arm=arm, place=place, dry_run=dry_run, timeout=timeout, on_feedback=show)
+            result = client.pick(
+                label,
+                arm=arm,
+                place=place,
+                place_yaw=None if yaw is None else math.radians(yaw),
+                phase=phase,
+                dry_run=dry_run,
+                time_limit=time_limit,
+                timeout=timeout,
+                on_feedback=show,
+            )
         except KeyboardInterrupt:
             return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED, {"label": label})
     data: dict[str, Any] = {
+        "outcome": result.outcome,
         "label": result.label,
         "arm": result.arm,
         "attempts": result.attempts,
@@ -64,7 +82,7 @@ def pick(
     return Outcome(result.success, result.message, result.code, data)
 
 
-def _meet_graph(domain: int | None) -> None:
+def meet_graph(domain: int | None) -> None:
     """Set this process up to meet the graph: of that domain, or the only one that runs here."""
     from openarm_bringup import runs
 

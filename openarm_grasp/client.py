@@ -38,6 +38,7 @@ class GraspResult:
 
     Attributes:
         success: The object was placed and seen there (dry run: it could be).
+        outcome: SUCCESS; PARTIAL: held, not placed as asked; FAILED; REFUSED: never touched; CANCELLED.
         code: `openarm_common.errors.Code`.
         message: What happened, in a sentence or two.
         label: What was picked.
@@ -48,6 +49,7 @@ class GraspResult:
     """
 
     success: bool
+    outcome: str
     code: Code
     message: str
     label: str
@@ -115,7 +117,10 @@ class GraspClient:
         *,
         arm: str = "auto",
         place: Sequence[float] | None = None,
+        place_yaw: float | None = None,
+        phase: str = "all",
         dry_run: bool = False,
+        time_limit: float = 0.0,
         timeout: float = 300.0,
         on_feedback: OnFeedback | None = None,
     ) -> GraspResult:
@@ -126,7 +131,10 @@ class GraspClient:
             arm: "auto", "left" or "right".
             place: (x, y) or (x, y, z) of the footprint centre, base frame, m; z is not read. None lets a free spot be
                 chosen.
+            place_yaw: Of the object's x axis about the base z where it is put down, rad; None: as the hand likes.
+            phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
             dry_run: Plan and report, do not move.
+            time_limit: s of robot time; then it ends with TIMEOUT, the hand keeping what it holds. 0: none.
             timeout: s of wall clock; then the grasp is cancelled.
             on_feedback: Called with each `GraspStatus`, in the background thread; it may call `cancel`.
 
@@ -137,7 +145,9 @@ class GraspClient:
             OpenArmError: NOT_READY, when no grasp node answers; TIMEOUT; INVALID_ARGUMENT, for a place that is not two
                 or three numbers.
         """
-        goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run)
+        goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run, phase=phase, timeout=time_limit)
+        if place_yaw is not None:
+            goal.has_place_yaw, goal.place_yaw = True, place_yaw
         if place is not None:
             if len(place) not in (2, 3):
                 raise OpenArmError(Code.INVALID_ARGUMENT, f"place {list(place)} must be x, y or x, y, z in metres")
@@ -232,6 +242,7 @@ def _result(message: Pick.Result) -> GraspResult:
     x, y, z = (float(v) for v in xyz(message.place_position))
     return GraspResult(
         success=message.success,
+        outcome=message.outcome,
         code=Code(message.code) if message.code in Code.__members__ else Code.INTERNAL,
         message=message.message,
         label=message.label,

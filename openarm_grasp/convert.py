@@ -38,12 +38,15 @@ def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
     """The user's wish; a service request and an action goal have the same fields."""
     p = message.place_position
     place = (p.x, p.y, p.z) if message.has_place_position else None
-    return GraspRequest(message.label, message.arm or "auto", place, message.dry_run)
+    yaw = message.place_yaw if message.has_place_yaw else None
+    phase = message.phase or "all"
+    return GraspRequest(message.label, message.arm or "auto", place, message.dry_run, phase, yaw, message.timeout)
 
 
 def fill_answer(answer: Grasp.Response | Pick.Result, outcome: GraspOutcome) -> None:
     """Write an outcome into a service response or an action result."""
     answer.success = outcome.success
+    answer.outcome = outcome.kind
     answer.code = outcome.code.value
     answer.message = outcome.message
     answer.label = outcome.label

@@ -35,12 +35,18 @@ class GraspRequest:
         arm: "auto", "left" or "right".
         place: (2,) or (3,) footprint centre, base frame, m; None lets a free spot be chosen.
         dry_run: Plan and report, do not move.
+        phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
+        place_yaw: Of the object's x axis about the base z, rad (half a turn makes no difference); None: any.
+        timeout: s of robot time for all of it; 0: none.
     """
 
     label: str
     arm: str = "auto"
     place: tuple[float, ...] | None = None
     dry_run: bool = False
+    phase: str = "all"
+    place_yaw: float | None = None
+    timeout: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -259,6 +265,7 @@ class GraspOutcome:
         attempts: Physical attempts.
         place_position: (3,) target that was used, base frame, m; zeros when none.
         duration: s of robot time.
+        held: The object is in the hand.
     """
 
     code: Code
@@ -268,6 +275,18 @@ class GraspOutcome:
     attempts: int = 0
     place_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     duration: float = 0.0
+    held: bool = False
+
+    @property
+    def kind(self) -> str:
+        """SUCCESS; CANCELLED; PARTIAL: picked, not placed as asked; REFUSED: never touched; FAILED."""
+        if self.success:
+            return "SUCCESS"
+        if self.code is Code.CANCELLED:
+            return "CANCELLED"
+        if self.held:
+            return "PARTIAL"
+        return "FAILED" if self.attempts else "REFUSED"
 
     @property
     def success(self) -> bool:

@@ -21,6 +21,12 @@ from openarm_grasp.observation import Detection, Frame
 Array = NDArray[np.float64]
 
 
+#: Largest turn of a placed object from the yaw that was asked for, rad.
+YAW_TOLERANCE = float(np.radians(15.0))
+#: Edges of a footprint that differ by less are taken for equal, m; what is round looks so, too.
+SQUARE_WITHIN = 0.006
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What the gripper's joint says at rest.
@@ -152,7 +158,9 @@ def judge_lift(grip: tuple[Grip, str], sight: tuple[Sight, str]) -> Verdict:
     return Verdict(code, f"{grip[1]}, but {sight[1]}")
 
 
-def judge_place(label: str, p_target: Array, frames: Sequence[Frame], tolerance: float) -> Verdict:
+def judge_place(
+    label: str, p_target: Array, frames: Sequence[Frame], tolerance: float, yaw: float | None = None
+) -> Verdict:
     """Whether the camera sees the object at the place target after the arm has left.
 
     Args:
@@ -160,14 +168,21 @@ def judge_place(label: str, p_target: Array, frames: Sequence[Frame], tolerance:
         p_target: (3,) where its footprint centre shall stand, base frame, m; z is not judged.
         frames: Taken after the arm has left.
         tolerance: Largest horizontal distance, m.
+        yaw: Of its x axis, where one was asked for, rad; what looks square or round is not judged by it.
     """
     if not frames:
         return Verdict(Code.STALE_DATA, "no camera frame after the place")
     same = [d for d in frames[-1].detections if d.label == label]
     if not same:
         return Verdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
-    distance = min(float(np.linalg.norm((d.p_base - p_target)[:2])) for d in same)
+    nearest = min(same, key=lambda d: float(np.linalg.norm((d.p_base - p_target)[:2])))
+    distance = float(np.linalg.norm((nearest.p_base - p_target)[:2]))
     text = f"{label!r} stands {distance * 1e3:.0f} mm from its target"
     if distance > tolerance:
         return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
+    if yaw is not None and abs(float(nearest.size[0] - nearest.size[1])) > SQUARE_WITHIN:
+        off = abs((nearest.yaw - yaw + np.pi / 2.0) % np.pi - np.pi / 2.0)
+        text += f", turned {np.degrees(off):.0f}° from what was asked"
+        if off > YAW_TOLERANCE:
+            return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {np.degrees(YAW_TOLERANCE):.0f}°")
     return Verdict(Code.OK, text)

@@ -22,7 +22,7 @@ from openarm_grasp import convert, effects
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames, Planned, Trajectory
 from openarm_grasp.link_executor import RobotLink
-from openarm_grasp.performer import Performer
+from openarm_grasp.performer import Performer, check_deadline
 from openarm_grasp.routing import ARMS
 
 Array = NDArray[np.float64]
@@ -48,6 +48,7 @@ class GraspExecutor:
         self._grippers = {
             arm: ActionClient(node, gripper_action, f"/{arm}_gripper_controller/gripper_cmd") for arm in ARMS
         }
+        self.deadline_ns = 0
         self.performer = Performer(self, config)
 
     # --- begin, end, cancel
@@ -115,6 +116,7 @@ class GraspExecutor:
     def check(self) -> None:
         """Raise when the grasp shall not go on."""
         self._link.check()
+        check_deadline(self.now_ns, self.deadline_ns)
 
     def warn(self, text: str) -> None:
         """Write a warning into the log."""
@@ -125,7 +127,15 @@ class GraspExecutor:
         self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
     ) -> None:
         """Wait for a condition, `limit` s of wall clock."""
-        await self._link.until(done, limit, what, guard)
+        await self._link.until(done, limit, what, self._watched(guard))
+
+    def _watched(self, guard: Callable[[], None] | None) -> Callable[[], None]:
+        def look() -> None:
+            check_deadline(self.now_ns, self.deadline_ns)
+            if guard is not None:
+                guard()
+
+        return look
 
     async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
         """Carry out several things at once."""
@@ -161,7 +171,7 @@ class GraspExecutor:
         """Ask /motion/plan_approach."""
         goal = convert.plan_goal(effect, self._config.velocity_scale)
         what = f"{effect.arm} arm: planning"
-        result = await self._link.goal(self._plan, goal, self._config.limits.plan_timeout, what)
+        result = await self._link.goal(self._plan, goal, self._config.limits.plan_timeout, what, self._watched(None))
         return convert.planned_from_msg(result, len(goal.targets))
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
@@ -189,7 +199,7 @@ class GraspExecutor:
     async def _moved(
         self, client: ActionClient, goal: object, what: str, guard: Callable[[], None] | None = None
     ) -> None:
-        result = await self._link.goal(client, goal, self._config.limits.move_timeout, what, guard)
+        result = await self._link.goal(client, goal, self._config.limits.move_timeout, what, self._watched(guard))
         if not result.success:
             code = convert.code_from_text(result.code, Code.EXECUTION_FAILED)
             raise OpenArmError(code, f"{what}: {result.message or 'failed'}")
@@ -197,5 +207,6 @@ class GraspExecutor:
     async def grip(self, arm: str, joint: str, position: float, what: str) -> bool:
         """Ask the gripper's controller."""
         goal = convert.gripper_goal(self._config.gripper_action, joint, position)
-        result = await self._link.goal(self._grippers[arm], goal, self._config.limits.gripper_timeout, what)
+        limit = self._config.limits.gripper_timeout
+        result = await self._link.goal(self._grippers[arm], goal, limit, what, self._watched(None))
         return bool(result.stalled or result.reached_goal)

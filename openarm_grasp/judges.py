@@ -6,7 +6,7 @@ A judge also writes down what was learned. `OpenArmError` raised by a judge ends
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -15,8 +15,8 @@ from openarm_grasp import recipes
 from openarm_grasp.candidates import propose
 from openarm_grasp.effects import Frames, Outcome, Planned, Reach
 from openarm_grasp.evidence import Evidence, Grip, Verdict, judge_grip, judge_lift, judge_place, judge_sight
-from openarm_grasp.memory import Memory, Surroundings
-from openarm_grasp.observation import Sighting, find, labels_in_view, on_table
+from openarm_grasp.memory import Kept, Memory, Surroundings
+from openarm_grasp.observation import Detection, Sighting, find, labels_in_view, on_table
 from openarm_grasp.place import check_position, free_spots, place_targets
 from openarm_grasp.routing import arm_order, out_of_reach
 from openarm_grasp.states import Event, State
@@ -42,6 +42,8 @@ def detect(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judg
         return fail(m, outcome.code, outcome.message, final=True)
     m.seen = outcome.last(Frames)
     seen = labels_in_view(m.seen.frames)
+    if m.kept is not None:
+        return Event.DONE, f"holding {m.label!r}; in view: {', '.join(seen) or 'nothing'}"
     if seen and (not m.request.label or m.request.label in seen):
         return Event.DONE, f"in view: {', '.join(seen)}"
     if not seen:
@@ -57,6 +59,8 @@ def transform(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> J
             return _missed_round(m, outcome.code, outcome.message, around)
         return fail(m, outcome.code, outcome.message, final=True)
     m.seen = outcome.last(Frames)
+    if m.kept is not None:
+        return _place_what_is_held(m, m.kept, t_ns, around)
     limits, table = around.config.detect, around.table
     try:
         sighting = find(
@@ -69,8 +73,7 @@ def transform(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> J
     if age > limits.max_age:
         text = f"the newest detection is {age:.2f} s old, expected at most {limits.max_age:g} s"
         return _missed_round(m, Code.STALE_DATA, text, around)
-    # What is flat on the table is in nobody's way.
-    others = tuple(on_table(d, table.top_z) for d in sighting.others if d.top > table.top_z + 0.005)
+    others = _standing(sighting.others, table.top_z)
     m.sighting = Sighting(target, others, sighting.t_ns, sighting.spread)
     if m.request.place is not None:
         check_position(m.request.place, target, others, table.x, table.y)
@@ -78,6 +81,23 @@ def transform(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> J
     _offer_grasps(m, around)
     x, y, z = target.p_base
     return Event.DONE, f"{target.label!r} stands at ({x:.3f}, {y:.3f}, {z:.3f}) m; {len(m.offered)} ways to grasp it"
+
+
+def _standing(found: Iterable[Detection], table_z: float) -> tuple[Detection, ...]:
+    """What stands on the table; what is flat on it is in nobody's way."""
+    return tuple(on_table(d, table_z) for d in found if d.top > table_z + 0.005)
+
+
+def _place_what_is_held(m: Memory, kept: Kept, t_ns: int, around: Surroundings) -> Judgement:
+    newest = m.need_frames().frames[-1]
+    age, limit = (t_ns - newest.t_ns) * 1e-9, around.config.detect.max_age
+    if age > limit:
+        text = f"the newest detection is {age:.2f} s old, expected at most {limit:g} s"
+        return _missed_round(m, Code.STALE_DATA, text, around)
+    others = _standing((d for d in newest.detections if d.label != kept.target.label), around.table.top_z)
+    m.sighting, m.candidate = Sighting(kept.target, others, newest.t_ns, 0.0), kept.candidate
+    _offer_places(m, around)
+    return Event.SKIP, f"the {m.arm} hand holds {m.label!r}; {len(m.place_offered)} ways to place it"
 
 
 def _missed_round(m: Memory, code: Code, reason: str, around: Surroundings) -> Judgement:
@@ -122,6 +142,12 @@ def _next_arm(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
     if m.grasp_plan is not None:
         m.place_refused = True
         reason = f"it could grasp, but not place: {reason.removeprefix(f'{m.arm} arm: ')}"
+        # Held by other faces or turned by half, the object may stand where it is wanted.
+        hold = "/".join(m.need_candidate().id.split("/")[:2])
+        others = tuple(c for c in m.offered if not c.id.startswith(f"{hold}/"))
+        if others:
+            m.offered, m.candidate, m.grasp_plan, m.place_target = others, None, None, None
+            return Event.MORE, f"{reason}; trying another hold"
     m.refusals[m.arm] = Verdict(outcome.code, reason)
     m.candidate = m.grasp_plan = m.place_target = None
     m.arms = m.arms[1:]
@@ -162,7 +188,8 @@ def _offer_places(m: Memory, around: Surroundings, *, origin: bool = False) -> N
     else:
         spots = free_spots(m.arm, s.target, s.others, around.config)
     used = () if origin else m.used_places
-    m.place_offered = place_targets(s.target, m.need_candidate(), spots, around.config, used)
+    yaw = None if origin else m.request.place_yaw
+    m.place_offered = place_targets(s.target, m.need_candidate(), spots, around.config, used, yaw=yaw)
 
 
 # --- grasping
@@ -209,6 +236,9 @@ def lift(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgem
     if not verdict.ok:
         m.hand.holding = grip[0] is Grip.HELD
         return fail(m, verdict.code, verdict.reason)
+    if m.request.phase == "pick":
+        m.failure = None
+        return Event.SKIP, f"{verdict.reason}; the {m.arm} hand keeps it"
     m.hand.at_object = False
     return Event.DONE, verdict.reason
 
@@ -243,7 +273,7 @@ def place(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judge
 
 def _put_back(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
     """The place cannot be reached: put the object back, or keep it when that cannot be done either."""
-    if m.hand.putting_back:
+    if m.hand.putting_back or m.kept is not None:
         text = f"{outcome.message}; the {m.arm} hand still holds {m.label!r}: open it over a safe place"
         return fail(m, Code.PLACE_FAILED, text, final=True)
     fail(m, Code.PLACE_FAILED, f"{m.label!r} could not be placed ({outcome.code}): {outcome.message}")
@@ -269,7 +299,7 @@ def reset(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judge
         return fail(m, Code.PLACE_FAILED, f"put down, but not seen since: {outcome.message}", final=True)
     else:
         frames, tolerance = outcome.last(Frames).frames, around.config.place.tolerance
-        verdict = judge_place(m.label, m.need_place_target().position, frames, tolerance)
+        verdict = judge_place(m.label, m.need_place_target().position, frames, tolerance, m.request.place_yaw)
         if verdict.ok:
             m.failure = None
             return Event.DONE, f"{verdict.reason}, placed by the {m.arm} arm"
@@ -294,7 +324,7 @@ def _no_way_home(m: Memory, outcome: Outcome) -> Judgement:
 def start_over(m: Memory, came_from: State) -> None:
     """Look again; after a physical attempt with the next number, the failed grasp marked, the object's name kept."""
     if came_from is State.RESET:
-        m.request = replace(m.request, label=m.label)
+        m.request = replace(m.request, label=m.label, phase="all" if m.kept else m.request.phase)
         m.used = m.used | {m.candidate.id} if m.candidate else m.used
         m.attempt += 1
         m.detect_rounds = m.plans_failed = 0

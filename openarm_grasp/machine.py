@@ -8,15 +8,20 @@ passed in; waiting is an effect.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.effects import Effects, GraspOutcome, GraspRequest, Outcome
 from openarm_grasp.evidence import Verdict
 from openarm_grasp.judges import JUDGES, Judgement, fail, start_over
-from openarm_grasp.memory import Memory, Surroundings
+from openarm_grasp.memory import Hand, Kept, Memory, Surroundings
 from openarm_grasp.recipes import RECIPES
 from openarm_grasp.routing import arm_order
-from openarm_grasp.states import TRANSITIONS, Event, State
+from openarm_grasp.states import TRANSITIONS, Event, State, load_transitions
 
+#: What a request may ask for.
+PHASES = ("all", "pick", "place")
 #: These end a request wherever it stands, with the arm where it is.
 _STOPS = {Code.CANCELLED: Event.CANCEL, Code.ROBOT_LOST: Event.LOST, Code.INTERNAL: Event.LOST}
 
@@ -30,14 +35,21 @@ class GraspMachine:
 
     def __init__(self, around: Surroundings) -> None:
         self._around = around
+        path = around.config.transitions
+        self._transitions = load_transitions(Path(path)) if path else TRANSITIONS
         self._memory: Memory | None = None
         self.state = State.IDLE
         self.previous = State.IDLE
         self.reason = "waiting for a request"
         #: How the last request ended; None while one runs.
         self.outcome: GraspOutcome | None = None
-        #: The arm that kept an object in its hand when the last request ended, or "".
-        self.carrying = ""
+        #: What stayed in a hand when the last request ended.
+        self.kept: Kept | None = None
+
+    @property
+    def carrying(self) -> str:
+        """The arm that kept an object in its hand when the last request ended, or ""."""
+        return self.kept.arm if self.kept else ""
 
     @property
     def memory(self) -> Memory | None:
@@ -70,7 +82,8 @@ class GraspMachine:
             The recipe of the state that follows; empty when the request has ended and `outcome` says how.
 
         Raises:
-            OpenArmError: BUSY, for a request while one runs; INVALID_ARGUMENT, for a request with an unknown arm.
+            OpenArmError: BUSY, for a request while one runs; INVALID_ARGUMENT, for one with an unknown arm or phase;
+                NOT_READY, for a place when no hand holds anything.
         """
         m = self._memory
         if isinstance(event, GraspRequest):
@@ -78,7 +91,11 @@ class GraspMachine:
                 running = f"a grasp of {m.label or 'any object'!r} is running (state {self.state.value})"
                 raise OpenArmError(Code.BUSY, f"{running}; cancel it or wait")
             arm_order(event.arm, 0.0, 0.0)
-            self._memory = m = Memory(event, t_ns)
+            if event.phase not in PHASES:
+                raise OpenArmError(
+                    Code.INVALID_ARGUMENT, f"phase {event.phase!r} does not exist; valid: {', '.join(PHASES)}"
+                )
+            self._memory = m = self._place_request(event, t_ns) if event.phase == "place" else Memory(event, t_ns)
             self.outcome = None
             return self._enter(m, Event.REQUEST, f"asked for {event.label or 'any object'!r}", t_ns)
         if m is None:
@@ -86,9 +103,23 @@ class GraspMachine:
         kind, reason = self._judge(m, event, t_ns)
         return self._enter(m, kind, reason, t_ns)
 
+    def _place_request(self, request: GraspRequest, t_ns: int) -> Memory:
+        kept = self.kept
+        if kept is None:
+            raise OpenArmError(Code.NOT_READY, "no hand holds anything that was picked; ask for phase pick first")
+        label = kept.target.label
+        if request.label not in ("", label) or request.arm not in ("", "auto", kept.arm):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"asked to place {request.label or 'an object'!r} with arm {request.arm!r}, but it is the"
+                f" {kept.arm} hand that holds {label!r}",
+            )
+        return Memory(replace(request, label=label), t_ns, arm=kept.arm, kept=kept, hand=Hand(holding=True))
+
     def _judge(self, m: Memory, outcome: Outcome, t_ns: int) -> Judgement:
         if outcome.code in _STOPS:
-            m.failure = Verdict(outcome.code, outcome.message)
+            late = 0.0 < m.request.timeout <= (t_ns - m.started_ns) * 1e-9 and outcome.code is Code.CANCELLED
+            m.failure = Verdict(Code.TIMEOUT if late else outcome.code, outcome.message)
             # Fingers that were closing may have the object between them by now.
             m.hand.holding = m.hand.holding or self.state is State.CLOSE_GRIPPER
             return _STOPS[outcome.code], outcome.message
@@ -98,7 +129,7 @@ class GraspMachine:
             return fail(m, error.code, error.message, final=True)
 
     def _enter(self, m: Memory, event: Event, reason: str, t_ns: int) -> Effects:
-        came_from, self.state = self.state, TRANSITIONS[self.state][event]
+        came_from, self.state = self.state, self._transitions[self.state][event]
         self.previous, self.reason = came_from, reason
         waits = came_from is State.DETECT and event is Event.AGAIN
         if self.state is State.IDLE and not waits:
@@ -106,7 +137,7 @@ class GraspMachine:
             return ()
         if self.state is State.DETECT and came_from in (State.TRANSFORM, State.PLAN, State.RESET):
             start_over(m, came_from)
-        if self.state is State.MOVE_TO_PREGRASP:
+        if self.state is State.MOVE_TO_PREGRASP or (self.state is State.PLACE and came_from is State.TRANSFORM):
             m.tried += 1
         return RECIPES[self.state](m, self._around)
 
@@ -122,6 +153,10 @@ class GraspMachine:
             attempts=m.tried,
             place_position=(x, y, z),
             duration=(t_ns - m.started_ns) * 1e-9,
+            held=m.hand.holding,
         )
-        self.carrying = m.arm if m.hand.holding else ""
+        if m.hand.holding and m.sighting is not None and m.candidate is not None:
+            self.kept = Kept(m.arm, m.sighting.target, m.candidate)
+        elif not m.hand.holding and not m.request.dry_run:
+            self.kept = None
         self._memory = None

@@ -13,7 +13,7 @@ from openarm_grasp.candidates import GraspCandidate
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames, GraspRequest, Planned
 from openarm_grasp.evidence import Verdict
-from openarm_grasp.observation import Sighting
+from openarm_grasp.observation import Detection, Sighting
 from openarm_grasp.place import PlaceTarget
 
 ValueT = TypeVar("ValueT")
@@ -59,6 +59,21 @@ class Hand:
     retreats: int = 0
 
 
+@dataclass(frozen=True)
+class Kept:
+    """What a hand kept when its request ended.
+
+    Attributes:
+        arm: Whose hand.
+        target: The object as it stood before the grasp.
+        candidate: How it is held.
+    """
+
+    arm: str
+    target: Detection
+    candidate: GraspCandidate
+
+
 @dataclass
 class Memory:
     """The request and all that was learned since it came.
@@ -87,6 +102,7 @@ class Memory:
         place_target: The chosen one.
         place_plan: Its trajectories.
         hand: Where the hand stands.
+        kept: What an earlier request left in the hand, to be placed by this one.
     """
 
     request: GraspRequest
@@ -112,6 +128,7 @@ class Memory:
     place_target: PlaceTarget | None = None
     place_plan: Planned | None = None
     hand: Hand = field(default_factory=Hand)
+    kept: Kept | None = None
 
     @property
     def label(self) -> str:
@@ -143,6 +160,7 @@ class Memory:
         self.seen = self.sighting = self.candidate = self.grasp_plan = self.place_target = self.place_plan = None
         self.arms, self.refusals, self.offered, self.place_offered, self.arm = (), {}, (), (), ""
         self.place_refused = self.probed = False
+        self.kept = None
         self.hand = Hand()
 
 

@@ -96,7 +96,6 @@ class GraspNode(BaseNode[GraspConfig]):
         self._running = True
         try:
             await self._executor.begin(moves=not request.dry_run)
-            self._refuse_full_hand(request)
             return await self._run(request, on_status)
         except OpenArmError as error:
             self.get_logger().warning(f"grasp of {request.label!r} refused: {error}")
@@ -115,24 +114,6 @@ class GraspNode(BaseNode[GraspConfig]):
         self.get_logger().info(report) if result.success else self.get_logger().warning(report)
         self.diagnose(True, report, state=self._machine.state.value)
         return result
-
-    def _refuse_full_hand(self, request: GraspRequest) -> None:
-        """An object that an ended grasp left in the hand would be dropped by going home and opening.
-
-        Raises:
-            OpenArmError: NOT_READY, when one is still there.
-        """
-        arm = self._machine.carrying
-        if not arm or request.dry_run:
-            return
-        gap = self._executor.performer.gap(arm)
-        hand = self.config.hand
-        if self.config.held.closed_below < gap < 2.0 * (hand.opening - hand.open_tolerance):
-            raise OpenArmError(
-                Code.NOT_READY,
-                f"the {arm} hand still holds what the last grasp picked (gap {gap * 1e3:.0f} mm);"
-                f" open it with /{arm}_gripper_controller/gripper_cmd where that is safe",
-            )
 
     def _tell(self, on_status: OnStatus | None) -> None:
         machine, t_ns = self._machine, self._executor.now_ns

@@ -60,6 +60,9 @@ class Link(Protocol):
         """Name of the base frame."""
         ...
 
+    deadline_ns: int
+    """Robot time after which `check` raises CANCELLED; 0: none."""
+
     @property
     def now_ns(self) -> int:
         """Robot time."""
@@ -142,6 +145,25 @@ class Performer:
             OpenArmError: NOT_READY, when no joint state says so.
         """
         return self._hands[arm].gap()
+
+    def check_hands(self, machine: GraspMachine, request: GraspRequest) -> None:
+        """Refuse what would drop an object that an ended request left in the hand, and forget one that is gone.
+
+        Raises:
+            OpenArmError: NOT_READY.
+        """
+        kept, hand = machine.kept, self._config.hand
+        if kept is None or request.dry_run:
+            return
+        gap = self.gap(kept.arm)
+        if not self._config.held.closed_below < gap < 2.0 * (hand.opening - hand.open_tolerance):
+            machine.kept = None  # taken or dropped meanwhile
+        elif request.phase != "place":
+            raise OpenArmError(
+                Code.NOT_READY,
+                f"the {kept.arm} hand still holds {kept.target.label!r} (gap {gap * 1e3:.0f} mm); ask for phase place"
+                f" first, or open it with /{kept.arm}_gripper_controller/gripper_cmd where that is safe",
+            )
 
     async def perform(self, recipe: Effects) -> Outcome:
         """Carry out a recipe; the first effect that fails ends it."""
@@ -261,15 +283,25 @@ class Performer:
         return hand.evidence(effect.expected, link.effort(hand.joint), effect.T_base_tcp)
 
 
+def check_deadline(now_ns: int, deadline_ns: int) -> None:
+    """Raise CANCELLED when the time of a request is over; for links."""
+    if 0 < deadline_ns < now_ns:
+        raise OpenArmError(
+            Code.CANCELLED, "the time for the request is over; the arm holds and the hand keeps its object"
+        )
+
+
 async def run_request(
     machine: GraspMachine, performer: Performer, link: Link, request: GraspRequest, tell: Callable[[], None]
 ) -> GraspOutcome:
     """Carry out one request from beginning to end; `tell` is called after each transition.
 
     Raises:
-        OpenArmError: BUSY or INVALID_ARGUMENT, when the machine does not take the request.
+        OpenArmError: BUSY, INVALID_ARGUMENT or NOT_READY, when the request is not taken.
     """
+    performer.check_hands(machine, request)
     recipe = machine.step(request, link.now_ns)
+    link.deadline_ns = link.now_ns + round(request.timeout * 1e9) if request.timeout > 0.0 else 0
     while recipe:
         try:
             tell()

@@ -18,6 +18,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.candidates import UP, GraspCandidate
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.evidence import SQUARE_WITHIN
 from openarm_grasp.observation import Detection
 
 Array = NDArray[np.float64]
@@ -55,6 +56,8 @@ def place_targets(
     spots: Sequence[Array],
     config: GraspConfig,
     used: Sequence[PlaceTarget] = (),
+    *,
+    yaw: float | None = None,
 ) -> tuple[PlaceTarget, ...]:
     """Hand poses that put the object on each of the spots, best first: earlier spots, then smaller turns.
 
@@ -64,9 +67,10 @@ def place_targets(
         spots: (2,) or (3,) footprint centres, base frame, m, best first; z is not read.
         config: Parameters.
         used: Targets that have failed before: their spots (where there are others) or turns come last.
+        yaw: Of the object's x axis about the base z when it stands there, rad; None: any.
     """
     T_object_tcp = se3.inverse(target.T_base_object) @ candidate.T_base_tcp
-    yaws = yaw_offsets(config.place.yaw_step_deg)
+    yaws = yaw_offsets(config.place.yaw_step_deg) if yaw is None else turns_to(target, yaw)
     # Small turns of every spot come first: a hopeless spot must not use up the planner's patience. Turns of one spot
     # score alike, so that the planner takes the one that is near.
     n = len(spots)
@@ -112,6 +116,14 @@ def yaw_offsets(step_deg: float) -> tuple[float, ...]:
     if abs(k * step_deg - 180.0) < 1e-9:
         offsets.append(float(np.pi))
     return tuple(offsets)
+
+
+def turns_to(target: Detection, yaw: float) -> tuple[float, ...]:
+    """Turns that give a box a yaw, rad, smallest first; it looks the same after half a turn, a square one a quarter."""
+    step = np.pi / 2.0 if abs(float(target.size[0] - target.size[1])) < SQUARE_WITHIN else np.pi
+    first = (yaw - target.yaw) % step
+    turns = [(first + k * step + np.pi) % (2.0 * np.pi) - np.pi for k in range(round(2.0 * np.pi / step))]
+    return tuple(sorted((float(turn) for turn in turns), key=abs))
 
 
 def free_spots(arm: str, target: Detection, others: Sequence[Detection], config: GraspConfig) -> tuple[Array, ...]:

@@ -43,6 +43,10 @@ def idle(m: Memory, around: Surroundings) -> Effects:
 def detect(m: Memory, around: Surroundings) -> Effects:
     """Clear the camera's view, then look. A dry run moves nothing."""
     look = Observe(around.config.detect.frames)
+    if m.kept is not None:
+        # The hand that holds something stays where it is; it may be among the objects.
+        others = tuple(arm for arm in ARMS if arm != m.kept.arm)
+        return (look,) if m.detect_rounds > 0 else (GoHome(others), look)
     if m.request.dry_run or m.detect_rounds > 0 or m.plans_failed > 0:
         return (look,)
     return (GoHome(ARMS, back_off_below=around.table.top_z + 2.0 * around.config.approach.lift_height), look)

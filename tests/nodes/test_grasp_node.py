@@ -473,6 +473,27 @@ def test_the_client_picks_from_plain_python(bench):
         results[1].raise_for_code()
 
 
+def test_p01_p02_the_client_picks_and_places_in_two_requests(bench):
+    results = []
+
+    def script() -> None:
+        with GraspClient() as grasp:
+            results.append(grasp.pick("red", phase="pick"))
+            results.append(grasp.pick("blue"))
+            results.append(grasp.pick("red", phase="place", place=(0.3, -0.3)))
+
+    thread = Thread(target=script)
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    thread.join()
+    picked, other, placed = results
+    assert (picked.outcome, picked.code) == ("SUCCESS", Code.OK), picked.message
+    assert (other.outcome, other.code) == ("REFUSED", Code.NOT_READY)
+    assert "still holds 'red'" in other.message
+    assert (placed.outcome, placed.label) == ("SUCCESS", "red"), placed.message
+    assert bench.world.objects["red"][:2] == pytest.approx((0.3, -0.3), abs=0.005)
+
+
 def test_the_client_can_cancel_from_its_feedback(bench):
     results = []
 

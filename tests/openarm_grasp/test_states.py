@@ -4,8 +4,12 @@
 from __future__ import annotations
 
 import pytest
+import yaml
 
-from openarm_grasp.states import TRANSITIONS, Event, State
+from openarm_common.config import load_yaml
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import config_dir
+from openarm_grasp.states import TRANSITIONS, Event, State, as_text, load_transitions, mermaid
 
 S, E = State, Event
 
@@ -55,3 +59,59 @@ def test_a_request_changes_nothing_while_a_grasp_runs(state):
 @pytest.mark.parametrize("state", list(State))
 def test_the_end_is_idle_or_the_way_home(state):
     assert TRANSITIONS[state][E.END] in (S.IDLE, S.RESET)
+
+
+def edited(tmp_path, **changes: str):
+    """The suite's table with some pairs changed, as a file: DETECT_again="DETECT"."""
+    table = load_yaml(config_dir() / "params" / "grasp_transitions.yaml")
+    for key, follower in changes.items():
+        state, _, event = key.rpartition("_")
+        table[state][event] = follower
+    path = tmp_path / "table.yaml"
+    path.write_text(yaml.safe_dump(table))
+    return path
+
+
+def test_p29_a_table_may_be_edited_within_limits(tmp_path):
+    table = load_transitions(edited(tmp_path, DETECT_again="DETECT", RESET_again="IDLE"))
+    assert table[S.DETECT][E.AGAIN] is S.DETECT
+    assert table[S.RESET][E.AGAIN] is S.IDLE
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"CLOSE_GRIPPER_done": "PLACE"}, "CLOSE_GRIPPER.done is PLACE, expected LIFT"),
+        ({"LIFT_again": "DETECT"}, "goes home before it tries again"),
+        ({"PLACE_cancel": "RESET"}, "PLACE.cancel is RESET, expected IDLE"),
+        ({"PLAN_skip": "PLACE"}, "only a hand that holds its object already"),
+        ({"IDLE_request": "PLAN"}, "nothing is grasped that was not looked for"),
+        ({"LIFT_done": "FLY"}, "LIFT.done is 'FLY', expected one of IDLE"),
+    ],
+)
+def test_p29_what_would_skip_evidence_or_the_way_home_is_refused(tmp_path, change, why):
+    with pytest.raises(OpenArmError, match=why) as error:
+        load_transitions(edited(tmp_path, **change))
+    assert error.value.code is Code.CONFIG_INVALID
+
+
+def test_p29_missing_and_unknown_names_are_all_told(tmp_path):
+    path = edited(tmp_path)
+    table = yaml.safe_load(path.read_text())
+    del table["LIFT"]["done"]
+    table["FLY"] = {}
+    path.write_text(yaml.safe_dump(table))
+    with pytest.raises(OpenArmError) as error:
+        load_transitions(path)
+    assert "LIFT.done is 'None'" in error.value.message
+    assert "no state 'FLY'" in error.value.message
+
+
+def test_p29_the_drawings_hold_every_state_and_the_skips():
+    drawing = mermaid(TRANSITIONS)
+    assert all(state.value in drawing for state in State)
+    assert "TRANSFORM --> PLACE: skip" in drawing
+    assert "LIFT --> RESET: again, end" in drawing
+    lines = as_text(TRANSITIONS).splitlines()
+    assert len(lines) == 11
+    assert lines[0].split() == [event.value for event in Event]

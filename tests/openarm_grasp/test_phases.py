@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests in parts: pick, place, a yaw, a time limit, and what the answer calls itself. On the robot of a campaign."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from openarm_bringup.campaign_robot import SimulatedSenses
+from openarm_bringup.campaign_tasks import Task
+from openarm_bringup.campaign_trial import Trials
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene import Scene, SceneObject
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.effects import GraspOutcome, GraspRequest
+from openarm_grasp.performer import run_request
+
+BOX = SceneObject(name="blue_box", shape="box", size=(0.045, 0.068, 0.06), color="blue", position=(0.26, -0.2), yaw=0.4)
+CUBE = SceneObject(name="red_cube", shape="box", size=(0.05, 0.05, 0.05), color="red", position=(0.26, 0.2))
+
+
+class Bench:
+    """A robot, its grasp machine, and requests to it."""
+
+    def __init__(self, *objects: SceneObject) -> None:
+        scene = Scene(name="bench", objects=objects)
+        self.trials = Trials(Task("nominal", 1, scene, ()), SimulatedSenses(depth_noise=False), GraspConfig())
+        self.trials.robot.pass_time(0.3)
+
+    def ask(self, label: str = "", **kwargs) -> GraspOutcome:
+        t = self.trials
+        t.link.cancelled = ""
+        work = run_request(t.machine, t.performer, t.link, GraspRequest(label, **kwargs), t._tell)
+        return t.link.run(work)
+
+    def position(self, name: str) -> np.ndarray:
+        poses = {o.object.name: o.T_world_object for o in self.trials.robot.world.objects()}
+        return poses[name][:3, 3]
+
+    def yaw(self, name: str) -> float:
+        poses = {o.object.name: o.T_world_object for o in self.trials.robot.world.objects()}
+        return math.atan2(poses[name][1, 0], poses[name][0, 0])
+
+
+@pytest.fixture(scope="module")
+def picked() -> Bench:
+    """A bench whose right hand holds the blue box."""
+    bench = Bench(BOX, CUBE)
+    outcome = bench.ask("blue", phase="pick")
+    assert outcome.success, outcome.message
+    assert outcome.kind == "SUCCESS"
+    assert outcome.held
+    return bench
+
+
+def test_p01_a_pick_ends_with_the_object_in_the_hand(picked: Bench) -> None:
+    assert picked.position("blue_box")[2] > 0.40 + 0.03 + 0.08
+    assert picked.trials.machine.carrying == "right"
+    states = [step.state for step in picked.trials.steps]
+    assert "PLACE" not in states
+    picked.trials.robot.pass_time(2.0)
+    assert picked.position("blue_box")[2] > 0.50  # and it stays there
+
+
+def test_p01_a_full_hand_is_not_opened_by_another_request(picked: Bench) -> None:
+    with pytest.raises(OpenArmError, match="still holds 'blue'") as error:
+        picked.ask("red")
+    assert error.value.code is Code.NOT_READY
+
+
+def test_p01_a_place_that_contradicts_the_hand_is_refused(picked: Bench) -> None:
+    with pytest.raises(OpenArmError, match="right hand that holds 'blue'"):
+        picked.ask("red", phase="place")
+
+
+def test_p01_p09_a_place_puts_it_down_at_position_and_yaw(picked: Bench) -> None:
+    outcome = picked.ask("", phase="place", place=(0.30, -0.30), place_yaw=0.6)
+    assert outcome.success, outcome.message
+    assert outcome.kind == "SUCCESS"
+    assert np.linalg.norm(picked.position("blue_box")[:2] - (0.30, -0.30)) < 0.02
+    off = (picked.yaw("blue_box") - 0.6 + math.pi / 2.0) % math.pi - math.pi / 2.0
+    assert abs(off) < math.radians(15.0)
+    assert picked.trials.machine.kept is None
+    with pytest.raises(OpenArmError, match="no hand holds anything"):
+        picked.ask("", phase="place")
+
+
+def test_a_yaw_that_one_hold_cannot_give_is_given_by_another() -> None:
+    bench = Bench(BOX)
+    outcome = bench.ask("blue", place=(0.30, -0.30), place_yaw=1.2)
+    assert outcome.success, outcome.message
+    assert any("trying another hold" in step.reason for step in bench.trials.steps)
+    off = (bench.yaw("blue_box") - 1.2 + math.pi / 2.0) % math.pi - math.pi / 2.0
+    assert abs(off) < math.radians(15.0)
+
+
+def test_p02_a_time_limit_ends_a_carry_with_the_object_held_and_a_place_frees_it() -> None:
+    bench = Bench(BOX)
+    whole = Bench(BOX).ask("blue").duration
+    outcome = bench.ask("blue", timeout=0.6 * whole)
+    assert outcome.code is Code.TIMEOUT
+    assert outcome.kind == "PARTIAL"
+    assert bench.position("blue_box")[2] > 0.43  # not dropped
+    outcome = bench.ask("", phase="place")
+    assert outcome.success, outcome.message
+
+
+@pytest.mark.parametrize("state", ["MOVE_TO_PREGRASP", "MOVE_TO_GRASP", "CLOSE_GRIPPER", "LIFT", "PLACE", "RESET"])
+def test_p21_a_cancel_in_each_state_drops_nothing_and_the_next_request_works(state: str) -> None:
+    bench = Bench(BOX)
+    trials, robot = bench.trials, bench.trials.robot
+    entered: list[int] = []
+    fastest: list[float] = []
+
+    def watch() -> None:
+        if trials.machine.state.value == state and not entered:
+            entered.append(robot.t_ns)
+        if entered and robot.t_ns - entered[0] > 400_000_000:
+            trials.link.cancelled = "cancelled on purpose"
+        fastest.append(float(np.linalg.norm(robot.world.objects()[0].linear)))
+
+    trials.link.watch = watch
+    outcome = bench.ask("blue")
+    trials.link.watch = lambda: None
+    assert outcome.code is Code.CANCELLED
+    assert outcome.kind == "CANCELLED"
+    for _ in range(150):
+        robot.tick()
+        fastest.append(float(np.linalg.norm(robot.world.objects()[0].linear)))
+    assert max(fastest) < 1.0  # a fall of 5 cm ends at 1 m/s
+    holds = trials.machine.kept is not None and trials.performer.gap("right") < 0.08
+    outcome = bench.ask("", phase="place") if holds else bench.ask("blue")
+    assert outcome.success, outcome.message
+
+
+def test_p02_the_five_outcomes() -> None:
+    with pytest.raises(OpenArmError, match="valid: all, pick, place"):
+        Bench(BOX).ask("", phase="throw")
+
+    def kind(code: Code, attempts: int, held: bool = False) -> str:
+        return GraspOutcome(code, "", "red", attempts=attempts, held=held).kind
+
+    assert kind(Code.OK, 1) == "SUCCESS"
+    assert kind(Code.PLACE_FAILED, 1, held=True) == "PARTIAL"
+    assert kind(Code.GRASP_MISSED, 3) == "FAILED"
+    assert kind(Code.TOO_WIDE, 0) == "REFUSED"
+    assert kind(Code.CANCELLED, 1, held=True) == "CANCELLED"
+
+
+def test_an_object_taken_from_the_hand_is_forgotten() -> None:
+    bench = Bench(BOX, CUBE)
+    assert bench.ask("blue", phase="pick").success
+    bench.trials.link.run(bench.trials.link.grip("right", "openarm_right_finger_joint1", 0.044, "open"))
+    bench.trials.robot.pass_time(1.0)
+    with pytest.raises(OpenArmError, match="no hand holds anything"):
+        bench.ask("", phase="place")
