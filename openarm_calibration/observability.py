@@ -31,6 +31,8 @@ _NO_TRANSLATION = 0.003  # m
 _SMALL_ROTATION = math.radians(15.0)
 _SMALL_SECOND_AXIS = math.radians(10.0)
 _WORST_CONDITION = 1e12
+#: No arm in order is off by so much from pose to pose, m and rad.
+_BAD_ARM = (1.5e-3, math.radians(0.15))
 #: Six columns of a mount in units of 1 mm and 0.1°.
 UNITS = np.array([1e-3] * 3 + [math.radians(0.1)] * 3)
 
@@ -142,15 +144,17 @@ def require_accuracy(problem: Problem, estimate: Estimate, most_translation: flo
                 seen = motion(problem.A[(problem.camera == camera) & (problem.kind < 2)])
                 raise OpenArmError(
                     Code.DEGENERATE,
-                    f"{_cause(seen)}: the predicted error is {t * 1e3:.2g} mm and {math.degrees(r):.2g}°,"
-                    f" more than {most_translation * 1e3:g} mm or {math.degrees(most_rotation):g}°; {_advice(seen)}",
+                    f"{_cause(seen, estimate)}: the predicted error is {t * 1e3:.2g} mm and {math.degrees(r):.2g}°,"
+                    f" more than {most_translation * 1e3:g} mm or {math.degrees(most_rotation):g}°;"
+                    f" {_advice(seen, estimate)}",
                 )
     else:
         seen = motion(problem.A[problem.kind < 2])
         raise OpenArmError(
             Code.DEGENERATE,
-            f"{_cause(seen)}: some direction of the mounts is not determined"
-            f" (condition {condition(values):.1e}, at most {_WORST_CONDITION:.0e} is accepted); {_advice(seen)}",
+            f"{_cause(seen, estimate)}: some direction of the mounts is not determined"
+            f" (condition {condition(values):.1e}, at most {_WORST_CONDITION:.0e} is accepted);"
+            f" {_advice(seen, estimate)}",
         )
 
 
@@ -167,7 +171,7 @@ def condition_number(problem: Problem, information: Array) -> float:
     return condition(np.linalg.eigvalsh(scaled).astype(np.float64))
 
 
-def _cause(seen: Motion) -> str:
+def _cause(seen: Motion, estimate: Estimate) -> str:
     if seen.rotation < _SMALL_ROTATION:
         return f"rotations too small (up to {math.degrees(seen.rotation):.1f}°)"
     if seen.second < _SMALL_SECOND_AXIS:
@@ -176,15 +180,28 @@ def _cause(seen: Motion) -> str:
         )
     if seen.poses < 6:
         return f"too few poses ({seen.poses})"
+    if _contradicting(estimate):
+        noise = estimate.noise
+        return (
+            f"{seen.poses} poses that contradict each other, as if the robot were off by"
+            f" {noise.translation * 1e3:.1f} mm and {math.degrees(noise.rotation):.2f}°"
+        )
     return f"{seen.poses} poses that are too noisy or too far from the board"
 
 
-def _advice(seen: Motion) -> str:
+def _advice(seen: Motion, estimate: Estimate) -> str:
     if seen.rotation < _SMALL_ROTATION:
         return "rotate the hand by 30° or more between samples, about two different axes"
     if seen.second < _SMALL_SECOND_AXIS:
         return f"rotate by 15° or more about {_other(seen.axis)} too"
+    if seen.poses >= 6 and _contradicting(estimate):
+        return "check the intrinsics in camera_info, the size of the board, and that it did not move"
     return "add poses, nearer to the board and with larger rotations"
+
+
+def _contradicting(estimate: Estimate) -> bool:
+    """Whether the robot's errors, as estimated, are larger than those of any arm in order."""
+    return estimate.noise.translation > _BAD_ARM[0] or estimate.noise.rotation > _BAD_ARM[1]
 
 
 def _name(axis: Array) -> str:

@@ -34,6 +34,7 @@ class Limits(Config):
     rotation: float = Field(default=math.radians(0.05), gt=0.0, description="predicted error of the rotation, rad")
     held_out: float = Field(default=1e-3, gt=0.0, description="rms error at the board of poses that were left out, m")
     scale: float = Field(default=0.003, gt=0.0, description="of the board against what is stated")
+    focal: float = Field(default=0.005, gt=0.0, description="of the focal length against the camera's info")
     samples: int = Field(default=10, ge=3, description="fewer are a warning")
     drift: float = Field(default=2e-3, gt=0.0, description="distance from the stored calibration, m")
 
@@ -144,6 +145,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
     sigma_t, sigma_r = solution.sigma()
     one_out, folds = held_out(problem, solution, len(problem)), held_out(problem, solution, 5)
     scale, scale_sigma = _scale(solution)
+    focal, focal_sigma = _focal(solution)
     poses = len(np.unique(problem.pose[solution.used]))
     figures: dict[str, Any] = {
         "sigma_translation": sigma_t, "sigma_rotation": sigma_r,
@@ -153,7 +155,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         "reprojection_px": _rms(problem.subset(solution.used), solution.estimate.X, solution.estimate.Z),
         "leave_one_out_px": one_out.px, "leave_one_out": one_out.metres,
         "five_fold_px": folds.px, "five_fold": folds.metres,
-        "scale": scale, "scale_sigma": scale_sigma,
+        "scale": scale, "scale_sigma": scale_sigma, "focal": focal, "focal_sigma": focal_sigma,
         "by_sample": {name: {"px": px, "metres": m} for name, (px, m) in one_out.by_name.items()},
         "influence": {v.name: solution.tests[int(problem.pose[k])].influence for k, v in enumerate(problem.views)},
         "outliers": {outlier.name: outlier.reason for outlier in solution.outliers},
@@ -166,6 +168,9 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         checks.append((one_out.metres / limits.held_out, f"held-out error {one_out.metres * 1e3:.2f} mm at the board"))
     beyond = max(abs(scale - 1.0) - 3.0 * scale_sigma, 0.0)
     checks.append((beyond / limits.scale, f"the board seems {abs(scale - 1.0) * 100:.2f} % off its stated size"))
+    away = max(abs(focal - 1.0) - 3.0 * focal_sigma, 0.0)
+    told = f"the focal length seems {(focal - 1.0) * 100:+.2f} % off what camera_info says; are these its intrinsics?"
+    checks.append((away / limits.focal, told))
     share = len(solution.outliers) / max(len(problem), 1)
     checks.append((share / 0.1, f"{len(solution.outliers)} of {len(problem)} samples contradict the others"))
     checks.append((1.5 if poses < limits.samples else 0.0, f"{poses} poses, {limits.samples} are wanted"))
@@ -181,6 +186,29 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
     worst = max(ratio for ratio, _ in checks)
     grade: Grade = "fail" if worst > 3.0 else "warn" if worst > 1.0 else "pass"
     return Verdict(grade, reasons, figures)
+
+
+def _focal(solution: Solution) -> tuple[float, float]:
+    """Focal length over the one that the camera states, when the intrinsics are free, and its deviation.
+
+    The larger distance of fx and fy; of several cameras the first.
+    """
+    part = solution.problem.subset(solution.used)
+    now, stated = solution.estimate, part.intrinsics[0]
+    estimate = refine(part, now.X, now.Z, now.noise, extras=("intrinsics",))
+    if estimate.intrinsics is None:
+        return 1.0, math.inf
+    try:
+        covariance = estimate.covariance()
+    except OpenArmError:
+        return 1.0, math.inf  # views that do not tell it
+    first = 6 * (part.cameras + part.boards)
+    both = [
+        (float(estimate.intrinsics[0, k]) / f, math.sqrt(float(covariance[first + k, first + k])) / f)
+        for k, f in enumerate((stated.fx, stated.fy))
+    ]
+    change, sigma = max(both, key=lambda pair: abs(pair[0]) - 3.0 * pair[1])
+    return 1.0 + change, sigma
 
 
 def _scale(solution: Solution) -> tuple[float, float]:

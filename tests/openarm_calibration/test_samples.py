@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from openarm_calibration.gate import GateConfig, match
 from openarm_calibration.refine import mount_error
 from openarm_calibration.samples import load_session, without
-from openarm_calibration.solve import solve
+from openarm_calibration.solve import SolveConfig, solve
 from openarm_calibration.verdict import assess, estimate_delay, side_by_side
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
@@ -128,6 +129,27 @@ def test_p28_the_verdict_has_held_out_errors_and_reasons(session) -> None:
     assert any("5 poses, 10 are wanted" in reason for reason in assess(few, solve(few)).reasons)
     table = side_by_side(problem, solution)
     assert set(table) == {"TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS", "SHAH", "LI", "REFINED"}
+
+
+@pytest.mark.parametrize("setup", ["in_hand", "to_hand"])
+def test_a32_wrong_intrinsics_fail_by_name_and_right_ones_do_not(session, setup: str) -> None:
+    """A focal length 4 % off, as of another resolution or field of view."""
+    samples = session(setup, px=0.1).samples
+    solution = solve(samples.problem())
+    right = assess(samples.problem(), solution)
+    assert abs(right.figures["focal"] - 1.0) < 4.0 * right.figures["focal_sigma"] < 0.02
+    assert not any("focal length" in reason for reason in right.reasons)
+    width, height, fx, fy, cx, cy = samples.head.intrinsics
+    wrong = (width, height, 1.04 * fx, 1.04 * fy, cx, cy)
+    samples.head = samples.head.model_copy(update={"intrinsics": wrong})
+    problem = samples.problem()
+    verdict = assess(problem, solve(problem, SolveConfig(most_translation=0.1, most_rotation=0.2)))
+    assert verdict.grade == "fail"
+    assert any(re.match(r"the focal length seems -3\.\d+ % off", reason) for reason in verdict.reasons)
+    far = (width, height, 1.2 * fx, 1.2 * fy, cx, cy)
+    samples.head = samples.head.model_copy(update={"intrinsics": far})
+    with pytest.raises(OpenArmError, match=r"poses that contradict each other.*check the intrinsics in camera_info"):
+        solve(samples.problem())
 
 
 def test_an_unknown_link_in_a_session_lists_the_links(session) -> None:
