@@ -92,22 +92,36 @@ def calibrate(
         OpenArmError: DEGENERATE, with cause and advice; INVALID_ARGUMENT, for an unknown algorithm.
     """
     name = checked_algorithm(algorithm)
-    problem = samples.problem()
-    solution = solve(problem, config)
+    solution = solve(samples.problem(), config)
+    return judged(samples, solution, algorithm=name, limits=limits, session=session, created=created, stored=stored)
+
+
+def judged(
+    samples: SampleSet,
+    solution: Solution,
+    *,
+    algorithm: str = REFINED,
+    limits: Limits | None = None,
+    session: str = "",
+    created: str = "",
+    stored: StoredCalibration | None = None,
+) -> Result:
+    """Judge a solution of a session, and make what is to be stored; arguments and errors as for `calibrate`."""
+    problem = solution.problem
     before = None if stored is None else stored.T_parent_link @ T_LINK_OPTICAL
     verdict = assess(problem, solution, limits, before)
     X = solution.estimate.X[0]
     sigma_t, sigma_r = solution.sigma()
-    if name != REFINED:
+    if algorithm != REFINED:
         part = problem.subset(solution.used)
         require_motion(part)
-        refined, X = X, closed_form(name, samples.head.setup, part.A, part.free).X
+        refined, X = X, closed_form(algorithm, samples.head.setup, part.A, part.free).X
         # its own error is not known; the distance from the refinement is the better part of it
         offset, angle = mount_error(X, refined)
         sigma_t, sigma_r = float(np.hypot(sigma_t, offset)), float(np.hypot(sigma_r, angle))
     calibration = StoredCalibration.of_mount(
         samples.head.camera, samples.head.parent, X @ se3.inverse(T_LINK_OPTICAL),
-        sigma_translation=sigma_t, sigma_rotation=sigma_r, mount_seed=samples.head.mount_seed, method=name,
+        sigma_translation=sigma_t, sigma_rotation=sigma_r, mount_seed=samples.head.mount_seed, method=algorithm,
         board=samples.board.label, samples=int(np.count_nonzero(solution.used)), session=session, created=created,
         versions=versions(),
     )  # fmt: skip
