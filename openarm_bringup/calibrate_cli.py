@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm calibrate`: boards, and what is done with a session file; no robot and no graph is needed."""
+"""`openarm calibrate`: boards, and what is done with a session file; only `auto` and `sample` need a robot."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
+from openarm_bringup import calibrate_live_cli
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from openarm_calibration.store import CalibrationStore, StoredCalibration
 
 app = App(name="calibrate", help="Where are the cameras? Boards, solving, checking and storing hand-eye calibrations.")
+
+app.command(calibrate_live_cli.auto)
+app.command(calibrate_live_cli.sample)
 
 
 @app.command

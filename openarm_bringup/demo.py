@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from openarm_bringup import environment, report, runs
 from openarm_bringup.graph import Graph, load_graph
-from openarm_bringup.session import running_graph
+from openarm_bringup.session import in_thread, running_graph
 from openarm_bringup.trial import Ask, Trial, choose_target, run_trial
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
@@ -113,7 +112,7 @@ async def _demo(options: DemoOptions, graph: Graph, result: DemoResult, listener
         with Observer(environment.domain_id(graph), on_step) as observer, GraspClient() as client:
             if studio is not None:
                 studio.observer = observer
-            work = _in_thread(lambda: _trials(options, graph, observer, client, studio, result, listeners))
+            work = in_thread(lambda: _trials(options, graph, observer, client, studio, result, listeners), "trials")
             stop = asyncio.create_task(supervisor.wait_stop_asked())
             await asyncio.wait([work, stop], return_when=asyncio.FIRST_COMPLETED)
             try:
@@ -252,28 +251,6 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"--seeds {text}: expected numbers such as 0-19, 3 or 1,4,7-9")
         seeds += range(int(low), int(high if dash else low) + 1)
     return tuple(seeds)
-
-
-def _in_thread(work: Callable[[], None]) -> asyncio.Future[None]:
-    """Run in a daemon thread, which an abandoned wait inside it cannot keep from ending with the process."""
-    loop = asyncio.get_running_loop()
-    future: asyncio.Future[None] = loop.create_future()
-
-    def tell(error: BaseException | None) -> None:
-        if not future.done():
-            future.set_result(None) if error is None else future.set_exception(error)
-
-    def run() -> None:
-        error: BaseException | None = None
-        try:
-            work()
-        except BaseException as caught:  # handed to whoever awaits
-            error = caught
-        if not loop.is_closed():
-            loop.call_soon_threadsafe(tell, error)
-
-    threading.Thread(target=run, name="trials", daemon=True).start()
-    return future
 
 
 def failures(trials: Sequence[Trial]) -> list[Trial]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -45,3 +46,25 @@ async def running_graph(
         finally:
             for number in SIGNALS:
                 loop.remove_signal_handler(number)
+
+
+def in_thread(work: Callable[[], None], name: str) -> asyncio.Future[None]:
+    """Run in a daemon thread of that name: an abandoned wait inside it can't keep the process from ending."""
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[None] = loop.create_future()
+
+    def tell(error: BaseException | None) -> None:
+        if not future.done():
+            future.set_result(None) if error is None else future.set_exception(error)
+
+    def run() -> None:
+        error: BaseException | None = None
+        try:
+            work()
+        except BaseException as caught:  # handed to whoever awaits
+            error = caught
+        if not loop.is_closed():
+            loop.call_soon_threadsafe(tell, error)
+
+    threading.Thread(target=run, name=name, daemon=True).start()
+    return future

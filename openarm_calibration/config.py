@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
-from pydantic import Field, field_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
 
 from openarm_calibration.gate import GateConfig
+from openarm_calibration.next_pose import SearchConfig
 from openarm_calibration.offline import ALGORITHMS
 from openarm_calibration.verdict import Limits
+from openarm_common import se3
 from openarm_common.config import Config
 
 
@@ -44,6 +48,50 @@ class PublisherConfig(StoreConfig):
     period: float = Field(default=0.5, gt=0.0, le=60.0, description="between looks at the store, s of wall clock")
 
 
+class PlaceConfig(Config):
+    """Where a board is, roughly: as measured with a ruler. Without it the board must be in view at the start."""
+
+    position: tuple[float, ...] = Field(default=(), description="of its middle, m: three numbers, or none: unknown")
+    z_axis: tuple[float, float, float] = Field(default=(0.0, 0.0, -1.0), description="direction into the board")
+    y_axis: tuple[float, float, float] = Field(default=(-1.0, 0.0, 0.0), description="direction down the board")
+
+    @model_validator(mode="after")
+    def _whole(self) -> PlaceConfig:
+        if len(self.position) not in (0, 3):
+            raise ValueError(f"position has {len(self.position)} numbers, expected three, or none")
+        if np.linalg.norm(np.cross(self.z_axis, self.y_axis)) < 1e-6:
+            raise ValueError(f"z_axis {self.z_axis} and y_axis {self.y_axis} are parallel or zero")
+        return self
+
+    @property
+    def pose(self) -> NDArray[np.float64] | None:
+        """(4, 4) in the frame of what carries it; None when unknown."""
+        if not self.position:
+            return None
+        return se3.make(se3.rotation_from_z_y(self.z_axis, self.y_axis), self.position)
+
+
+class AutoConfig(Config):
+    """Calibration by itself, with the arm moved by /motion/move."""
+
+    arm: Literal["left", "right"] = Field(default="right", description="that carries the camera, or the board")
+    poses: int = Field(default=15, ge=4, le=100, description="samples at most")
+    fewest: int = Field(default=10, ge=4, le=100, description="samples at least, however certain the result is")
+    sigma_translation: float = Field(default=1e-4, gt=0.0, description="predicted error that is enough, m")
+    sigma_rotation: float = Field(default=2e-4, gt=0.0, description="the same of the rotation, rad")
+    tries: int = Field(default=90, ge=1, description="poses that are tried for one sample before it is given up")
+    velocity_scale: float = Field(default=0.5, gt=0.0, le=1.0, description="of the motions")
+    delay_velocity_scale: float = Field(default=0.1, gt=0.0, le=1.0, description="while the delay is measured")
+    settle_timeout: float = Field(default=5.0, gt=0.0, description="longest wait for the arm to stand, s of wall clock")
+    move_timeout: float = Field(default=60.0, gt=0.0, description="longest wait for a motion, s of wall clock")
+    plate: float = Field(default=0.01, gt=0.0, description="thickness that plans allow for the board, m")
+    on_table: PlaceConfig = Field(default_factory=PlaceConfig, description="board of a camera that moves, base frame")
+    on_hand: PlaceConfig = Field(
+        default_factory=PlaceConfig, description="board of a camera that stands, frame of the carrier"
+    )
+    search: SearchConfig = Field(default_factory=SearchConfig, description="for the next pose")
+
+
 class CalibrationConfig(StoreConfig):
     """Parameters of the node `calibration`."""
 
@@ -63,6 +111,7 @@ class CalibrationConfig(StoreConfig):
     )
     gate: GateConfig = GateConfig()
     limits: Limits = Limits()
+    auto: AutoConfig = Field(default_factory=AutoConfig, description="calibration by itself")
 
     @field_validator("algorithm")
     @classmethod

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -44,8 +45,24 @@ class Photographer:
     def __init__(self, node: BaseNode[Any], states: RobotStateListener, name: str, config: CalibrationConfig) -> None:
         self._node, self._states, self._name, self._config = node, states, name, config
 
-    async def take(self) -> tuple[Image, CameraInfo]:
+    async def state(self) -> dict[str, float]:
+        """The newest joint state, rad or m.
+
+        Raises:
+            OpenArmError: NOT_READY, when none comes in time.
+        """
+        self._states.enable(True)
+        try:
+            await wait_until(self._node, lambda: math.isfinite(self._states.age_s()), self._config.state_timeout)
+            return self._states.buffer.latest()[1]
+        finally:
+            self._states.enable(False)
+
+    async def take(self, after: float = 0.0) -> tuple[Image, CameraInfo]:
         """The first image whose stamp has joint states before it, and its info.
+
+        Args:
+            after: How long after the image joint states are waited for, s.
 
         Raises:
             OpenArmError: NOT_READY, when none comes in time.
@@ -62,7 +79,9 @@ class Photographer:
             return bool(buffer.between(0, t - window_ns))
 
         def bracketed() -> bool:
-            return seen.image is not None and bool(buffer.between(stamp_to_ns(seen.image.header.stamp), 2**62))
+            if seen.image is None:
+                return False
+            return bool(buffer.between(stamp_to_ns(seen.image.header.stamp) + round(after * 1e9), 2**62))
 
         self._states.enable(True)
         subscriptions = [
@@ -74,7 +93,7 @@ class Photographer:
             ),
         ]
         try:
-            await self._until(pair, config.image_timeout + config.state_timeout)
+            await wait_until(node, pair, config.image_timeout + config.state_timeout)
             if seen.image is None or seen.info is None:
                 what = "image" if seen.image is None else "camera_info"
                 raise OpenArmError(
@@ -84,29 +103,30 @@ class Photographer:
                 )
             image, info = seen.image, seen.info
             node.destroy_subscription(subscriptions.pop(0))  # this image is the one
-            await self._until(bracketed, config.state_timeout)
+            await wait_until(node, bracketed, config.state_timeout)
             return image, info
         finally:
             for subscription in subscriptions:
                 node.destroy_subscription(subscription)
             self._states.enable(False)
 
-    async def _until(self, condition: Callable[[], bool], timeout: float) -> bool:
-        """Wait until a condition holds, or for so long."""
-        future = Future(executor=self._node.executor)
-        left = round(timeout / _POLL)
 
-        def look() -> None:
-            nonlocal left
-            left -= 1
-            if not future.done() and (condition() or left <= 0):
-                future.set_result(left > 0)
+async def wait_until(node: BaseNode[Any], condition: Callable[[], bool], timeout: float) -> bool:
+    """Wait, in a coroutine of the node, until a condition holds (True) or the time is over (False); s of wall clock."""
+    future = Future(executor=node.executor)
+    left = round(timeout / _POLL)
 
-        timer = self._node.create_timer(_POLL, look, clock=self._node.wall_clock)
-        try:
-            return bool(await future)
-        finally:
-            self._node.destroy_timer(timer)
+    def look() -> None:
+        nonlocal left
+        left -= 1
+        if not future.done() and (condition() or left <= 0):
+            future.set_result(left > 0)
+
+    timer = node.create_timer(_POLL, look, clock=node.wall_clock)
+    try:
+        return bool(await future)
+    finally:
+        node.destroy_timer(timer)
 
 
 def grey(message: Image) -> NDArray[np.uint8]:

@@ -278,6 +278,19 @@ def load_session(path: Path, description: RobotDescription) -> tuple[SampleSet, 
     return out, hashlib.sha256(text.encode()).hexdigest()
 
 
+def session_path(text: str) -> Path:
+    """Path of a session file that was asked for.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when it is empty.
+    """
+    if not text:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, "path is empty; expected the name of a session file that ends in .npz"
+        )
+    return Path(text).expanduser()
+
+
 def moving_joints(head: SessionHead, description: RobotDescription) -> tuple[str, ...]:
     """Names of the joints between the base and what the arm carries."""
     link = head.parent if head.setup == "in_hand" else head.carrier

@@ -8,8 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup import cli
+from openarm_bringup import calibration_run, cli
+from openarm_calibration.client import AutoResult
 from openarm_calibration.synthetic_session import make_session
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +90,13 @@ def test_a43_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) ->
         (["rollback", "../wrist"], 2, "camera name"),
         (["rollback", "wrist"], 1, "has 0 stored"),
         (["frobnicate"], 2, "frobnicate"),
+        (["auto", "--poses", "2"], 2, "at least 4"),
+        (["auto", "--camera", "sideways"], 2, "cameras: overhead, wrist"),
+        (["auto", "--camera", "spectator"], 2, "cameras: overhead, wrist"),
+        (["auto", "--mount-seed", "-3"], 2, "expected 0 or more"),
+        (["auto", "--set", "nonsense"], 2, "expected node.param=value"),
+        (["auto", "--running"], 2, "--camera NAME"),
+        (["sample", "--remove", "last", "--advice"], 2, "exclude each other"),
     ],
 )
 def test_wrong_calls_say_what_is_wrong(
@@ -105,3 +115,46 @@ def test_a41_a_degenerate_session_is_exit_code_1_with_advice(capsys, session_fil
     code, _, err = run(capsys, "solve", str(session_file), *[word for n in names for word in ("--exclude", n)])
     assert code == 1
     assert "DEGENERATE: too few poses: 2" in err
+
+
+def result(camera: str, **more) -> AutoResult:
+    fields = {
+        "success": True, "code": Code.OK, "message": "pass: within all limits", "grade": "pass",
+        "T_parent_link": se3.make(None, (0.1, 0.2, 0.3)), "sigma_translation": 1e-5, "sigma_rotation": 1e-5,
+        "samples": 10, "missed": (), "delay": (0.02, 1e-4), "path": "", "duration": 40.0,
+    }  # fmt: skip
+    return AutoResult(**{**fields, **more})
+
+
+@pytest.mark.parametrize(
+    ("results", "error", "code", "words"),
+    [
+        ({"overhead": result("overhead"), "wrist": result("wrist")}, None, 0, "calibrated overhead, wrist"),
+        ({"wrist": result("wrist", grade="fail", message="fail: scale")}, None, 1, "wrist: fail: scale"),
+        (
+            {"wrist": result("wrist", success=False, code=Code.NO_PLAN, message="none", grade="", T_parent_link=None)},
+            None, 1, "NO_PLAN: wrist: none",
+        ),
+        ({"overhead": result("overhead")}, OpenArmError(Code.CANCELLED, "stopped"), 1, "CANCELLED: stopped"),
+    ],
+)  # fmt: skip
+def test_auto_tells_what_came_out(capsys, tmp_path: Path, monkeypatch, results, error, code: int, words: str) -> None:
+    """Exit code and sentence follow the worst camera; pages are written of the sessions that there are."""
+    asked: list[calibration_run.CalibrationOptions] = []
+
+    def run_it(options, listeners):
+        asked.append(options)
+        make_session("in_hand", 12).samples.save(tmp_path / "wrist.npz")
+        return calibration_run.CalibrationRun(tmp_path, results, 1.0, error)
+
+    monkeypatch.setattr(calibration_run, "run_calibration", run_it)
+    got, out, _ = run(capsys, "auto", "--mount-seed", "3", "--poses", "12", "--save", "--json")
+    assert got == code
+    data = json.loads(out)
+    assert words in f"{data['code']}: {data['message']}"
+    assert (asked[0].cameras, asked[0].mount_seed, asked[0].poses) == (("overhead", "wrist"), 3, 12)
+    assert asked[0].save
+    rows = data["cameras"]
+    assert list(rows) == list(results)
+    assert all(row["delay"] == {"seconds": 0.02, "sigma": 1e-4} for row in rows.values())
+    assert (tmp_path / "wrist.html").is_file() == ("wrist" in results)

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node that spins in the background, for programs that ask something of the graph and wait for the answer."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
+
+import rclpy
+from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+from openarm_common.errors import Code, OpenArmError
+
+#: Between looks at whether the server is still there, s.
+_LOOK_S = 0.25
+#: Looks without a server before it counts as gone: discovery may lose it for a moment.
+_GONE = 20
+_UP = "is the graph up, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE?"
+
+
+class BackgroundNode:
+    """A context manager with a ROS context, node and thread of its own, so that it also works beside an rclpy program.
+
+    Args:
+        name: Of the node.
+        timeout: Longest wait for a server to be there, s of wall clock.
+    """
+
+    def __init__(self, name: str, *, timeout: float = 10.0) -> None:
+        self._timeout = timeout
+        self._context = Context()
+        # Ctrl-C stays the caller's.
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = Node(name, context=self._context, use_global_arguments=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._clients: dict[str, Any] = {}
+        self._thread = threading.Thread(target=self._spin, name=name, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the thread and leave the graph."""
+        if not self._context.ok():
+            return
+        self._executor.shutdown(timeout_sec=2.0)
+        self._thread.join(timeout=5.0)
+        self._node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+    def call(self, kind: Any, name: str, request: Any, timeout: float = 60.0) -> Any:
+        """Call a service and return its response.
+
+        Raises:
+            OpenArmError: NOT_READY, when nobody serves it; TIMEOUT.
+        """
+        client = self._client(name, lambda: self._node.create_client(kind, name))
+        if not client.wait_for_service(timeout_sec=self._timeout):
+            raise OpenArmError(Code.NOT_READY, f"no service {name} within {self._timeout:g} s: {_UP}")
+        return self._wait(self._begin(client.call_async, request), timeout, name, client.service_is_ready)
+
+    def do(
+        self,
+        kind: Any,
+        name: str,
+        goal: Any,
+        *,
+        timeout: float,
+        on_feedback: Callable[[Any], None] | None = None,
+        stop: threading.Event | None = None,
+    ) -> Any:
+        """Send a goal to an action and return its result, also that of a failure.
+
+        Args:
+            kind: Type of the action.
+            name: Of the action.
+            goal: To send.
+            timeout: Longest wait for the end, s of wall clock; then, and at any exception, the goal is cancelled.
+            on_feedback: Called with each feedback, in the background thread.
+            stop: When it is set the goal is cancelled, and its result waited for.
+
+        Raises:
+            OpenArmError: NOT_READY, when nobody serves it, or no longer; BUSY, when the goal is refused; TIMEOUT.
+        """
+        client: ActionClient = self._client(name, lambda: ActionClient(self._node, kind, name))
+        if not client.wait_for_server(timeout_sec=self._timeout):
+            raise OpenArmError(Code.NOT_READY, f"no action {name} within {self._timeout:g} s: {_UP}")
+        deliver = None if on_feedback is None else (lambda message: on_feedback(message.feedback))
+        there = client.server_is_ready
+        handle = self._wait(self._begin(client.send_goal_async, goal, deliver), self._timeout, name, there)
+        if not handle.accepted:
+            raise OpenArmError(Code.BUSY, f"{name} refused the goal")
+        try:
+            ended = self._begin(handle.get_result_async)
+            answer = self._wait(ended, timeout, name, there, stop, lambda: self._begin(handle.cancel_goal_async))
+        except BaseException:
+            # Whatever keeps the caller from waiting (a deadline, Ctrl-C): nobody would see the robot go on.
+            _event(self._begin(handle.cancel_goal_async)).wait(2.0)
+            raise
+        if answer.status == GoalStatus.STATUS_UNKNOWN:
+            raise OpenArmError(Code.NOT_READY, f"{name} no longer knows the goal: its node was started anew")
+        return answer.result
+
+    def _client(self, name: str, make: Callable[[], Any]) -> Any:
+        if name not in self._clients:
+            self._clients[name] = make()
+        return self._clients[name]
+
+    def _begin(self, ask: Callable[..., Future], *args: Any) -> Future:
+        """Send a request from the background thread; the returned future is done when the answer is there.
+
+        rclpy files a request only after it has sent it: sent from another thread, a fast answer would find nobody.
+        """
+
+        async def exchange() -> Any:
+            return await ask(*args)
+
+        return self._executor.create_task(exchange)
+
+    def _wait(
+        self,
+        future: Future,
+        timeout: float,
+        name: str,
+        there: Callable[[], bool],
+        stop: threading.Event | None = None,
+        cancel: Callable[[], object] = lambda: None,
+    ) -> Any:
+        done = _event(future)
+        deadline = time.monotonic() + timeout
+        missed, stopped = 0, False
+        while not done.wait(_LOOK_S):
+            missed = 0 if there() else missed + 1
+            if missed > _GONE:
+                raise OpenArmError(Code.NOT_READY, f"the server of {name} is gone")
+            if not self._thread.is_alive():
+                raise OpenArmError(Code.NOT_READY, f"the client was closed while waiting for {name}")
+            if time.monotonic() > deadline:
+                raise OpenArmError(Code.TIMEOUT, f"no answer of {name} within {timeout:g} s")
+            if stop is not None and stop.is_set() and not stopped:
+                stopped = True
+                deadline = min(deadline, time.monotonic() + self._timeout)
+                cancel()
+        return future.result()
+
+    def _spin(self) -> None:
+        try:
+            self._executor.spin()
+        except ExternalShutdownException:
+            self._node.get_logger().debug("the context was shut down")
+
+
+def _event(future: Future) -> threading.Event:
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    return done

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The next pose for an arm: what it shows, what it tells, what happens without any."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from openarm_calibration.board import CircleGrid
+from openarm_calibration.detect import Detection
+from openarm_calibration.next_pose import PoseSearch, SearchConfig
+from openarm_calibration.projection import project
+from openarm_calibration.refine import mount_error
+from openarm_calibration.samples import Sample, SampleSet, SessionHead
+from openarm_common import se3
+from openarm_common.cameras import T_LINK_OPTICAL, load_cameras, true_mount
+from openarm_common.description import RobotDescription
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene import load_scene
+
+BOARD = CircleGrid()
+QUICK = SearchConfig(draws=1000, candidates=30)
+HAND = "openarm_right_link7"
+
+
+class Arm:
+    """The right arm, a camera off its nominal mount, and a board 1 cm off where a ruler says it is."""
+
+    def __init__(self, name: str) -> None:
+        self.description, self.camera = RobotDescription.load(), load_cameras()[name]
+        self.in_hand = self.camera.parent == HAND
+        k = self.camera.intrinsics
+        self.row, self.size = np.array([k.fx, k.fy, k.cx, k.cy]), (k.width, k.height)
+        head = SessionHead(
+            camera=name, setup="in_hand" if self.in_hand else "to_hand", parent=self.camera.parent, carrier=HAND,
+            intrinsics=(k.width, k.height, k.fx, k.fy, k.cx, k.cy), board=BOARD.model_dump(),
+        )  # fmt: skip
+        self.samples = SampleSet(head, self.description)
+        self.X = true_mount(self.camera, 1) @ T_LINK_OPTICAL
+        self.Z = load_scene(f"calibration_{name}").fixtures[0].T_link_fixture
+        self.state = dict.fromkeys(self.description.joints, 0.0)
+        for side in ("left", "right"):
+            self.state |= self.description.group_state(f"{side}_arm", "home")
+
+    def search(self) -> PoseSearch:
+        told = self.Z @ se3.make(se3.rot_x(0.03), (0.008, -0.006, 0.0))
+        return PoseSearch(self.description, self.camera.T_parent_optical, told, QUICK)
+
+    def look(self, q: np.ndarray, rng: np.random.Generator) -> bool:
+        """Go there and take a sample; False when not all marks are in the image."""
+        joints = dict(zip(self.samples.joint_names, q.tolist(), strict=True))
+        A = self.samples.pose(joints)
+        T = se3.inverse(self.X) @ (se3.inverse(A) if self.in_hand else A) @ self.Z
+        pixels = project(BOARD.points, BOARD.radius, T, self.row) + rng.normal(0.0, 0.05, (len(BOARD.points), 2))
+        if not ((pixels > 0.0) & (pixels < self.size)).all():
+            return False
+        self.state |= joints
+        count = len(self.samples)
+        detection = Detection(np.arange(len(BOARD.points)), pixels, 0.05)
+        self.samples.add(Sample(f"s{count:03d}", 10**9 * count, 10**9 * count, joints, 0.0, detection, T))
+        return True
+
+
+@pytest.mark.parametrize("name", ["wrist", "overhead"])
+def test_n07_eight_proposed_poses_calibrate(name: str) -> None:
+    """Nominal mount and a ruler are enough to begin; all proposals but the first few show the board; 0.3 mm, 0.03°."""
+    arm, rng = Arm(name), np.random.default_rng(0)
+    search = arm.search()
+    while len(arm.samples) < 8:
+        solved = search.belief.solved
+        proposals = search.propose(arm.samples, arm.state)
+        seen = arm.look(proposals[0].q, rng)
+        assert seen or not solved
+        if not seen:
+            search.refuse(proposals[0])
+            continue
+        belief = search.learn(arm.samples)
+        assert proposals[0].sigma_translation < 0.05
+    offset, angle = mount_error(belief.X, arm.X)
+    assert offset < 0.3e-3
+    assert angle < math.radians(0.03)
+    assert offset < 4.0 * belief.sigma_translation
+    lower, upper = arm.description.limits(arm.samples.joint_names)
+    q = np.array([list(sample.joints.values()) for sample in arm.samples.samples])
+    assert (q >= lower).all()
+    assert (q <= upper).all()
+    turns = [se3.angle_between(a, b) for a in rotations(arm) for b in rotations(arm)]
+    assert max(turns) > math.radians(25.0)
+
+
+def rotations(arm: Arm) -> list[np.ndarray]:
+    return [arm.samples.pose(sample.joints)[:3, :3] for sample in arm.samples.samples]
+
+
+def test_what_was_refused_is_not_proposed_again() -> None:
+    arm = Arm("overhead")
+    search = arm.search()
+    first = search.propose(arm.samples, arm.state)
+    for proposal in first:
+        search.refuse(proposal)
+    again = search.propose(arm.samples, arm.state)
+    assert all(np.abs(a.q - b.q).max() > 0.05 for a in again for b in first)
+
+
+def test_no_board_and_a_board_that_can_not_be_seen_are_refused_with_what_to_do() -> None:
+    arm = Arm("wrist")
+    unknown = PoseSearch(arm.description, arm.camera.T_parent_optical, None, QUICK)
+    with pytest.raises(OpenArmError, match="must be told, or seen") as caught:
+        unknown.propose(arm.samples, arm.state)
+    assert caught.value.code == Code.NOT_READY
+    with pytest.raises(OpenArmError, match="without a sample"):
+        unknown.learn(arm.samples)
+    behind = se3.make(None, (-3.0, 0.0, 0.5))
+    blind = PoseSearch(arm.description, arm.camera.T_parent_optical, behind, QUICK)
+    with pytest.raises(OpenArmError, match="no posture of 'openarm_right_link7' shows all of") as caught:
+        blind.propose(arm.samples, arm.state)
+    assert caught.value.code == Code.UNREACHABLE
