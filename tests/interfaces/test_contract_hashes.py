@@ -13,6 +13,8 @@ import pytest
 from rclpy.action import ActionServer
 from type_description_interfaces.srv import GetTypeDescription
 
+from openarm_bringup.bag import Types
+
 _MESSAGES = {
     "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     "octomap_msgs/msg/Octomap": "9891a19a05b70ec20aa8f45db3f8300b9ab80afff32c61c549d25087da9625b0",
@@ -51,6 +53,13 @@ def test_the_graph_reports_the_upstream_hash_of_a_message(ros, name: str, sha256
     ros.node.create_publisher(_type(name), "/contract", 1)
     (endpoint,) = ros.node.get_publishers_info_by_topic("/contract")
     assert (endpoint.topic_type, str(endpoint.topic_type_hash)) == (name, f"RIHS01_{sha256}")
+
+
+@pytest.mark.parametrize(("name", "sha256"), _MESSAGES.items(), ids=_MESSAGES)
+def test_a_bag_declares_the_upstream_hash_of_a_message(name: str, sha256: str) -> None:
+    types = Types()
+    types.add(name)
+    assert types.store.hash_rihs01(name) == f"RIHS01_{sha256}"
 
 
 @pytest.mark.parametrize(("name", "sha256"), (_SERVICES | _ACTIONS).items(), ids=_SERVICES | _ACTIONS)

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Publishes the messages of a bag as raw CDR."""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+
+from openarm_bringup.bag import Bag, Record, message_class
+from openarm_bringup.bag_qos import to_profile
+from openarm_bringup.environment import write_profile
+from openarm_bringup.graph import NodeSpec
+from openarm_common.convert import ns_to_stamp
+from openarm_common.errors import Code, OpenArmError
+
+_CLOCK = "/clock"
+#: Subscribers of what a graph publishes come within this time after the publishers are there, s.
+_MEET_S = 2.0
+_SETTLE_S = 0.3
+
+
+class Player:
+    """Publishers for the topics of a bag; a context manager.
+
+    Args:
+        bag: Open.
+        topics: Only these; None takes all whose type is installed.
+        names: New names of topics.
+        clock: Publish /clock from the bag's stamps when it holds none.
+
+    Attributes:
+        published: Messages so far.
+        unknown: Types that no installed package has.
+        late_ms: The most that a message was published after its time.
+    """
+
+    def __init__(self, bag: Bag, topics: Sequence[str] | None, names: Mapping[str, str], *, clock: bool) -> None:
+        self.published = 0
+        self.late_ms = 0.0
+        self._bag = bag
+        self._folder = tempfile.TemporaryDirectory()
+        spec = NodeSpec(module="openarm_bringup", large_messages=True, segment_mib=24)
+        profile = write_profile(spec, Path(self._folder.name) / "fastdds.xml")
+        os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(profile)  # read when the participant is made
+        self._context = Context()
+        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node("openarm_player", context=self._context, use_global_arguments=False)
+        self._publishers: dict[str, Publisher] = {}
+        missing: set[str] = set()
+        for topic, (kind, qos) in bag.topics.items():
+            if topics is not None and topic not in topics:
+                continue
+            try:
+                message = message_class(kind)
+            except OpenArmError:
+                missing.add(kind)
+                continue
+            self._publishers[topic] = self._node.create_publisher(message, names.get(topic, topic), to_profile(qos))
+        self.unknown = sorted(missing)
+        own_clock = clock and _CLOCK not in self._publishers
+        self._clock = self._node.create_publisher(Clock, _CLOCK, 1) if own_clock else None
+
+    def __enter__(self) -> Player:
+        # A subscriber knows of a publisher a little later than the publisher of it; nothing tells when.
+        began = changed = time.monotonic()
+        before: list[int] = []
+        while (now := time.monotonic()) - began < _MEET_S:
+            counts = [publisher.get_subscription_count() for publisher in self._publishers.values()]
+            if counts != before:
+                before, changed = counts, now
+            if all(counts) and now - changed > _SETTLE_S:
+                break
+            time.sleep(0.02)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._node.destroy_node()
+        self._context.try_shutdown()
+        self._folder.cleanup()
+
+    def play(self, rate: float, start: float, duration: float, stop: threading.Event) -> None:
+        """Publish from `start` seconds on, for `duration` seconds of the bag (0: to its end).
+
+        Args:
+            rate: Times real time. With 0, each message waits only until reliable subscribers have taken the last.
+            start: In the bag, s.
+            duration: In the bag, s.
+            stop: Ends it early.
+        """
+        first = self._bag.start_ns + round(start * 1e9)
+        last = first + round(duration * 1e9) if duration else None
+        self._latch(first if start else None)
+        began: int | None = None
+        for record in self._bag.records(list(self._publishers), start):
+            if stop.is_set() or (last is not None and record.t_ns > last):
+                return
+            if rate > 0.0:
+                now = time.monotonic_ns()
+                began = now - round((record.t_ns - first) / rate) if began is None else began
+                due = began + round((record.t_ns - first) / rate)
+                if due > now and stop.wait((due - now) * 1e-9):
+                    return
+                self.late_ms = max(self.late_ms, (time.monotonic_ns() - due) * 1e-6)
+            self._publish(record)
+            if rate == 0.0:
+                self._publishers[record.topic].wait_for_all_acked()
+
+    def _latch(self, before: int | None) -> None:
+        """Publish the last message of each latched topic from before the start."""
+        if before is None:
+            return
+        latched = [
+            topic
+            for topic in self._publishers
+            if to_profile(self._bag.topics[topic][1]).durability == DurabilityPolicy.TRANSIENT_LOCAL
+        ]
+        newest: dict[str, Record] = {}
+        for record in self._bag.records(latched):
+            if record.t_ns >= before:
+                break
+            newest[record.topic] = record
+        for record in newest.values():
+            self._publish(record)
+
+    def _publish(self, record: Record) -> None:
+        if self._clock is not None:
+            self._clock.publish(Clock(clock=ns_to_stamp(record.t_ns)))
+        self._publishers[record.topic].publish(record.data)
+        self.published += 1
+
+    def wait_idle(self, quiet_s: float, limit_s: float) -> None:
+        """Wait until no other node of the graph has published anything for `quiet_s` seconds.
+
+        Raises:
+            OpenArmError: TIMEOUT, naming a topic that goes on after `limit_s` seconds.
+        """
+        heard = {"": time.monotonic()}
+        own = {publisher.topic_name for publisher in self._publishers.values()}
+        for topic, kinds in self._node.get_topic_names_and_types():
+            if topic in own or re.fullmatch(r"/rosout|/parameter_events|/diagnostics|/clock", topic):
+                continue
+
+            def note(_: bytes, topic: str = topic) -> None:
+                heard[topic] = time.monotonic()
+
+            try:
+                kind = message_class(kinds[0])
+            except OpenArmError:
+                continue
+            profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+            self._node.create_subscription(kind, topic, note, profile, raw=True)
+        executor = SingleThreadedExecutor(context=self._context)
+        executor.add_node(self._node)
+        limit = time.monotonic() + limit_s
+        try:
+            while (now := time.monotonic()) - max(heard.values()) < quiet_s:
+                if now > limit:
+                    topic = max(heard, key=lambda key: heard[key])
+                    raise OpenArmError(Code.TIMEOUT, f"{topic} is still published {limit_s:g} s after the bag's end")
+                executor.spin_once(timeout_sec=0.1)
+        except ExternalShutdownException:
+            pass  # the context was shut down by the end of the process
+        finally:
+            executor.remove_node(self._node)

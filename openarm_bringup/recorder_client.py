@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records topics of a running graph into a bag, as raw CDR.
+
+Messages are taken in one thread and written in another, with a bounded queue between them: what does not fit is
+counted as lost, and never silently.
+"""
+
+from __future__ import annotations
+
+import queue
+import re
+import shutil
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rosbags.interfaces import Qos
+
+from openarm_bringup.bag import BagWriter, message_class
+from openarm_bringup.bag_qos import from_profile
+from openarm_common.errors import Code, OpenArmError
+
+#: What the profiles record: regular expressions of whole topic names.
+PROFILES: Mapping[str, tuple[str, ...]] = {
+    "camera": (
+        r"/(overhead|wrist)/(color|depth)/(image_raw|camera_info)",
+        "/joint_states|/tf|/tf_static|/clock|/robot_description",
+    ),
+    "grasp": (
+        r"/(overhead|wrist)/(color|depth)/(image_raw|camera_info)",
+        "/joint_states|/tf|/tf_static|/clock|/robot_description",
+        r"/detections_2d|/detections_3d|/grasp/.*|/motion/.*|/.*/controller_state|/diagnostics|/sim/ground_truth/.*",
+    ),
+    "all": (".*",),
+}
+#: Not recorded by a profile: a replay would be taken for the simulation or for a parameter service.
+_NEVER = r".*/_action/.*|/parameter_events|/rosout|/sim/tick|/sim/ack"
+_QUEUE_BYTES = 512 * 2**20
+_DISCOVERY_S = 0.5
+#: The disk is left this much room, so that the bag can still be closed.
+_SPARE_BYTES = 200 * 2**20
+
+
+@dataclass
+class Recorded:
+    """What a recording holds, while it grows.
+
+    Attributes:
+        counts: Messages written, by topic.
+        lost: Messages that came but were not written, by topic.
+        bytes: Written, before compression.
+        ended: Why it ended; empty while it runs.
+    """
+
+    counts: Counter[str] = field(default_factory=Counter[str])
+    lost: Counter[str] = field(default_factory=Counter[str])
+    bytes: int = 0
+    ended: str = ""
+
+
+class _Topic(NamedTuple):
+    name: str
+    type: str
+    qos: Qos
+
+
+class _Message(NamedTuple):
+    topic: str
+    t_ns: int
+    data: bytes
+
+
+class Recorder:
+    """Records until `stop`; a context manager.
+
+    Args:
+        domain: ROS_DOMAIN_ID of the graph.
+        path: Folder of the bag.
+        patterns: Regular expressions; a topic whose whole name matches one is recorded, also when it comes later.
+        custom: Kept in the metadata.
+        image_rate: Of each image stream, at most, Hz of their stamps; 0 keeps all.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for a pattern that is none or a folder that exists.
+    """
+
+    def __init__(
+        self, domain: int, path: Path, patterns: tuple[str, ...], custom: Mapping[str, str], image_rate: float = 0.0
+    ) -> None:
+        try:
+            self._wanted = [re.compile(pattern) for pattern in patterns]
+        except re.error as error:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"a topic pattern is no regular expression: {error}") from error
+        self.recorded = Recorded()
+        self._path = path
+        self._bag = BagWriter(path, custom)
+        self._thinner = Thinner(image_rate)
+        # Only the writing thread touches the bag: topics reach it through the queue as messages do.
+        self._queue: queue.SimpleQueue[_Topic | _Message | None] = queue.SimpleQueue()
+        self._queued = 0
+        self._topics: set[str] = set()
+        self._context = Context()
+        rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node("openarm_recorder", context=self._context, use_global_arguments=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._changed = threading.Condition()
+        self._threads = [
+            threading.Thread(target=self._listen, name="recorder", daemon=True),
+            threading.Thread(target=self._write, name="bag", daemon=True),
+        ]
+
+    def __enter__(self) -> Recorder:
+        self._bag.__enter__()
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        self._context.try_shutdown()
+        self._threads[0].join(timeout=5.0)
+        self._queue.put(None)
+        self._threads[1].join()
+        self._node.destroy_node()
+        full = OSError(self.recorded.ended) if self.recorded.ended else None
+        self._bag.__exit__(type(full) if full else None, full, None)
+
+    @property
+    def topics(self) -> list[str]:
+        """What is recorded, sorted."""
+        return sorted(self._topics)
+
+    def wait(self, seconds: float) -> bool:
+        """Wait, but not longer than until the recording ends by itself; returns whether it goes on."""
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self.recorded.ended), seconds)
+        return not self.recorded.ended
+
+    def _listen(self) -> None:
+        found_at = 0.0
+        try:
+            while self._context.ok():
+                if time.monotonic() - found_at > _DISCOVERY_S:
+                    self._discover()
+                    found_at = time.monotonic()
+                self._executor.spin_once(timeout_sec=0.1)
+        except ExternalShutdownException:
+            pass  # the normal end
+
+    def _discover(self) -> None:
+        for topic, kinds in self._node.get_topic_names_and_types():
+            if topic in self._topics or re.fullmatch(_NEVER, topic):
+                continue
+            if not any(pattern.fullmatch(topic) for pattern in self._wanted):
+                continue
+            offered = self._node.get_publishers_info_by_topic(topic)
+            if not offered:
+                continue
+            self._topics.add(topic)
+            try:
+                kind = message_class(kinds[0])
+            except OpenArmError as error:
+                self._node.get_logger().warning(f"{topic} is not recorded: {error.message}")
+                continue
+            profiles = [info.qos_profile for info in offered]
+            reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+            latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+            profile = QoSProfile(
+                history=HistoryPolicy.KEEP_LAST,
+                depth=200,
+                reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+            )
+            self._queue.put(_Topic(topic, kinds[0], from_profile(profile)))
+            # rclpy passes the info of a message to a callback with two arguments, which its annotations do not know.
+            take: Any = self._taker(topic)
+            self._node.create_subscription(kind, topic, take, profile, raw=True)
+
+    def _taker(self, topic: str) -> Callable[[bytes, Mapping[str, Any]], None]:
+        def take(data: bytes, info: Mapping[str, Any]) -> None:
+            if not self._thinner.keeps(topic, data):
+                return
+            if self._queued + len(data) > _QUEUE_BYTES or self.recorded.ended:
+                self.recorded.lost[topic] += 1
+                return
+            self._queued += len(data)
+            self._queue.put(_Message(topic, info["received_timestamp"], data))
+
+        return take
+
+    def _write(self) -> None:
+        checked = 0
+        while (item := self._queue.get()) is not None:
+            if isinstance(item, _Topic):
+                self._bag.add_topic(item.name, item.type, item.qos)
+                continue
+            topic, t_ns, data = item
+            self._queued -= len(data)
+            if self.recorded.ended:
+                self.recorded.lost[topic] += 1
+                continue
+            try:
+                if self.recorded.bytes >= checked:
+                    free = shutil.disk_usage(self._path).free
+                    if free < _SPARE_BYTES:
+                        raise OSError(f"the disk has only {free // 2**20} MiB left")
+                    checked = self.recorded.bytes + _SPARE_BYTES // 8
+                self._bag.write(topic, t_ns, data)
+            except OSError as error:
+                with self._changed:
+                    self.recorded.ended = str(error)
+                    self._changed.notify_all()
+                self.recorded.lost[topic] += 1
+                continue
+            self.recorded.counts[topic] += 1
+            self.recorded.bytes += len(data)
+
+
+class Thinner:
+    """Keeps whole frames of the cameras at a lower rate: all streams of one stamp, or none.
+
+    Args:
+        rate: Hz of the stamps; 0 keeps all.
+    """
+
+    def __init__(self, rate: float) -> None:
+        self._period_ns = round(1e9 / rate) if rate > 0.0 else 0
+
+    def keeps(self, topic: str, data: bytes) -> bool:
+        """Whether to keep a message. Stamps decide, so that colour and depth of a frame stay together."""
+        if not self._period_ns or not topic.endswith(("/image_raw", "/camera_info", "/points")):
+            return True
+        sec, nanosec = int.from_bytes(data[4:8], "little"), int.from_bytes(data[8:12], "little")
+        # The frame that is nearest to a multiple of the period, of cameras with 30 Hz.
+        return (sec * 1_000_000_000 + nanosec + 5_000_000) % self._period_ns < 33_333_333

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bag is recorded from a live graph and replayed into another: every message, in order, as it was offered."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rclpy.qos import DurabilityPolicy
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+
+from openarm_bringup import record_cli
+from openarm_bringup.bag import open_bag
+from openarm_bringup.player_client import Player
+from openarm_bringup.recorder_client import Recorder, Thinner
+from openarm_common.convert import array_to_image
+from openarm_common.errors import OpenArmError
+from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+
+
+def record(ros, path: Path, count: int, patterns: tuple[str, ...] = (".*",)) -> Recorder:
+    chatter = ros.node.create_publisher(String, "/chatter", QOS_COMMAND)
+    latched = ros.node.create_publisher(String, "/robot_description", QOS_LATCHED)
+    images = ros.node.create_publisher(Image, "/overhead/color/image_raw", QOS_SENSOR)
+    latched.publish(String(data="<robot/>"))
+    picture = np.arange(64 * 48 * 3, dtype=np.uint8).reshape(48, 64, 3)
+    with Recorder(int(os.environ["ROS_DOMAIN_ID"]), path, patterns, {}) as recorder:
+        publishers = [chatter, latched, images] if patterns == (".*",) else [chatter]
+        ros.spin_until(lambda: all(p.get_subscription_count() for p in publishers), what="the recorder subscribes")
+        for i in range(count):
+            chatter.publish(String(data=str(i)))
+            images.publish(array_to_image(picture, "rgb8", "optical", i * 33_333_333))
+        chatter.wait_for_all_acked()
+        wanted = 2 * count + 1 if len(publishers) == 3 else count
+        ros.spin_until(lambda: sum(recorder.recorded.counts.values()) >= wanted, what="everything is written")
+    return recorder
+
+
+def test_what_is_recorded_is_replayed(ros, tmp_path: Path) -> None:
+    recorder = record(ros, tmp_path / "bag", 40)
+    assert recorder.recorded.counts["/chatter"] == 40
+    assert recorder.recorded.counts["/overhead/color/image_raw"] == 40
+    assert not recorder.recorded.lost
+    for publisher in list(ros.node.publishers):
+        if publisher.topic_name in ("/chatter", "/robot_description"):
+            ros.node.destroy_publisher(publisher)
+
+    heard: list[str] = []
+    described: list[str] = []
+    ros.node.create_subscription(String, "/talk", lambda m: heard.append(m.data), 100)
+    with open_bag(tmp_path / "bag") as bag:
+        assert bag.counts["/robot_description"] == 1
+        with Player(bag, ["/chatter", "/robot_description"], {"/chatter": "/talk"}, clock=True) as player:
+            work = threading.Thread(target=player.play, args=(0.0, 0.0, 0.0, threading.Event()))
+            work.start()
+            ros.spin_until(lambda: len(heard) == 40, what="all 40 messages are replayed")
+            ros.node.create_subscription(String, "/robot_description", lambda m: described.append(m.data), QOS_LATCHED)
+            ros.spin_until(lambda: described == ["<robot/>"], what="a late subscriber gets the latched message")
+            work.join()
+            (offered,) = ros.node.get_publishers_info_by_topic("/robot_description")
+            assert offered.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            assert player.published == 41
+    assert heard == [str(i) for i in range(40)]
+
+
+def test_patterns_choose_topics(ros, tmp_path: Path) -> None:
+    recorder = record(ros, tmp_path / "bag", 3, ("/chat.*",))
+    assert recorder.topics == ["/chatter"]
+    with pytest.raises(OpenArmError, match="no regular expression"):
+        Recorder(0, tmp_path / "other", ("(",), {})
+
+
+def test_a_full_disk_ends_the_recording_and_leaves_a_bag(ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Usage:
+        free = 10**12
+
+    monkeypatch.setattr("openarm_bringup.recorder_client.shutil.disk_usage", lambda _: Usage)
+    monkeypatch.setattr("openarm_bringup.recorder_client._SPARE_BYTES", 2**20)
+    images = ros.node.create_publisher(Image, "/overhead/color/image_raw", QOS_COMMAND)
+    picture = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
+    with Recorder(int(os.environ["ROS_DOMAIN_ID"]), tmp_path / "bag", ("/overhead/.*",), {}) as recorder:
+        ros.spin_until(images.get_subscription_count, what="the recorder subscribes")
+        for i in range(4):
+            images.publish(array_to_image(picture, "rgb8", "optical", i))
+        ros.spin_until(lambda: recorder.recorded.counts.total() == 4, what="four images are written")
+        Usage.free = 0
+        images.publish(array_to_image(picture, "rgb8", "optical", 4))
+        ros.spin_until(lambda: bool(recorder.recorded.ended), what="the recording ends")
+        assert not recorder.wait(0.0)
+    assert "disk" in recorder.recorded.ended
+    assert recorder.recorded.lost.total() == 1
+    with open_bag(tmp_path / "bag") as bag:
+        assert bag.mended is not None
+        assert sum(bag.counts.values()) >= 3
+
+
+def test_frames_are_thinned_as_a_whole() -> None:
+    thin = Thinner(2.0)
+    stamps = [round(i * 1e9 / 30) for i in range(300)]
+    kept = []
+    for t in stamps:
+        head = bytes(4) + (t // 10**9).to_bytes(4, "little") + (t % 10**9).to_bytes(4, "little")
+        answers = {thin.keeps(f"/wrist/{kind}", head) for kind in ("color/image_raw", "depth/camera_info")}
+        assert len(answers) == 1
+        kept += [t] if answers.pop() else []
+    assert len(kept) == 20
+    assert thin.keeps("/joint_states", bytes(12))
+
+
+def test_replay_refuses_what_makes_no_sense(ros, tmp_path: Path) -> None:
+    record(ros, tmp_path / "bag", 1)
+    began = time.monotonic()
+    for keywords, said in (
+        ({"rate": -1.0}, "0 or more"),
+        ({"topics": ("/none",)}, "topics: /chatter"),
+        ({"remap": ("/a=/b",)}, "expected /from:=/to"),
+    ):
+        with pytest.raises(OpenArmError, match=said):
+            record_cli.replay(tmp_path / "bag", **keywords)
+    assert time.monotonic() - began < 5.0

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags: what is written is read; what was cut short is mended; what is no bag is refused by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import String
+
+from openarm_bringup.bag import BagWriter, definition, message_class, open_bag
+from openarm_bringup.bag_qos import from_profile, to_profile
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+
+
+def write(path: Path, count: int, size: int = 10) -> Path:
+    with BagWriter(path, {"seed": "7"}, compress=False) as bag:
+        bag.add_topic("/chatter", "std_msgs/msg/String", from_profile(QOS_COMMAND))
+        for i in range(count):
+            bag.write("/chatter", 1_000_000_000 + i * 10_000_000, serialize_message(String(data=f"{i:0{size}d}")))
+    return path
+
+
+def test_what_is_written_is_read_in_order(tmp_path: Path) -> None:
+    with open_bag(write(tmp_path / "bag", 50)) as bag:
+        assert bag.mended is None
+        assert (bag.counts, bag.custom["seed"]) == ({"/chatter": 50}, "7")
+        assert bag.duration_s == pytest.approx(0.49)
+        said = [deserialize_message(record.data, String).data for record in bag.records()]
+        assert said == [f"{i:010d}" for i in range(50)]
+        assert next(bag.records(start_s=0.4)).t_ns == 1_400_000_000
+
+
+@pytest.mark.parametrize("lost", [1, 30, 700_000])
+def test_a_recording_that_was_cut_short_keeps_what_is_whole(tmp_path: Path, lost: int) -> None:
+    """As SIGKILL or a full disk leave it: no end, no metadata."""
+    path = write(tmp_path / "bag", 400, size=10_000)  # 4 MB: four chunks
+    (path / "metadata.yaml").unlink()
+    file = path / "bag.mcap"
+    with file.open("r+b") as data:
+        data.truncate(file.stat().st_size - lost)
+    with open_bag(path) as bag:
+        assert bag.mended is not None
+        said = [int(deserialize_message(record.data, String).data.lstrip("0") or "0") for record in bag.records()]
+        assert said == list(range(len(said)))
+        assert len(said) > 200
+    with open_bag(path) as bag:
+        assert bag.mended is None, "mended once and for all"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(b"", "is empty"), (b"\x89MCAP0\r\n" + bytes(3), "before anything whole"), (b"nonsense" * 9, "not an MCAP file")],
+)
+def test_empty_truncated_and_foreign_files_are_refused(tmp_path: Path, content: bytes, said: str) -> None:
+    path = tmp_path / "bag.mcap"
+    path.write_bytes(content)
+    with pytest.raises(OpenArmError, match=said) as refused, open_bag(path):
+        pass
+    assert refused.value.code == Code.INVALID_ARGUMENT
+    assert path.read_bytes() == content, "a file that is refused is left as it was"
+
+
+def test_folders_that_are_no_bag_and_bags_that_exist_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(OpenArmError, match="there is no bag"), open_bag(tmp_path / "missing"):
+        pass
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(OpenArmError, match=r"found notes\.txt"), open_bag(tmp_path):
+        pass
+    with pytest.raises(OpenArmError, match="never overwritten"):
+        BagWriter(write(tmp_path / "bag", 1), {})
+
+
+def test_a_definition_has_constants_arrays_and_bounds() -> None:
+    text = definition(message_class("sensor_msgs/msg/JointState"))
+    assert "float64[] position" in text
+    assert "int64 CUBE=1" in definition(message_class("visualization_msgs/msg/Marker"))
+    with pytest.raises(OpenArmError, match="no_such_msgs"):
+        message_class("no_such_msgs/msg/Thing")
+
+
+@pytest.mark.parametrize("profile", [QOS_COMMAND, QOS_LATCHED, QOS_SENSOR])
+def test_quality_of_service_survives_the_bag(profile: object) -> None:
+    back = to_profile(from_profile(profile))  # type: ignore[arg-type]
+    assert (back.reliability, back.durability) == (profile.reliability, profile.durability)  # type: ignore[attr-defined]
