@@ -83,7 +83,7 @@ def compile_world(
         dof=model.jnt_dofadr[joints].astype(np.intp),
         actuator=actuator,
         effort_limit=np.where(limited, model.actuator_forcerange[actuator, 1], np.inf),
-        start_qpos=_start_qpos(model, home),
+        start_qpos=start_qpos(model, home),
         objects=tuple(objects),
         object_qpos=tuple(int(model.jnt_qposadr[j]) for j in free),
         object_dof=tuple(int(model.jnt_dofadr[j]) for j in free),
@@ -136,7 +136,12 @@ def _free_joint(model: mujoco.MjModel, body_name: str) -> int:
     return joint
 
 
-def _start_qpos(model: mujoco.MjModel, home: Mapping[str, float]) -> Array:
+def start_qpos(model: mujoco.MjModel, home: Mapping[str, float]) -> Array:
+    """Configuration (nq,) with joints at given positions by name, those coupled to them too, the rest at its reference.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when a joint is missing.
+    """
     start = model.qpos0.copy()
     for name, value in home.items():
         start[model.jnt_qposadr[_joint(model, name)]] = value

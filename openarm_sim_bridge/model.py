@@ -94,6 +94,7 @@ def build_spec(
     cameras: Mapping[str, CameraConfig],
     mount_seed: int | None = None,
     physics: PhysicsConfig | None = None,
+    robot: mujoco.MjSpec | None = None,
 ) -> mujoco.MjSpec:
     """Compose the world.
 
@@ -103,6 +104,7 @@ def build_spec(
         cameras: By name; those of a mount with an error stand where `mount_seed` puts them.
         mount_seed: Of the mount errors; None is the nominal mounts.
         physics: None is the defaults.
+        robot: Of `robot_spec` with the same physics, to spare the reading of the URDF; it stays as it is.
 
     Returns:
         An editable model: bodies are named like links, joints and actuators like joints, objects by their names.
@@ -112,7 +114,7 @@ def build_spec(
             URDF or a fixture.
     """
     settings = physics or PhysicsConfig()
-    spec = robot_spec(description, settings)
+    spec = robot_spec(description, settings) if robot is None else robot.copy()
     contact = contact_of(settings)
     scenery.add_surroundings(spec, contact)
     scenery.add_table(spec, scene.table, contact)

@@ -9,18 +9,21 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import Future as ThreadFuture
 from typing import Any, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 from openarm_interfaces.srv import MoveObject, RemoveObject, ResetWorld, SetPause, SpawnObject, StepSimulation
+from rclpy.task import Future
 
 from openarm_common.convert import pose_to_matrix, xyz
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import BaseNode
 from openarm_common.scene import Scene, load_scene
+from openarm_sim_bridge.compiled import CompiledWorld
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.stage import Stage, with_object, without_object
 from openarm_sim_bridge.state_publisher import WORLD_FRAME
@@ -28,7 +31,6 @@ from openarm_sim_bridge.state_publisher import WORLD_FRAME
 T = TypeVar("T")
 
 _ANSWER_S = 1.0
-_STEPPING_S = 60.0
 _UPRIGHT = 1e-3
 
 
@@ -90,7 +92,7 @@ class SimulationServices:
 
     # --- callbacks
     async def _on_reset(self, request: ResetWorld.Request, response: ResetWorld.Response) -> ResetWorld.Response:
-        return await answer(self._node, response, self._node.in_thread(self._reset, request.scene, request.seed))
+        return await answer(self._node, response, self._node.in_thread(self._reset, request))
 
     async def _on_pause(self, request: SetPause.Request, response: SetPause.Response) -> SetPause.Response:
         return await answer(self._node, response, self._node.in_thread(self._pause, request.paused))
@@ -98,7 +100,7 @@ class SimulationServices:
     async def _on_step(
         self, request: StepSimulation.Request, response: StepSimulation.Response
     ) -> StepSimulation.Response:
-        return await answer(self._node, response, self._node.in_thread(self._step, request.steps))
+        return await answer(self._node, response, self._step(request.steps))
 
     async def _on_spawn(self, request: SpawnObject.Request, response: SpawnObject.Response) -> SpawnObject.Response:
         return await answer(self._node, response, self._node.in_thread(self._spawn, request))
@@ -110,30 +112,59 @@ class SimulationServices:
         return await answer(self._node, response, self._node.in_thread(self._move, request.name, request.pose))
 
     # --- work, in a worker thread
-    def _reset(self, source: str, seed: int) -> str:
+    def _reset(self, request: ResetWorld.Request) -> str:
         with self._changing:
-            if seed < 0:
-                raise OpenArmError(Code.SCENE_INVALID, f"seed is {seed}, expected 0 or more")
-            scene = load_scene(source, seed) if source else self._loaded
+            if request.seed < 0:
+                raise OpenArmError(Code.SCENE_INVALID, f"seed is {request.seed}, expected 0 or more")
+            scene = load_scene(request.scene, request.seed) if request.scene else self._loaded
+            joints, objects = self._start_of(request, scene)
             if scene == self._present:
-                between_ticks(self._simulation, self._reset_world)
+                between_ticks(self._simulation, lambda: self._reset_world(joints, objects))
             else:
                 compiled = self._stage.compile(self._simulation.world, scene)
-                between_ticks(self._simulation, lambda: self._exchange(compiled))
+                between_ticks(self._simulation, lambda: self._exchange(compiled, joints, objects))
             self._loaded = self._present = scene
         self._on_scene(scene)
         return f"scene {scene.name!r} with {len(scene.objects)} objects"
+
+    def _start_of(
+        self, request: ResetWorld.Request, scene: Scene
+    ) -> tuple[dict[str, float], dict[str, NDArray[np.float64]]]:
+        """Which joints and objects start elsewhere than at home and in their places of the scene."""
+        keyframe = request.keyframe
+        joints = self._stage.posture(keyframe) if keyframe not in ("", "home") else dict[str, float]()
+        command = self._simulation.controller.check_command(request.joint_names, request.joint_positions)
+        if command.unknown:
+            known = ", ".join(self._stage.joint_names)
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no joint {command.unknown[0]!r}; joints: {known}")
+        if len(request.object_names) != len(request.object_poses):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"{len(request.object_names)} object names and {len(request.object_poses)} poses, expected as many",
+            )
+        objects = {
+            name: _pose_of(name, pose, scene)
+            for name, pose in zip(request.object_names, request.object_poses, strict=True)
+        }
+        return joints | dict(command.positions), objects
 
     def _pause(self, paused: bool) -> str:
         between_ticks(self._simulation, lambda: self._simulation.set_paused(paused))
         return "paused" if paused else "running"
 
-    def _step(self, steps: int) -> str:
-        stepping = between_ticks(self._simulation, lambda: self._simulation.advance(steps))
-        try:
-            t_ns = stepping.result(timeout=_STEPPING_S)
-        except TimeoutError as error:
-            raise OpenArmError(Code.TIMEOUT, f"{steps} steps took more than {_STEPPING_S:.0f} s") from error
+    async def _step(self, steps: int) -> str:
+        """Not in a worker thread: in lock-step that would wait for steps that wait for it."""
+        begun = self._node.in_thread(between_ticks, self._simulation, lambda: self._simulation.advance(steps))
+        stepped = Future(executor=self._node.executor)
+
+        def done(stepping: ThreadFuture[int]) -> None:
+            error = stepping.exception()
+            stepped.set_result(stepping.result()) if error is None else stepped.set_exception(error)
+            if self._node.executor is not None:
+                self._node.executor.wake()
+
+        (await begun).add_done_callback(done)
+        t_ns: Any = await stepped
         return f"simulated time is {t_ns * 1e-9:.3f} s"
 
     def _spawn(self, request: SpawnObject.Request) -> str:
@@ -154,23 +185,35 @@ class SimulationServices:
 
     def _move(self, name: str, pose: PoseStamped) -> str:
         with self._changing:
-            there = {item.name: item for item in self._present.objects}
-            if name not in there:
-                raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {', '.join(there) or 'none'}")
-            T, stands = _pose_in_world(pose, self._present.table.top_z)
-            if stands:
-                T[2, 3] += 0.5 * there[name].size[2]
+            T = _pose_of(name, pose, self._present)
             between_ticks(self._simulation, lambda: self._simulation.world.move_object(name, T))
         return f"{name!r} is at ({', '.join(f'{v:.3f}' for v in T[:3, 3])}) m in {WORLD_FRAME}"
 
     # --- between two ticks
-    def _reset_world(self) -> None:
-        self._simulation.world.reset()
+    def _reset_world(self, joints: Mapping[str, float], objects: Mapping[str, NDArray[np.float64]]) -> None:
+        self._simulation.world.reset(joints, objects)
         self._simulation.restart()
 
-    def _exchange(self, compiled: Any) -> None:
-        self._simulation.world.exchange(compiled)
+    def _exchange(
+        self, compiled: CompiledWorld, joints: Mapping[str, float], objects: Mapping[str, NDArray[np.float64]]
+    ) -> None:
+        self._simulation.world.exchange(compiled, joints, objects)
         self._simulation.restart()
+
+
+def _pose_of(name: str, pose: PoseStamped, scene: Scene) -> NDArray[np.float64]:
+    """T_world_object of an object of a scene.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, naming the objects that exist; as `_pose_in_world`.
+    """
+    there = {item.name: item for item in scene.objects}
+    if name not in there:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {', '.join(there) or 'none'}")
+    T, stands = _pose_in_world(pose, scene.table.top_z)
+    if stands:
+        T[2, 3] += 0.5 * there[name].size[2]
+    return T
 
 
 def _pose_in_world(pose: PoseStamped, table_top_z: float) -> tuple[NDArray[np.float64], bool]:

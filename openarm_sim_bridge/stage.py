@@ -6,12 +6,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import mujoco
+
 from openarm_common.cameras import CameraConfig
 from openarm_common.description import SIDES, RobotDescription
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Scene, SceneObject, parse_object
 from openarm_sim_bridge.compiled import CompiledWorld, TrackedObject
-from openarm_sim_bridge.model import PhysicsConfig, build_spec
+from openarm_sim_bridge.model import PhysicsConfig, build_spec, robot_spec
 from openarm_sim_bridge.trajectory import JointGroup
 from openarm_sim_bridge.world import World
 
@@ -37,6 +39,7 @@ class Stage:
         self._cameras = cameras
         self._mount_seed = mount_seed
         self._physics = physics
+        self._robot = robot_spec(description, physics)
         self.joint_names = tuple(
             name for side in SIDES for name in (*description.arm_joints(side), description.finger_joint(side))
         )
@@ -58,8 +61,7 @@ class Stage:
         Raises:
             OpenArmError: CONFIG_INVALID, when the model can't be built.
         """
-        spec = build_spec(self._description, scene, self._cameras, self._mount_seed, self._physics)
-        return World(spec, joint_names=self.joint_names, home=self.home, objects=tracked(scene))
+        return World(self._spec(scene), joint_names=self.joint_names, home=self.home, objects=tracked(scene))
 
     def compile(self, world: World, scene: Scene) -> CompiledWorld:
         """Compile another scene for a world to take; slow, changes nothing.
@@ -67,8 +69,24 @@ class Stage:
         Raises:
             OpenArmError: CONFIG_INVALID, when the model can't be built.
         """
-        spec = build_spec(self._description, scene, self._cameras, self._mount_seed, self._physics)
-        return world.compile(spec, tracked(scene))
+        return world.compile(self._spec(scene), tracked(scene))
+
+    def posture(self, keyframe: str) -> dict[str, float]:
+        """Joint positions of a keyframe, rad: the SRDF's state of that name of either arm; an arm without one is home.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, naming the keyframes there are.
+        """
+        states = self._description.semantics.states
+        groups = [f"{side}_arm" for side in SIDES]
+        known = sorted({name for group, name in states if group in groups})
+        if keyframe not in known:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no keyframe {keyframe!r}; keyframes: {', '.join(known)}")
+        found = [states[group, keyframe] for group in groups if (group, keyframe) in states]
+        return self.home | {joint: position for state in found for joint, position in state.items()}
+
+    def _spec(self, scene: Scene) -> mujoco.MjSpec:
+        return build_spec(self._description, scene, self._cameras, self._mount_seed, self._physics, robot=self._robot)
 
     def _group(self, names: tuple[str, ...]) -> JointGroup:
         lower, upper = self._description.limits(names)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.compiled import CompiledWorld, TrackedObject, compile_world, joint_slices
+from openarm_sim_bridge.compiled import CompiledWorld, TrackedObject, compile_world, joint_slices, start_qpos
 from openarm_sim_bridge.touch import contact_wrench, wrist_wrench
 
 Array = NDArray[np.float64]
@@ -196,14 +196,31 @@ class World:
         return Snapshot(self.model, self.t_ns, self.data.qpos.copy())
 
     # --- reset and exchange
-    def reset(self) -> None:
-        """Put robot and objects back to their start, at rest; simulated time goes on."""
+    def reset(self, joints: Mapping[str, float] | None = None, objects: Mapping[str, Array] | None = None) -> None:
+        """Put robot and objects back to their start, at rest; simulated time goes on.
+
+        Args:
+            joints: Start positions by name of joints that do not start at home, rad or m.
+            objects: T_world_object (4, 4) by name of objects that start elsewhere.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, naming the objects that exist; SCENE_INVALID, when something would overlap
+                (checked where something starts elsewhere). The world is then as before.
+        """
+        c, d = self._compiled, self.data
+        start = start_qpos(self.model, self._home | dict(joints or {}))
+        for name, T in (objects or {}).items():
+            self._set_free_pose(start, c.object_qpos[self._object(name)], T)
+        ctrl = np.zeros(self.model.nu)
+        ctrl[c.actuator] = start[c.qpos]
+        before = d.qpos.copy(), d.qvel.copy(), d.ctrl.copy()
+        self._place(start, np.zeros(self.model.nv), ctrl)
+        overlap = self._overlap(set(range(self.model.nbody))) if joints or objects else ""
+        if overlap:
+            self._place(*before)
+            raise OpenArmError(Code.SCENE_INVALID, overlap)
         self._effort_limits.clear()
         self._apply_effort_limits()
-        start = self._compiled.start_qpos
-        ctrl = np.zeros(self.model.nu)
-        ctrl[self._compiled.actuator] = start[self._compiled.qpos]
-        self._place(start, np.zeros(self.model.nv), ctrl)
 
     def compile(self, spec: mujoco.MjSpec, objects: Sequence[TrackedObject]) -> CompiledWorld:
         """Compile a world for `exchange`. Slow (tens of ms), changes nothing, may run in any thread.
@@ -215,10 +232,21 @@ class World:
             spec, joint_names=self.joint_names, home=self._home, objects=objects, period_ns=self.period_ns
         )
 
-    def exchange(self, compiled: CompiledWorld) -> None:
-        """Take another world, at its start; fast. Simulated time goes on."""
+    def exchange(
+        self,
+        compiled: CompiledWorld,
+        joints: Mapping[str, float] | None = None,
+        objects: Mapping[str, Array] | None = None,
+    ) -> None:
+        """Take another world, at its start; fast. Arguments and errors as `reset`."""
+        before = (self._compiled, self.model, self.data) if hasattr(self, "_compiled") else None
         self._use(compiled)
-        self.reset()
+        try:
+            self.reset(joints, objects)
+        except OpenArmError:
+            if before is not None:
+                self._compiled, self.model, self.data = before
+            raise
 
     def extend(self, compiled: CompiledWorld) -> None:
         """Take a world that holds more or less, and keep the state of joints and targets that both have; fast.
@@ -242,7 +270,8 @@ class World:
         ctrl[compiled.actuator] = old.ctrl[before.actuator]
         self._apply_effort_limits()
         self._place(qpos, qvel, ctrl)
-        overlap = self._overlap_of_new(known)
+        new = {body for body in range(self.model.nbody) if self.model.body_dofnum[body] == 6} - known
+        overlap = self._overlap(new)
         if overlap:
             self._compiled, self.model, self.data = before, old_model, old
             raise OpenArmError(Code.SCENE_INVALID, overlap)
@@ -255,33 +284,41 @@ class World:
                 (the object then stays where it was).
         """
         c, d = self._compiled, self.data
-        names = [tracked.name for tracked in c.objects]
-        if name not in names:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {', '.join(names) or 'none'}")
-        q, v = c.object_qpos[names.index(name)], c.object_dof[names.index(name)]
+        at = self._object(name)
+        q, v = c.object_qpos[at], c.object_dof[at]
         before = d.qpos.copy(), d.qvel.copy(), d.ctrl.copy()
         qpos, qvel, ctrl = (part.copy() for part in before)
-        qpos[q : q + 3] = T_world_object[:3, 3]
-        qpos[q + 3 : q + 7] = np.roll(se3.quat_xyzw_from_matrix(T_world_object[:3, :3]), 1)
+        self._set_free_pose(qpos, q, T_world_object)
         qvel[v : v + 6] = 0.0
         self._place(qpos, qvel, ctrl)
-        body = int(self.model.dof_bodyid[v])
-        overlap = self._overlap_of_new(set(range(self.model.nbody)) - {body})
+        overlap = self._overlap({int(self.model.dof_bodyid[v])})
         if overlap:
             self._place(*before)
             raise OpenArmError(Code.SCENE_INVALID, overlap)
 
-    def _overlap_of_new(self, known: set[int]) -> str:
+    def _object(self, name: str) -> int:
+        names = [tracked.name for tracked in self._compiled.objects]
+        if name not in names:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {', '.join(names) or 'none'}")
+        return names.index(name)
+
+    @staticmethod
+    def _set_free_pose(qpos: Array, address: int, T_world_object: Array) -> None:
+        qpos[address : address + 3] = T_world_object[:3, 3]
+        qpos[address + 3 : address + 7] = np.roll(se3.quat_xyzw_from_matrix(T_world_object[:3, :3]), 1)
+
+    def _overlap(self, of: set[int]) -> str:
+        """What is wrong with where some bodies are; empty when they only touch."""
         m = self.model
         for contact in self.data.contact:
             bodies = [int(m.geom_bodyid[geom]) for geom in (contact.geom1, contact.geom2)]
-            new = [body for body in bodies if m.body_dofnum[body] == 6 and body not in known]
-            if new and contact.dist < -_OVERLAP_ALLOWED:
-                other = bodies[1] if bodies[0] == new[0] else bodies[0]
+            if not of.isdisjoint(bodies) and contact.dist < -_OVERLAP_ALLOWED:
+                # The one that can be put elsewhere is named first: an object, else what moves.
+                one, other = sorted(bodies, key=lambda body: (body not in of, -int(m.body_dofnum[body])))
                 place = ", ".join(f"{v:.3f}" for v in contact.pos)
                 return (
-                    f"{m.body(new[0]).name!r} would overlap {m.body(other).name!r} by {-contact.dist * 1e3:.0f} mm at"
-                    f" ({place}) m in world; choose another place"
+                    f"{m.body(one).name!r} would overlap {m.body(other).name!r} by {-contact.dist * 1e3:.0f} mm at"
+                    f" ({place}) m in world; choose another place or posture"
                 )
         return ""
 

@@ -55,6 +55,55 @@ def test_p25_reset_puts_the_robot_back_and_aborts_what_runs(bench) -> None:
     assert np.all(np.diff(stamps) > 0)
 
 
+def test_p25_reset_takes_a_keyframe_and_overrides(bench) -> None:
+    got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
+    pose = PoseStamped()
+    pose.pose.position.x, pose.pose.position.y = 0.45, 0.30
+    answer = bench.call(
+        ResetWorld,
+        "/sim/reset_world",
+        keyframe="hands_up",
+        joint_names=["openarm_right_joint7", bench.FINGER],
+        joint_positions=[0.25, 0.03],
+        object_names=["red_cube"],
+        object_poses=[pose],
+    )
+    assert answer.success, answer.message
+    up = bench.node.description.group_state("right_arm", "hands_up")
+    bench.ros.spin_until(lambda: abs(bench.arm[6] - 0.25) < 0.01, 5.0, "a joint state of the new posture")
+    np.testing.assert_allclose(bench.arm, [*(up[name] for name in bench.ARM[:6]), 0.25], atol=0.01)
+    assert bench.position(bench.FINGER) == pytest.approx(0.03, abs=0.001)
+    red = next(o for o in bench.fresh(got, 2)[-1].objects if o.name == "red_cube").pose.position
+    np.testing.assert_allclose([red.x, red.y, red.z], [0.45, 0.30, 0.425], atol=0.001)
+    bench.spin_sim(0.5)
+    assert bench.arm[6] == pytest.approx(0.25, abs=0.01)  # held there
+    assert bench.call(ResetWorld, "/sim/reset_world").success  # the overrides are of one reset
+    bench.ros.spin_until(lambda: np.allclose(bench.arm, bench.HOME, atol=0.01), 5.0, "home again")
+
+
+def test_p25_a_reset_that_makes_no_sense_changes_nothing(bench) -> None:
+    elbow = "openarm_right_joint4"
+    _, running = bench.follow(bench.goal((3.0, bench.NEAR_HOME)))
+    for fields, parts in (
+        ({"keyframe": "handstand"}, ["handstand", "hands_up", "home"]),
+        ({"joint_names": ["tail"], "joint_positions": [0.1]}, ["tail", "openarm_left_joint1"]),
+        ({"joint_names": [elbow], "joint_positions": [9.0]}, [elbow, "9.0", "limits"]),
+        ({"joint_names": [elbow]}, ["1 names", "0 positions"]),
+        ({"object_names": ["pear"], "object_poses": [PoseStamped()]}, ["pear", "red_cube"]),
+        ({"object_names": ["red_cube"]}, ["1 object names", "0 poses"]),
+        (
+            {"keyframe": "hands_up", "joint_names": [elbow], "joint_positions": [1.0]},
+            ["SCENE_INVALID", "openarm_right_link5", "table"],
+        ),
+        ({"seed": -1}, ["seed", "-1"]),
+    ):
+        answer = bench.call(ResetWorld, "/sim/reset_world", **fields)
+        assert not answer.success, fields
+        for part in parts:
+            assert part in answer.message
+    assert bench.ros.result(running, 10.0).result.error_code == 0  # the arm went on
+
+
 def test_a_diverged_world_takes_no_command_until_it_is_reset(bench, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a file there
     simulation = bench.node._simulation

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import openarm_sim_bridge
+from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_sim_bridge.compiled import TrackedObject
 from openarm_sim_bridge.world import World
@@ -166,6 +167,38 @@ def test_reset_puts_everything_back_and_time_goes_on() -> None:
     world.step_tick()
     assert world.t_ns == t_ns + 10_000_000
     np.testing.assert_allclose(world.read_joints().position, [-0.3, 0.8, 0.02], atol=0.05)
+
+
+def test_p25_a_reset_may_start_elsewhere_and_the_next_one_is_at_home_again() -> None:
+    world = make()
+    elsewhere = se3.make(None, (-0.4, 0.3, 0.05))
+    world.reset({"finger": 0.03, "elbow": -0.2}, {"ball": elsewhere})
+    np.testing.assert_allclose(world.read_joints().position, [-0.3, -0.2, 0.03])
+    np.testing.assert_allclose(world.data.ctrl, [0.03, -0.2, -0.3])  # it is held there
+    assert world.data.joint("mimic").qpos[0] == pytest.approx(0.03)  # what is coupled follows
+    np.testing.assert_allclose(world.objects()[0].T_world_object, elsewhere)
+    world.reset()
+    np.testing.assert_allclose(world.read_joints().position, [-0.3, 0.8, 0.02])
+    np.testing.assert_allclose(world.objects()[0].T_world_object[:3, 3], [0.5, 0.0, 0.05])
+
+
+def test_p25_a_start_that_overlaps_leaves_the_world_as_it_was() -> None:
+    world = make()
+    for _ in range(3):
+        world.step_tick()
+    model, qpos, qvel = world.model, world.data.qpos.copy(), world.data.qvel.copy()
+    cube = CUBE.format(pos="0 1 .05") + BALL.format(z=0.05)
+    other = world.compile(spec(extra=cube), (TrackedObject("cube", "blue", (0.06,) * 3), BALL_OBJECT))
+    into_the_floor, into_the_ball = se3.make(None, (0.5, 0.0, 0.01)), se3.make(None, (0.5, 0.02, 0.05))
+    with pytest.raises(OpenArmError, match="'ball' would overlap 'world' by 40 mm"):
+        world.reset(objects={"ball": into_the_floor})
+    with pytest.raises(OpenArmError, match=r"'cube' would overlap 'ball'|'ball' would overlap 'cube'"):
+        world.exchange(other, objects={"cube": into_the_ball})
+    with pytest.raises(OpenArmError, match="no object 'cube'; objects: ball"):
+        world.reset(objects={"cube": into_the_ball})
+    assert world.model is model
+    np.testing.assert_array_equal(world.data.qpos, qpos)
+    np.testing.assert_array_equal(world.data.qvel, qvel)
 
 
 def test_exchange_loads_another_world_and_time_goes_on() -> None:
