@@ -4,17 +4,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_common.errors import OpenArmError
+from openarm_common.errors import Code, OpenArmError
 from openarm_motion import moves
 from openarm_motion.arm import Arm, Situation
 from openarm_motion.collision import CollisionScene
+from openarm_motion.failure import Alternative, PlanFailedError
 from openarm_motion.moves import Around
+from openarm_motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
@@ -26,19 +27,20 @@ _SEARCH = 0.3
 _STEPS = 20
 
 
-@dataclass(frozen=True, eq=False)
-class Alternative:
-    """A goal that a plan was found for.
+def explained(plan: Callable[[], Trajectory], instead: Callable[[], Alternative | None]) -> Trajectory:
+    """A plan; when it fails for where it was to go, the error says what would work instead.
 
-    Attributes:
-        q: (n,) rad.
-        pose: (4, 4) of the tool there.
-        distance: Of the tool from where it was asked to be, m.
+    Raises:
+        OpenArmError: that of `plan`.
     """
-
-    q: Array
-    pose: Array
-    distance: float
+    try:
+        return plan()
+    except PlanFailedError as error:
+        blocked = error.stage in ("goal", "search", "certificate")
+        if not blocked or error.code not in (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN):
+            raise
+        found = instead()
+        raise PlanFailedError(error.code, error.message, error.stage, error.contact, found) from error
 
 
 def near_pose(

@@ -82,6 +82,29 @@ class ExecutionConfig(Config):
     )
 
 
+class MapConfig(Config):
+    """How the map of the surroundings is used."""
+
+    use: Literal["required", "optional", "off"] = Field(
+        default="optional",
+        description="required: no plan without a fresh map; optional: plans go without one that is missing or old",
+    )
+    max_age: float = Field(
+        default=3.0, gt=0.0, le=60.0, description="oldest update, and oldest look of each camera, that counts, s"
+    )
+    cameras: tuple[str, ...] = Field(default=(), description="cameras that must have looked; empty: all of the map's")
+    name: str = Field(
+        default="", pattern=r"^[A-Za-z0-9_.-]*$", description="of the map's shared memory; empty: by ROS domain"
+    )
+    certain_padding: float = Field(
+        default=0.018, ge=0.0, le=0.2, description="cells this near to the table or a body of the scene are theirs, m"
+    )
+    estimate_padding: float = Field(
+        default=0.03, ge=0.0, le=0.2, description="the same for a request's boxes and for what is held, m"
+    )
+    robot_padding: float = Field(default=0.005, ge=0.0, le=0.2, description="the same for the robot where it stands, m")
+
+
 class MotionConfig(Config):
     """Parameters of the motion node."""
 
@@ -94,6 +117,7 @@ class MotionConfig(Config):
     scene: str = Field(
         default="demo", description="scene whose table is an obstacle: a name, a path, or empty for none"
     )
+    map: MapConfig = Field(default_factory=MapConfig, description="the map of the surroundings")
     limits: LimitsConfig = Field(default_factory=LimitsConfig, description="of the joints")
     clearance: Clearance = Field(default_factory=Clearance, description="on free paths")
     straight: StraightClearance = Field(default_factory=StraightClearance, description="clearance on straight parts")

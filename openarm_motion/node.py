@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motion node: plans and executes motions of each arm.
+"""The motion node: plans and executes motions of each arm, and of both at once.
 
-Offers the actions /motion/plan_approach, /motion/move and /motion/execute, the service /motion/compute_ik, and latched
-/motion/attached_objects: what each arm holds, as far as plans say so. Poses are in the base frame or any frame that
-the description or /tf_static knows.
+Offers the actions /motion/plan_approach, /motion/move, /motion/move_arms and /motion/execute, the service
+/motion/compute_ik, the planning scene (`scene_executor`), and latched /motion/attached_objects and /motion/preview:
+what each arm holds, as far as plans say so, and the way of the latest plan. Poses are in the base frame or any frame
+that the description or /tf_static knows.
 """
 
 from __future__ import annotations
@@ -13,9 +14,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
-from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
+from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
 from openarm_interfaces.srv import ComputeIK
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
@@ -23,20 +23,25 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common.cameras import load_cameras
-from openarm_common.convert import matrix_to_pose, pose_to_matrix, trajectory_from_msg
+from openarm_common.convert import matrix_to_pose, trajectory_from_msg
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.housings import with_housings
 from openarm_common.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
-from openarm_common.scene import load_scene
 from openarm_common.tf import RobotStateListener
 from openarm_motion import convert, moves
+from openarm_motion.alternative import explained, near_joints, near_pose
 from openarm_motion.approach import ApproachFailedError, ApproachPlan, plan_approach
 from openarm_motion.arm import Arm, Situation
+from openarm_motion.both_executor import BothExecutor
 from openarm_motion.checks import check_against_others, check_trajectory
-from openarm_motion.collision import Box, box_from
+from openarm_motion.collision import Box
 from openarm_motion.config import MotionConfig
-from openarm_motion.executor import Follower, Watch, stale
+from openarm_motion.executor import Follower
+from openarm_motion.goals import posture
 from openarm_motion.memory import HeldMemory
+from openarm_motion.planning_scene import PlanningScene
+from openarm_motion.scene_executor import SceneExecutor, table_boxes
+from openarm_motion.situation_client import Situations
 from openarm_motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -44,6 +49,8 @@ Result = TypeVar("Result")
 
 #: Pace of feedback while planning, s.
 _FEEDBACK = 0.1
+#: Points of a previewed trajectory.
+_PREVIEW = 50
 
 
 class MotionNode(BaseNode[MotionConfig]):
@@ -51,19 +58,24 @@ class MotionNode(BaseNode[MotionConfig]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("motion", MotionConfig, **kwargs)
-        static = table_boxes(self.config.scene)
+        scene = PlanningScene(table_boxes(self.config.scene))
         self._states = RobotStateListener(self, self.description)
         robot = with_housings(self.description, load_cameras().values())
-        self._arms = {name: Arm(name, robot, self.config, static) for name in self.config.arms}
+        self._arms = {name: Arm(name, robot, self.config, scene.fixed) for name in self.config.arms}
         self._followers = {name: Follower(self, arm, self._states) for name, arm in self._arms.items()}
         self._claimed: set[str] = set()
         self._closing = False
         self._held = HeldMemory()
         self._attached = self.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
         self._publish_held()
+        self._preview = self.create_publisher(MarkerArray, "/motion/preview", QOS_LATCHED)
+        self._situations = Situations(self, self._states, self._arms, scene, self._held)
+        self._scene = SceneExecutor(self, scene, self._situations)
+        self._both = BothExecutor(self, self._states, self._arms, self._followers, self._situations)
         self._servers = [
             self._serve(PlanApproach, "/motion/plan_approach", self._on_plan),
             self._serve(MoveArm, "/motion/move", self._on_move),
+            self._serve(MoveArms, "/motion/move_arms", self._on_move_both),
             self._serve(ExecuteTrajectory, "/motion/execute", self._on_execute),
         ]
         self.create_service(ComputeIK, "/motion/compute_ik", self._on_ik)
@@ -93,22 +105,34 @@ class MotionNode(BaseNode[MotionConfig]):
             arm = self._arm(goal.arm)
             request = convert.request_from_msg(goal)
             if not len(goal.start):
-                await self._fresh()
-            now = self._situation(arm, goal.start, goal.velocity_scale, self._stopper(handle))
-            plan: ApproachPlan = await self.in_thread(plan_approach, arm, now, request, report)
-            result.success, result.code, result.message = True, Code.OK.value, "planned"
+                await self._situations.fresh()
+            prepared = self._situations.prepare(
+                arm,
+                goal.start,
+                goal.velocity_scale,
+                self._stopper(handle),
+                request.obstacles,
+                request.attached,
+                goal.expected_scene_version,
+            )
+            result.scene_version = prepared.version
+            plan: ApproachPlan = await self.in_thread(lambda: plan_approach(arm, prepared.complete(), request, report))
+            result.success, result.code, result.message = True, Code.OK.value, f"planned{prepared.note}"
             result.chosen = plan.chosen
             result.transfer = convert.trajectory_msg(plan.transfer)
             result.approach = convert.trajectory_msg(plan.approach)
             result.retreat = convert.trajectory_msg(plan.retreat)
             result.refusals = convert.refusals_msg(plan.refusals)
+            self._show_ways({goal.arm: (plan.transfer, plan.approach, plan.retreat)})
             self._held.expect(goal.arm, (plan.transfer, plan.approach), request.attached)
             self._held.expect(goal.arm, (plan.retreat,), plan.held_after)
         except ApproachFailedError as error:
             result.code, result.message = error.code.value, error.message
             result.refusals = convert.refusals_msg(error.refusals)
+            result.failure.stage = "search" if error.code == Code.NO_PLAN else "goal"
         except OpenArmError as error:
             result.code, result.message = error.code.value, error.message
+            result.failure = convert.failure_msg(error)
         finally:
             self.destroy_timer(timer)
         result.planning_time = time.monotonic() - begin
@@ -122,20 +146,55 @@ class MotionNode(BaseNode[MotionConfig]):
             arm = self._arm(goal.arm)
             with self._claim(goal.arm, wanted=not goal.plan_only):
                 handle.publish_feedback(MoveArm.Feedback(stage="planning"))
-                await self._fresh()
-                now = self._situation(arm, (), goal.velocity_scale, self._stopper(handle))
                 around = moves.Around(convert.boxes_from_msg(goal.obstacles), convert.boxes_from_msg(goal.attached))
-                trajectory: Trajectory = await self.in_thread(self._planner_of(arm, now, goal, around))
+                await self._situations.fresh()
+                prepared = self._situations.prepare(
+                    arm,
+                    (),
+                    goal.velocity_scale,
+                    self._stopper(handle),
+                    [*around.obstacles],
+                    [*around.attached],
+                    goal.expected_scene_version,
+                )
+                result.scene_version = prepared.version
+                planner = self._planner_of(arm, goal, around)
+                trajectory: Trajectory = await self.in_thread(lambda: planner(prepared.complete()))
                 result.trajectory = convert.trajectory_msg(trajectory)
                 result.planning_time = time.monotonic() - begin
-                result.message = f"planned, {trajectory.duration:.2f} s"
+                result.message = f"planned, {trajectory.duration:.2f} s{prepared.note}"
+                self._show_ways({goal.arm: (trajectory,)})
                 if not goal.plan_only:
+                    self._situations.unchanged(prepared.version)
                     self._hold(goal.arm, tuple(around.attached))
                     await self._follow(handle, arm, result.trajectory, MoveArm.Feedback(stage="executing"))
-                    result.message = "arrived"
+                    result.message = f"arrived{prepared.note}"
             result.success, result.code = True, Code.OK.value
         except OpenArmError as error:
             result.code, result.message = error.code.value, error.message
+            result.failure = convert.failure_msg(error)
+        return self._end(handle, result)
+
+    async def _on_move_both(self, handle: ServerGoalHandle) -> MoveArms.Result:
+        goal: MoveArms.Goal = handle.request
+        result = MoveArms.Result()
+        try:
+            arms = self._both.arms_of(goal)
+            names = [arm.name for arm in arms]
+            with self._claim(*names, wanted=not goal.plan_only):
+                handle.publish_feedback(MoveArms.Feedback(stage="planning"))
+                plan, held = await self._both.plan(goal, result, self._stopper(handle))
+                self._show_ways({name: (part,) for name, part in zip(names, plan.trajectories, strict=True)})
+                if not goal.plan_only:
+                    self._situations.unchanged(result.scene_version)
+                    for name, boxes in zip(names, held, strict=True):
+                        self._hold(name, boxes)
+                    await self._both.follow(handle, arms, result.trajectories, self._stopper(handle))
+                    result.message = f"arrived, {plan.separation * 1e3:.0f} mm apart on the way"
+            result.success, result.code = True, Code.OK.value
+        except OpenArmError as error:
+            result.code, result.message = error.code.value, error.message
+            result.failure = convert.failure_msg(error)
         return self._end(handle, result)
 
     async def _on_execute(self, handle: ServerGoalHandle) -> ExecuteTrajectory.Result:
@@ -143,8 +202,9 @@ class MotionNode(BaseNode[MotionConfig]):
         result = ExecuteTrajectory.Result()
         try:
             arm = self._arm(goal.arm)
+            self._situations.unchanged(goal.scene_version)
             with self._claim(goal.arm, wanted=True):
-                await self._fresh()
+                await self._situations.fresh()
                 await self._follow(handle, arm, goal.trajectory, ExecuteTrajectory.Feedback())
             result.success, result.code, result.message = True, Code.OK.value, "arrived"
         except OpenArmError as error:
@@ -155,8 +215,8 @@ class MotionNode(BaseNode[MotionConfig]):
     def _on_ik(self, request: ComputeIK.Request, response: ComputeIK.Response) -> ComputeIK.Response:
         try:
             arm = self._arm(request.arm)
-            pose = self._pose(request.pose)
-            now = self._situation(arm, request.seed, 0.0, lambda: False)
+            pose = self._situations.pose(request.pose)
+            now = self._situations.situation(arm, request.seed, 0.0, lambda: False)
             best = arm.inverse.nearest(pose, now.start, position_only=request.free_orientation)
             response.joint_positions = best.q.tolist()
             response.position_error, response.orientation_error = best.position_error, best.orientation_error
@@ -185,61 +245,48 @@ class MotionNode(BaseNode[MotionConfig]):
 
         await self._followers[arm.name].follow(message, motion, self._stopper(handle), progress)
 
-    def _planner_of(
-        self, arm: Arm, now: Situation, goal: MoveArm.Goal, around: moves.Around
-    ) -> Callable[[], Trajectory]:
+    def _planner_of(self, arm: Arm, goal: MoveArm.Goal, around: moves.Around) -> Callable[[Situation], Trajectory]:
         """The plan that a goal asks for, to be made in a thread; poses are looked up here, in the executor's thread."""
         if goal.kind == MoveArm.Goal.JOINTS:
-            return lambda: moves.to_joints(arm, now, goal.joint_positions, around)
+            q = np.array(goal.joint_positions, dtype=np.float64)
+            return lambda now: explained(
+                lambda: moves.to_joints(arm, now, goal.joint_positions, around),
+                lambda: near_joints(arm, now, around, q),
+            )
         if goal.kind == MoveArm.Goal.NAMED:
-            return lambda: moves.to_named(arm, now, goal.named, around)
+            return lambda now: explained(
+                lambda: moves.to_named(arm, now, goal.named, around),
+                lambda: near_joints(arm, now, around, posture(arm, goal.named, now.start)),
+            )
+        pose = self._situations.pose(goal.pose)
+        free = goal.free_orientation
         if goal.kind == MoveArm.Goal.POSE:
-            pose = self._pose(goal.pose)
-            return lambda: moves.to_pose(arm, now, pose, around, free_orientation=goal.free_orientation)
+            return lambda now: explained(
+                lambda: moves.to_pose(arm, now, pose, around, free_orientation=free),
+                lambda: near_pose(arm, now, around, pose, free_orientation=free),
+            )
         if goal.kind == MoveArm.Goal.LINEAR:
-            pose = self._pose(goal.pose)
-            return lambda: moves.to_pose_on_line(arm, now, pose, around)
+            return lambda now: moves.to_pose_on_line(arm, now, pose, around)
         raise OpenArmError(Code.INVALID_ARGUMENT, f"kind is {goal.kind}; valid: JOINTS 0, POSE 1, LINEAR 2, NAMED 3")
 
-    def _situation(self, arm: Arm, start: Sequence[float], scale: float, stopped: Callable[[], bool]) -> Situation:
-        """The robot as it is now; a given start is enough where the joint states are missing."""
-        state: dict[str, float] = {}
-        age = self._states.age_s()
-        if age <= self.config.execution.stale_after:
-            state = self._states.buffer.latest()[1]
-        elif len(start) == 0:
-            raise stale(age)
-        return arm.situation(state, start, scale, stopped)
-
-    async def _fresh(self) -> None:
-        """Wait a moment for a fresh joint state; see `Watch.fresh`."""
-        if self._states.age_s() <= self.config.execution.stale_after:
-            return
-        watch = Watch(self, self._states)
-        try:
-            await watch.fresh()
-        finally:
-            watch.close()
-
-    def _pose(self, message: PoseStamped) -> Array:
-        """`T_base_pose` (4, 4) of a pose in any known frame."""
-        T_frame_pose = pose_to_matrix(message.pose)
-        frame = message.header.frame_id
-        if frame in ("", BASE_FRAME):
-            return T_frame_pose
-        buffer = self._states.buffer
-        stamp_ns = buffer.latest()[0] if self._states.age_s() < float("inf") else 0
-        return buffer.lookup(self.description.root, frame, stamp_ns) @ T_frame_pose
+    def _show_ways(self, plans: dict[str, tuple[Trajectory, ...]]) -> None:
+        """Show the tools' ways: what a plan would do, for whoever has to agree to it."""
+        ways: dict[str, Array] = {}
+        for name, parts in plans.items():
+            q = np.concatenate([part.at(np.linspace(0.0, part.duration, _PREVIEW))[0] for part in parts])
+            ways[name] = self._arms[name].kinematics.fk_many(q)[:, :3, 3]
+        self._preview.publish(convert.preview_markers(ways, BASE_FRAME))
 
     def _arm(self, name: str) -> Arm:
         if name not in self._arms:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"arm is {name!r}; arms: {', '.join(self._arms)}")
         return self._arms[name]
 
-    def _claim(self, name: str, *, wanted: bool) -> _Claim:
-        if wanted and name in self._claimed:
-            raise OpenArmError(Code.BUSY, f"the {name} arm is moving already; wait for the end, or cancel it first")
-        return _Claim(self._claimed, name if wanted else None)
+    def _claim(self, *names: str, wanted: bool) -> _Claim:
+        taken = [name for name in names if name in self._claimed]
+        if wanted and taken:
+            raise OpenArmError(Code.BUSY, f"the {taken[0]} arm is moving already; wait for the end, or cancel it first")
+        return _Claim(self._claimed, names if wanted else ())
 
     def _stopper(self, handle: ServerGoalHandle) -> Callable[[], bool]:
         return lambda: self._closing or handle.is_cancel_requested
@@ -271,36 +318,27 @@ class MotionNode(BaseNode[MotionConfig]):
         age = self._states.age_s()
         fresh = age <= self.config.execution.stale_after
         moving = [name for name, follower in self._followers.items() if follower.running is not None]
-        message = "ready" if fresh else "no fresh /joint_states"
-        self.diagnose(fresh, message, joint_state_age_s=round(age, 2), moving=", ".join(moving) or "none")
+        faults = [] if fresh else ["no fresh /joint_states"]
+        values: dict[str, object] = {"joint_state_age_s": round(age, 2), "moving": ", ".join(moving) or "none"}
+        try:
+            look = self._situations.look()
+            values |= {"map_version": look.version, "map": look.why or f"{look.age_s:.1f} s old"}
+        except OpenArmError as error:
+            faults.append(error.message)
+        self.diagnose(not faults, "; ".join(faults) or "ready", **values)
 
 
 class _Claim:
-    """An arm is taken while this is open."""
+    """Arms are taken while this is open."""
 
-    def __init__(self, claimed: set[str], name: str | None) -> None:
-        self._claimed, self._name = claimed, name
+    def __init__(self, claimed: set[str], names: Sequence[str]) -> None:
+        self._claimed, self._names = claimed, names
 
     def __enter__(self) -> None:
-        if self._name is not None:
-            self._claimed.add(self._name)
+        self._claimed.update(self._names)
 
     def __exit__(self, *_: object) -> None:
-        if self._name is not None:
-            self._claimed.discard(self._name)
-
-
-def table_boxes(scene: str) -> tuple[Box, ...]:
-    """The table top of a scene as an obstacle; none for an empty name.
-
-    Raises:
-        OpenArmError: SCENE_INVALID, from the scene.
-    """
-    if not scene:
-        return ()
-    table = load_scene(scene).table
-    x, y = table.centre
-    return (box_from("table", (x, y, table.top_z - 0.5 * table.thickness), table.extents),)
+        self._claimed.difference_update(self._names)
 
 
 def main() -> None:

@@ -125,6 +125,25 @@ def plan_staggered(both: BothArms, now: Situation, wanted: BothGoals, time_limit
     return min(found, key=lambda plan: max(part.duration for part in plan.trajectories))
 
 
+def plan_any(both: BothArms, now: Situation, wanted: BothGoals, time_limit: float) -> BothPlan:
+    """Together where that is found in half of the time, else staggered.
+
+    Raises:
+        OpenArmError: as `plan_together`.
+    """
+    try:
+        return plan_together(both, now, wanted, 0.5 * time_limit)
+    except OpenArmError as error:
+        if error.code not in (Code.NO_PLAN, Code.IN_COLLISION):
+            raise
+        try:
+            return plan_staggered(both, now, wanted, 0.5 * time_limit)
+        except OpenArmError as second:
+            if second.code == Code.CANCELLED:
+                raise
+            raise error from second  # the first one knows more: it looked at both arms
+
+
 def separation(scene: BothScene, whole: Trajectory) -> float:
     """Least distance of the arms on a timed motion of all joints, at looks no more than 4 mm of way apart, m."""
     states = whole.at(dense_times(whole, scene.levers, _TRAVEL))[0]

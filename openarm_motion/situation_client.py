@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a request to the motion node starts from: joints, planning scene, map, what the hands hold."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from numpy.typing import NDArray
+
+from openarm_common.convert import pose_to_matrix
+from openarm_common.distance_field import field_path
+from openarm_common.node import BASE_FRAME, BaseNode
+from openarm_common.tf import RobotStateListener
+from openarm_motion.arm import Arm, Situation
+from openarm_motion.config import MotionConfig
+from openarm_motion.executor import Watch, stale
+from openarm_motion.map_eye import Look, MapEye, unexplained
+from openarm_motion.memory import HeldMemory
+from openarm_motion.planning_scene import PlanningScene
+from openarm_motion.seen import Known, carried
+from openarm_motion.solids import Box, Solid
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A situation without the map yet, the scene's version, and what the answer says of the map."""
+
+    now: Situation
+    version: int
+    note: str
+    complete: Callable[[], Situation]
+
+
+class Situations:
+    """Makes situations from what the node knows.
+
+    Args:
+        node: The node.
+        states: The robot's joint states.
+        arms: By name.
+        scene: Bodies.
+        held: What the hands hold.
+    """
+
+    def __init__(
+        self,
+        node: BaseNode[MotionConfig],
+        states: RobotStateListener,
+        arms: Mapping[str, Arm],
+        scene: PlanningScene,
+        held: HeldMemory,
+    ) -> None:
+        self._node, self._states, self._arms, self._scene, self._held = node, states, arms, scene, held
+        name = node.config.map.name or str(node.context.get_domain_id())
+        self._eye = MapEye(node.config.map, field_path(name), node.description.root)
+
+    def look(self) -> Look:
+        """The map as it is now; what is required and missing is an error, see `MapEye.look`."""
+        return self._eye.look(time.monotonic_ns())
+
+    def prepare(
+        self,
+        arm: Arm,
+        start: Sequence[float],
+        scale: float,
+        stopped: Callable[[], bool],
+        estimates: Sequence[Box] = (),
+        attached: Sequence[Box] = (),
+        expected: int = 0,
+    ) -> Prepared:
+        """The robot as it is now; a given start is enough where the joint states are missing.
+
+        Args:
+            arm: The arm that is asked.
+            start: Its joints, or empty for the present ones.
+            scale: Velocity scale.
+            stopped: Whether the request was cancelled.
+            estimates: Boxes of the request: what the map shows of them is theirs.
+            attached: What the arm holds, tool frame.
+            expected: Version that the scene must have; 0 is any.
+
+        Returns:
+            `complete` takes some ms and is for a worker thread.
+
+        Raises:
+            OpenArmError: from `Arm.situation`, `PlanningScene.require` and `MapEye.look`; NOT_READY without joints.
+        """
+        self._scene.require(expected)
+        now = self.situation(arm, start, scale, stopped)
+        solids = (*self._scene.solids, *self._others_hold(arm, now.state))
+        return self._prepared(now, solids, estimates, carried(attached, arm.kinematics.fk(now.start)))
+
+    def prepare_both(
+        self,
+        arms: Sequence[Arm],
+        scale: float,
+        stopped: Callable[[], bool],
+        estimates: Sequence[Box],
+        attached: Sequence[Sequence[Box]],
+        expected: int,
+    ) -> Prepared:
+        """As `prepare`, for two arms: `start` is the joints of both."""
+        self._scene.require(expected)
+        parts = [self.situation(arm, (), scale, stopped) for arm in arms]
+        held = [
+            box
+            for arm, part, boxes in zip(arms, parts, attached, strict=True)
+            for box in carried(boxes, arm.kinematics.fk(part.start))
+        ]
+        now = replace(parts[0], start=np.concatenate([part.start for part in parts]))
+        return self._prepared(now, self._scene.solids, estimates, held)
+
+    def situation(self, arm: Arm, start: Sequence[float], scale: float, stopped: Callable[[], bool]) -> Situation:
+        """Joints alone, without scene and map."""
+        state: dict[str, float] = {}
+        age = self._states.age_s()
+        if age <= self._node.config.execution.stale_after:
+            state = self._states.buffer.latest()[1]
+        elif len(start) == 0:
+            raise stale(age)
+        return arm.situation(state, start, scale, stopped)
+
+    async def fresh(self) -> None:
+        """Wait a moment for a fresh joint state; see `Watch.fresh`."""
+        if self._states.age_s() <= self._node.config.execution.stale_after:
+            return
+        watch = Watch(self._node, self._states)
+        try:
+            await watch.fresh()
+        finally:
+            watch.close()
+
+    def pose(self, message: PoseStamped) -> Array:
+        """`T_base_pose` (4, 4) of a pose in any known frame.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for a pose that is none; NO_TRANSFORM, listing the frames there are.
+        """
+        T_frame_pose = pose_to_matrix(message.pose)
+        frame = message.header.frame_id
+        if frame in ("", BASE_FRAME):
+            return T_frame_pose
+        buffer = self._states.buffer
+        stamp_ns = buffer.latest()[0] if self._states.age_s() < float("inf") else 0
+        return buffer.lookup(self._node.description.root, frame, stamp_ns) @ T_frame_pose
+
+    def unchanged(self, version: int) -> None:
+        """Refuse to carry out what was planned in another scene.
+
+        Raises:
+            OpenArmError: STALE_DATA, with both versions.
+        """
+        self._scene.require(version)
+
+    def _prepared(
+        self, now: Situation, solids: tuple[Solid, ...], estimates: Sequence[Box], held: Sequence[Box]
+    ) -> Prepared:
+        look, config = self.look(), self._node.config.map
+        certain = (*self._scene.fixed, *solids)
+        robot = next(iter(self._arms.values())).description  # with what is mounted on it
+
+        def complete() -> Situation:
+            seen = look.seen
+            if seen is not None:
+                seen = unexplained(seen, config, robot, now.state, certain, [*estimates, *held])
+            return replace(now, known=Known(solids, seen))
+
+        # a graph without a map is as it should be; one with an old map is not
+        note = f" without the map: {look.why}" if look.why and look.version else ""
+        return Prepared(now, self._scene.version, note, complete)
+
+    def _others_hold(self, arm: Arm, state: Mapping[str, float]) -> list[Box]:
+        """What the other arms hold, where they hold it now."""
+        boxes: list[Box] = []
+        for name, held in self._held.held.items():
+            other = self._arms[name]
+            if other is arm or any(joint not in state for joint in other.names):
+                continue
+            T = other.kinematics.fk(np.array([state[joint] for joint in other.names]))
+            boxes += [replace(box, id=f"{box.id} in the {name} hand") for box in carried(held, T)]
+        return boxes
