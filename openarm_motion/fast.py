@@ -19,6 +19,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion import fast_kernels as kernels
 from openarm_motion.collision import CollisionScene
+from openarm_motion.fast_model import Model, workspace
 from openarm_motion.line_kernels import line_free
 from openarm_motion.seen import DistanceMap
 from openarm_motion.shape_kernels import BOX, CYLINDER, SPHERE
@@ -45,8 +46,8 @@ class FastScene:
     def __init__(self, scenes: Sequence[CollisionScene], field: DistanceMap | None = None) -> None:
         self.levers: Array = np.concatenate([scene.levers for scene in scenes])
         packed = _Packer(scenes, field)
-        self.model: kernels.Model = packed.model()
-        self._work = kernels.workspace(self.model)
+        self.model: Model = packed.model()
+        self._work = workspace(self.model)
 
     def free(self, q: ArrayLike) -> bool:
         """Whether a state (n,) is proven free."""
@@ -154,13 +155,16 @@ class _Packer:
             mover = parents[mover]
         body = joints.get(mover, 0)
         pose = places[joint] @ T if body == 0 else se3.inverse(places[mover]) @ places[joint] @ T
+        self._put(kind, size, body, pose)
+
+    def _put(self, kind: int, size: Array, body: int, pose: Array) -> None:
         self._kinds.append(kind)
         self._sizes.append(size)
         self._radii.append(_radius(kind, size))
         self._bodies.append(body)
         self._poses.append(pose[:3])
 
-    def model(self) -> kernels.Model:
+    def model(self) -> Model:
         """Everything as arrays."""
         chains = [scene.robot.kinematics for scene in self._scenes]
         parents: list[int] = []
@@ -174,7 +178,9 @@ class _Packer:
         groups, reaches, pairs, keep = self._groups(of, clusters)
         moving = sum(cluster.body > 0 for cluster in clusters)
         still = [int(row[0]) for row in groups if row[1] >= moving]
-        spheres, sphere_groups, bounds = self._spheres()
+        spheres, sphere_groups, bounds, covered = self._spheres()
+        if self._field is not None:  # a cell of the map, which is put where it is when it is looked at
+            self._put(BOX, np.full(3, 0.5 * self._field.resolution), 0, np.eye(4))
         field = self._field
         slack = 0.0 if field is None else float(np.sqrt(3.0)) * field.resolution
         if field is not None and len(spheres) and float(spheres[:, 3].max()) + slack > field.reach:
@@ -188,7 +194,7 @@ class _Packer:
             swings.of(_Cluster(int(body), ball[:3], ball[3]))
             for (body, _, _), ball in zip(sphere_groups, bounds, strict=True)
         ]
-        return kernels.Model(
+        return Model(
             parents=np.array(parents, np.int64),
             placements=placements,
             axes=np.concatenate([chain.axes for chain in chains]),
@@ -212,6 +218,8 @@ class _Packer:
             spheres=spheres,
             sphere_groups=sphere_groups,
             sphere_bounds=bounds,
+            sphere_shapes=covered[:, 0].astype(np.int64),
+            sphere_keep=covered[:, 1].copy(),
             field=np.full((1, 1, 1), np.inf, np.float32) if field is None else np.array(field.distances, np.float32),
             corner=np.zeros(3) if field is None else np.array(field.corner, np.float64),
             edge=np.array([1.0 if field is None else field.resolution, slack]),
@@ -254,9 +262,10 @@ class _Packer:
             np.array([keep for _, _, keep in flat], np.float64),
         )
 
-    def _spheres(self) -> tuple[Array, NDArray[np.int64], Array]:
-        """Spheres that cover what moves, body by body; empty without a map."""
+    def _spheres(self) -> tuple[Array, NDArray[np.int64], Array, Array]:
+        """Spheres that cover what moves, body by body; shape and clearance of each; empty without a map."""
         spheres: list[Array] = []
+        shapes: list[tuple[int, float]] = []
         groups: list[tuple[int, int, int]] = []
         bounds: list[Array] = []
         bodies = sorted({self._bodies[k] for k in self._covered}) if self._field is not None else []
@@ -267,6 +276,7 @@ class _Packer:
                     for centre, radius in cover(self._kinds[k], self._sizes[k]):
                         p = self._poses[k][:, :3] @ centre + self._poses[k][:, 3]
                         spheres.append(np.array([*p, radius + keep]))
+                        shapes.append((k, keep + _ROUNDING))
             mine = np.array(spheres[first:])
             centre = 0.5 * (mine[:, :3].min(axis=0) + mine[:, :3].max(axis=0))
             bound = float(np.max(np.linalg.norm(mine[:, :3] - centre, axis=1) + mine[:, 3]))
@@ -276,6 +286,7 @@ class _Packer:
             np.array(spheres, np.float64).reshape(-1, 4),
             np.array(groups, np.int64).reshape(-1, 3),
             np.array(bounds, np.float64).reshape(-1, 4),
+            np.array(shapes, np.float64).reshape(-1, 2),
         )
 
 

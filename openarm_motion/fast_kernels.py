@@ -1,144 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numba kernels of the fast collision layer: where bodies are, and which of their shapes are near to others or the map.
 
-Shapes are boxes, cylinders and spheres on bodies; body 0 is the base, bodies 1..n follow the joints. Shapes of one
-body are a cluster with a ball about it; two clusters whose shapes are to be looked at are a group. The answer "apart"
-is a proof while the answer "near" may be wrong. m, rad, base frame. The kernels release the GIL.
+The answer "apart" is a proof while the answer "near" may be wrong; `fast_model` says what a scene is made of. m, rad,
+base frame. The kernels release the GIL.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from openarm_motion.fast_model import Model, Work, workspace
+from openarm_motion.map_kernels import map_distance, map_room, put_shape
 from openarm_motion.shape_kernels import BOX, separation
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-#: Numbers that a list of groups or intervals of a line has room for.
-_ROOM = 1 << 15
 #: More room than this is looked for between the balls of clusters only, not between the shapes in them, m.
 _CLOSE = 0.03
-
-
-class Model(NamedTuple):
-    """A scene as the kernels take it.
-
-    Attributes:
-        parents: (n,) body that joint i hangs on; joint i moves body i + 1.
-        placements: (n, 4, 4) of each joint in its parent body at zero.
-        axes: (n, 3) unit, in the joint's frame.
-        prismatic: (n,) bool.
-        kinds: (s,) BOX, CYLINDER or SPHERE.
-        sizes: (s, 3) half edges; radius, half length; radius.
-        radii: (s,) of the ball about the shape's centre that holds it.
-        bodies: (s,) body of each shape.
-        poses: (s, 3, 4) of each shape in its body.
-        clusters: (c,) body of each cluster; those that move come first.
-        centres: (c, 3) of the ball about a cluster, in its body.
-        bounds: (c,) radius of that ball.
-        runs: (moving clusters + 1,) where the groups of each moving cluster with clusters that stand still begin.
-        groups: (g, 5) clusters a (moving) and b, the first and last + 1 of their pairs, and b's shape if it is one
-            that stands still, else -1; groups of two moving clusters come last.
-        points: (3, g) centre of cluster b where it stands still.
-        reaches: (g,) greatest distance that a pair of the group must keep.
-        spans: (g,) the same with the radii of both balls.
-        swings: (g + m, n) how far, at most, a point of cluster a (of a body's spheres) moves as seen by cluster b (the
-            map) when a joint turns by 1 rad, m.
-        pairs: (p, 2) shapes.
-        keep: (p,) distance that each pair must keep.
-        spheres: (k, 4) centre in its body and radius with clearance, of spheres that cover the moving shapes.
-        sphere_groups: (m, 3) body, first and last + 1 of its spheres.
-        sphere_bounds: (m, 4) ball about them.
-        field: (x, y, z) float32 distances to occupied cells, of one cell when there is no map.
-        corner: (3,) lower corner of the field.
-        edge: (2,) edge of a cell, and what rounding to cells takes off a distance.
-    """
-
-    parents: Ints
-    placements: Array
-    axes: Array
-    prismatic: NDArray[np.bool_]
-    kinds: Ints
-    sizes: Array
-    radii: Array
-    bodies: Ints
-    poses: Array
-    clusters: Ints
-    centres: Array
-    bounds: Array
-    runs: Ints
-    groups: Ints
-    points: Array
-    reaches: Array
-    spans: Array
-    swings: Array
-    pairs: Ints
-    keep: Array
-    spheres: Array
-    sphere_groups: Ints
-    sphere_bounds: Array
-    field: NDArray[np.float32]
-    corner: Array
-    edge: Array
-
-
-class Work(NamedTuple):
-    """Room for one thread.
-
-    Attributes:
-        frames: (n + 1, 3, 4) poses of bodies.
-        world: (s, 3, 4) poses of shapes.
-        done: (s + 1,) the number of the state that each shape was last placed for; the last one is that number.
-        middles: (c, 3) centres of clusters.
-        near: (g,) flags.
-        sways: (g + m,) how far things come nearer over a line, m.
-        lists: Numbers of groups.
-        spans: (k, 4) intervals of a line: first and last point, where the list of its groups begins, its length.
-        q: (n,) a state.
-    """
-
-    frames: Array
-    world: Array
-    done: Ints
-    middles: Array
-    near: NDArray[np.uint8]
-    sways: Array
-    lists: Ints
-    spans: Ints
-    q: Array
-
-
-@njit(cache=True, nogil=True)
-def workspace(model: Model) -> Work:
-    """Room for one thread."""
-    n, s, c, g = model.parents.shape[0], model.kinds.shape[0], model.clusters.shape[0], model.groups.shape[0]
-    frames = np.zeros((n + 1, 3, 4))
-    for i in range(3):
-        frames[0, i, i] = 1.0
-    world, middles = np.zeros((s, 3, 4)), np.zeros((c, 3))
-    work = Work(
-        frames,
-        world,
-        np.zeros(s + 1, np.int64),
-        middles,
-        np.empty(g, np.uint8),
-        np.zeros(model.swings.shape[0]),
-        np.empty(_ROOM, np.int64),
-        np.empty((_ROOM, 4), np.int64),
-        np.empty(n),
-    )
-    for k in range(s):  # what does not move is where it is
-        if model.bodies[k] == 0:
-            world[k] = model.poses[k]
-    for k in range(c):
-        middles[k] = model.centres[k]
-    return work
 
 
 @njit(cache=True, nogil=True)
@@ -221,13 +104,22 @@ def look(start: int, count: int, end: int, share: float, model: Model, work: Wor
     groups, middles, bounds, spans, kinds = model.groups, work.middles, model.bounds, model.spans, model.kinds
     world, sizes, radii, pairs, keeps = work.world, model.sizes, model.radii, model.pairs, model.keep
     bodies, poses, frames, done = model.bodies, model.poses, work.frames, work.done
-    lists, sways = work.lists, work.sways
-    kept = 0
+    lists, sways, kept = work.lists, work.sways, 0
+    balls, about, field, corner, edge = (
+        model.sphere_groups,
+        model.sphere_bounds,
+        model.field,
+        model.corner,
+        model.edge,
+    )
     for at in range(start, start + count):
         g = lists[at]
         enough = float(share * sways[g])
         if g >= groups.shape[0]:
-            least = _map_room(g - groups.shape[0], enough, frames, model)
+            m = g - groups.shape[0]
+            if map_distance(frames[balls[m, 0]], about[m], field, corner, edge) >= enough:
+                continue
+            least = map_room(m, enough, model, work)
         else:
             a, b, j = groups[g, 0], groups[g, 1], groups[g, 4]
             x, y, z = middles[a, 0] - middles[b, 0], middles[a, 1] - middles[b, 1], middles[a, 2] - middles[b, 2]
@@ -251,8 +143,8 @@ def look(start: int, count: int, end: int, share: float, model: Model, work: Wor
             least = enough if close else 0.0
             for p in range(groups[g, 2], groups[g, 3]):
                 i, j, keep = pairs[p, 0], pairs[p, 1], keeps[p]
-                _shape(i, bodies, poses, frames, done, world)
-                _shape(j, bodies, poses, frames, done, world)
+                put_shape(i, bodies, poses, frames, done, world)
+                put_shape(j, bodies, poses, frames, done, world)
                 x, y, z = (
                     world[i, 0, 3] - world[j, 0, 3],
                     world[i, 1, 3] - world[j, 1, 3],
@@ -270,50 +162,6 @@ def look(start: int, count: int, end: int, share: float, model: Model, work: Wor
             lists[end + kept] = g
             kept += 1
     return kept
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _shape(k: int, bodies: Ints, poses: Array, frames: Array, done: Ints, world: Array) -> None:
-    """Bring a shape to where its body is, once a state."""
-    b, now = bodies[k], done[done.shape[0] - 1]
-    if b > 0 and done[k] != now:
-        done[k] = now
-        for r in range(3):
-            f0, f1, f2 = frames[b, r, 0], frames[b, r, 1], frames[b, r, 2]
-            for c in range(4):
-                world[k, r, c] = f0 * poses[k, 0, c] + f1 * poses[k, 1, c] + f2 * poses[k, 2, c]
-            world[k, r, 3] += frames[b, r, 3]
-
-
-@njit(cache=True, nogil=True)
-def _map_room(m: int, enough: float, frames: Array, model: Model) -> float:
-    """By how much a body is further from the map than it must be; looked for until it is `enough`."""
-    groups, spheres, bounds = model.sphere_groups, model.spheres, model.sphere_bounds
-    field, corner, edge = model.field, model.corner, model.edge
-    frame = frames[groups[m, 0]]
-    if _distance(frame, bounds[m], field, corner, edge) >= enough:
-        return enough
-    least = enough
-    for k in range(groups[m, 1], groups[m, 2]):
-        least = min(least, _distance(frame, spheres[k], field, corner, edge))
-        if least < 0.0:
-            break
-    return least
-
-
-@njit(cache=True, nogil=True)
-def _distance(frame: Array, ball: Array, field: NDArray[np.float32], corner: Array, edge: Array) -> float:
-    """Distance in the map at a ball's centre less its radius and what rounding to cells takes."""
-    nx, ny, nz = field.shape
-    inverse = 1.0 / edge[0]
-    x = frame[0, 0] * ball[0] + frame[0, 1] * ball[1] + frame[0, 2] * ball[2] + frame[0, 3] - corner[0]
-    y = frame[1, 0] * ball[0] + frame[1, 1] * ball[1] + frame[1, 2] * ball[2] + frame[1, 3] - corner[1]
-    z = frame[2, 0] * ball[0] + frame[2, 1] * ball[1] + frame[2, 2] * ball[2] + frame[2, 3] - corner[2]
-    # the nearest cell stands for a point outside: what is in the map is no nearer to the point than to it
-    i = min(max(math.floor(x * inverse), 0), nx - 1)
-    j = min(max(math.floor(y * inverse), 0), ny - 1)
-    k = min(max(math.floor(z * inverse), 0), nz - 1)
-    return field[i, j, k] - ball[3] - edge[1]
 
 
 @njit(cache=True, nogil=True)

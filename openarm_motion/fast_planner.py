@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion import search_kernels as kernels
 from openarm_motion.fast import FastScene
-from openarm_motion.fast_kernels import workspace
+from openarm_motion.fast_model import workspace
 from openarm_motion.planner import OmplPlanner, PlannedPath, Planner, PlanQuery
 
 Array = NDArray[np.float64]

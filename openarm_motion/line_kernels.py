@@ -14,7 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from openarm_motion.fast_kernels import Model, Work, look, near, place, sift
+from openarm_motion.fast_kernels import look, near, place, sift
+from openarm_motion.fast_model import Model, Work
 
 Array = NDArray[np.float64]
 

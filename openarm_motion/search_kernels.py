@@ -9,7 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from openarm_motion.fast_kernels import Model, Work, near
+from openarm_motion.fast_kernels import near
+from openarm_motion.fast_model import Model, Work
 from openarm_motion.line_kernels import between_free, line_free
 
 Array = NDArray[np.float64]

@@ -123,6 +123,7 @@ def test_a67_cells_of_a_map_are_never_overlooked(right: Arm, home: dict[str, flo
     truth = np.array([not exact.collides(q) for q in states])
     assert not np.any(free & ~truth)
     assert 10 < int(np.sum(free)) < int(np.sum(FastScene([right.scene(home)]).free_many(states)))
+    assert int(np.sum(free)) > 0.9 * int(np.sum(truth))  # the balls about the shapes don't have the last word
 
 
 def test_a_cell_at_the_gripper_is_seen(right: Arm, home: dict[str, float]) -> None:
