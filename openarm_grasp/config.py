@@ -8,6 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from openarm_common.config import Config
+from openarm_grasp.drift import DriftConfig
 
 
 class ApproachConfig(Config):
@@ -85,6 +86,9 @@ class HeldConfig(Config):
     use_effort: bool = Field(default=True, description="false for drivers that report no effort: the gap alone decides")
     max_tcp_error: float = Field(
         default=0.008, gt=0.0, le=0.05, description="TCP this far from the grasp hit something, m"
+    )
+    slip: float = Field(
+        default=0.003, gt=0.0, le=0.02, description="change of the gap on the way that counts as slipping, m"
     )
     rise: float = Field(default=0.03, gt=0.0, le=0.2, description="an object seen this much higher has risen, m")
 
@@ -166,6 +170,7 @@ class GraspConfig(Config):
         default="home", description="SRDF group state of both arms that keeps the camera's view free"
     )
     home_tolerance: float = Field(default=0.05, gt=0.0, le=0.5, description="joints this near to home are home, rad")
+    camera: str = Field(default="overhead", description="that the detections come from; named by the drift alarm")
     transitions: str = Field(
         default="", description="YAML of the state machine; empty: config/params/grasp_transitions.yaml"
     )
@@ -179,3 +184,4 @@ class GraspConfig(Config):
     detect: DetectConfig = DetectConfig()
     place: PlaceConfig = PlaceConfig()
     limits: LimitsConfig = LimitsConfig()
+    drift: DriftConfig = DriftConfig()

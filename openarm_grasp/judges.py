@@ -6,9 +6,12 @@ A judge also writes down what was learned. `OpenArmError` raised by a judge ends
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp import recipes
@@ -16,7 +19,7 @@ from openarm_grasp.candidates import propose
 from openarm_grasp.effects import Frames, Outcome, Planned, Reach
 from openarm_grasp.evidence import Evidence, Grip, Verdict, judge_grip, judge_lift, judge_place, judge_sight
 from openarm_grasp.memory import Kept, Memory, Surroundings
-from openarm_grasp.observation import Detection, Sighting, find, labels_in_view, on_table
+from openarm_grasp.observation import Detection, Frame, Sighting, find, labels_in_view, on_table
 from openarm_grasp.place import check_position, free_spots, place_targets
 from openarm_grasp.routing import arm_order, out_of_reach
 from openarm_grasp.states import Event, State
@@ -299,6 +302,7 @@ def reset(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judge
         return fail(m, Code.PLACE_FAILED, f"put down, but not seen since: {outcome.message}", final=True)
     else:
         frames, tolerance = outcome.last(Frames).frames, around.config.place.tolerance
+        m.residual = _beside_the_place(m, frames)
         verdict = judge_place(m.label, m.need_place_target().position, frames, tolerance, m.request.place_yaw)
         if verdict.ok:
             m.failure = None
@@ -307,6 +311,16 @@ def reset(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judge
     failure = m.failure or Verdict(Code.INTERNAL, "RESET without a failure")
     last = m.attempt >= around.config.limits.max_attempts or (hand.putting_back and not hand.try_again)
     return (Event.END if last else Event.AGAIN), failure.reason
+
+
+def _beside_the_place(m: Memory, frames: Sequence[Frame]) -> tuple[NDArray[np.float64], float] | None:
+    """Where the camera sees the placed object beside where the hand let it go, along the hand's opening axis."""
+    target = m.need_place_target()
+    seen = [d.p_base - target.position for d in frames[-1].detections if d.label == m.label] if frames else []
+    if not seen:
+        return None
+    axis = target.T_base_tcp[:2, 1] / np.linalg.norm(target.T_base_tcp[:2, 1])
+    return axis, float(axis @ min(seen, key=lambda d: float(np.linalg.norm(d[:2])))[:2])
 
 
 def _no_way_home(m: Memory, outcome: Outcome) -> Judgement:

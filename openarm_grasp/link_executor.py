@@ -8,7 +8,6 @@ only while a grasp runs, /detections_3d only in states that look.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -56,6 +55,9 @@ class RobotLink:
         self._timer.cancel()
         self._silence = Silence(_STARVED_S)
         self._cancelled = self._active = False
+        if node.lockstep:
+            self._look()
+            self.stop_looking()
 
     # --- begin, end, cancel
     async def begin(self, missing: Callable[[], list[str]]) -> None:
@@ -69,10 +71,10 @@ class RobotLink:
         self._active = True
         self.robot.enable(True)
         self._timer.reset()
-        deadline = time.monotonic() + self._config.limits.ready_timeout
+        deadline = self._node.monotonic() + self._config.limits.ready_timeout
         while faults := missing():
             self.check()
-            if time.monotonic() > deadline:
+            if self._node.monotonic() > deadline:
                 raise OpenArmError(Code.NOT_READY, f"not ready: no {'; no '.join(faults)}")
             await self.tick()
 
@@ -106,7 +108,7 @@ class RobotLink:
 
     # --- waiting
     def _on_tick(self) -> None:
-        self._silence.look(time.monotonic(), self.now_ns if self.hears_joints else -1)
+        self._silence.look(self._node.monotonic(), self.now_ns if self.hears_joints else -1)
         done, self._next_tick = self._next_tick, Future()
         done.set_result(None)
 
@@ -138,12 +140,12 @@ class RobotLink:
         Raises:
             OpenArmError: TIMEOUT, CANCELLED, ROBOT_LOST, or from `guard`.
         """
-        deadline = time.monotonic() + limit
+        deadline = self._node.monotonic() + limit
         while not done():
             self.check()
             if guard is not None:
                 guard()
-            if time.monotonic() > deadline:
+            if self._node.monotonic() > deadline:
                 raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
             await self.tick()
 
@@ -187,8 +189,8 @@ class RobotLink:
             await self.until(result.done, limit, what, watch)
         except OpenArmError as error:
             handle.cancel_goal_async()
-            deadline = time.monotonic() + (0.0 if error.code is Code.ROBOT_LOST else _STOP_LIMIT_S)
-            while not result.done() and time.monotonic() < deadline:
+            deadline = self._node.monotonic() + (0.0 if error.code is Code.ROBOT_LOST else _STOP_LIMIT_S)
+            while not result.done() and self._node.monotonic() < deadline:
                 await self.tick()
             raise
         return result.result().result
@@ -202,10 +204,7 @@ class RobotLink:
         """
         self._frames = []
         self._looking_since_ns = self.now_ns
-        if self._detections is None:
-            self._detections = self._node.create_subscription(
-                Detection3DArray, "/detections_3d", self._on_detections, reliable(5)
-            )
+        self._look()
         limit = self._config.detect.frame_timeout
         try:
             await self.until(lambda: len(self._frames) >= count, limit, "looking")
@@ -215,6 +214,12 @@ class RobotLink:
             seen = f"{len(self._frames)} of {count} frames came from /detections_3d within {limit:g} s"
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
         return Frames(tuple(self._frames[-count:]), self._frame_id)
+
+    def _look(self) -> None:
+        if self._detections is None:
+            self._detections = self._node.create_subscription(
+                Detection3DArray, "/detections_3d", self._on_detections, reliable(5)
+            )
 
     def _on_detections(self, message: Detection3DArray) -> None:
         # What the camera took before this look began shows another state of the world.

@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.drift import DriftWatch
 from openarm_grasp.effects import Effects, GraspOutcome, GraspRequest, Outcome
 from openarm_grasp.evidence import Verdict
 from openarm_grasp.judges import JUDGES, Judgement, fail, start_over
@@ -43,6 +44,8 @@ class GraspMachine:
         self.reason = "waiting for a request"
         #: How the last request ended; None while one runs.
         self.outcome: GraspOutcome | None = None
+        #: What grasps say about the camera.
+        self.drift = DriftWatch(around.config.drift)
         #: What stayed in a hand when the last request ended.
         self.kept: Kept | None = None
 
@@ -101,6 +104,9 @@ class GraspMachine:
         if m is None:
             raise OpenArmError(Code.INTERNAL, "an outcome came to the grasp machine while no request runs")
         kind, reason = self._judge(m, event, t_ns)
+        if m.residual is not None:
+            self.drift.add(self._around.config.camera, *m.residual)
+            m.residual = None
         return self._enter(m, kind, reason, t_ns)
 
     def _place_request(self, request: GraspRequest, t_ns: int) -> Memory:

@@ -7,6 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Table
 from openarm_grasp.candidates import GraspCandidate
@@ -102,6 +105,7 @@ class Memory:
         place_target: The chosen one.
         place_plan: Its trajectories.
         hand: Where the hand stands.
+        residual: Direction (2,) and how far along it the camera saw the object from where the hand put it.
         kept: What an earlier request left in the hand, to be placed by this one.
     """
 
@@ -128,6 +132,7 @@ class Memory:
     place_target: PlaceTarget | None = None
     place_plan: Planned | None = None
     hand: Hand = field(default_factory=Hand)
+    residual: tuple[NDArray[np.float64], float] | None = None
     kept: Kept | None = None
 
     @property

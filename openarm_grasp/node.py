@@ -9,13 +9,14 @@ from typing import Any
 from openarm_interfaces.action import Pick
 from openarm_interfaces.msg import GraspStatus
 from openarm_interfaces.srv import Grasp
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common.description import Side
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.lockstep_node import NamedActionServer
 from openarm_common.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene import load_scene
 from openarm_grasp import convert
@@ -47,7 +48,7 @@ class GraspNode(BaseNode[GraspConfig]):
         self._status_topic = self.create_publisher(GraspStatus, "/grasp/status", _QOS_STATUS)
         self._marker_topic = self.create_publisher(MarkerArray, "/grasp/markers", QOS_LATCHED)
         self.create_service(Grasp, "/grasp", self._on_grasp)
-        self._pick = ActionServer(
+        self._pick = NamedActionServer(
             self, Pick, "/grasp/pick", execute_callback=self._on_pick, cancel_callback=self._on_cancel
         )
         self._tell(None)
@@ -112,7 +113,11 @@ class GraspNode(BaseNode[GraspConfig]):
         result = await run_request(self._machine, link.performer, link, request, lambda: self._tell(on_status))
         report = f"{result.code}: {result.message} (arm {result.arm or '-'}, attempts {result.attempts})"
         self.get_logger().info(report) if result.success else self.get_logger().warning(report)
-        self.diagnose(True, report, state=self._machine.state.value)
+        drift = self._machine.drift.of(self.config.camera)
+        if drift.alarm:
+            self.get_logger().error(drift.message)
+        text = f"{drift.message}; {report}" if drift.alarm else report
+        self.diagnose(not drift.alarm, text, state=self._machine.state.value, drift=drift.message)
         return result
 
     def _tell(self, on_status: OnStatus | None) -> None:

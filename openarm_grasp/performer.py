@@ -231,10 +231,20 @@ class Performer:
 
     # --- moving
     async def _follow(self, effect: effects.Execute) -> None:
+        held, at_first = self._config.held, self.gap(effect.arm)
+
         def still_held() -> None:
+            if not effect.carrying:
+                return
             gap = self.gap(effect.arm)
-            if effect.carrying and gap <= self._config.held.closed_below:
+            if gap <= held.closed_below:
                 raise OpenArmError(Code.GRASP_LOST, f"{effect.what}: the hand closed to {gap * 1e3:.1f} mm on the way")
+            if abs(gap - at_first) > held.slip:
+                raise OpenArmError(
+                    Code.GRASP_LOST,
+                    f"{effect.what}: the object slips: the gap went from {at_first * 1e3:.1f} to {gap * 1e3:.1f} mm on"
+                    f" the way, expected to stay within {held.slip * 1e3:.0f} mm",
+                )
 
         await self._link.follow(effect.arm, effect.trajectory, f"{effect.arm} arm: {effect.what}", still_held)
 

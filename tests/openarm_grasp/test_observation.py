@@ -61,6 +61,12 @@ def test_an_object_that_moves_or_flickers_is_not_trusted(sequence):
     assert error.value.code is Code.STALE_DATA
 
 
+def test_one_missed_frame_of_three_is_forgiven_and_two_are_not():
+    assert look(frames((seen(),), (), (seen(),))).target.p_base[0] == pytest.approx(0.26)
+    with pytest.raises(OpenArmError, match="in 1 of 3 frames only"):
+        look(frames((), (), (seen(),)))
+
+
 def test_b27_without_a_label_the_highest_score_is_taken():
     pair = (seen("red", score=0.5), seen("blue", y=0.2, score=0.8))
     assert look(frames(pair, pair), "").target.label == "blue"

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Watches what grasps say about a camera: a mount that has moved shows as the same bias in grasp after grasp.
+
+A closing hand centres the object between its fingers, wherever the camera thought it was. So along the opening axis
+the hand knows where it puts the object down, and what the camera sees there beside it is the camera's own error in
+that direction. Across that axis the object keeps the error it was grasped with, and nothing is learned. Each placed
+object measures one direction; turned hands measure the others. Base frame, m.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from openarm_common.config import Config
+
+Array = NDArray[np.float64]
+
+
+class DriftConfig(Config):
+    """When residuals of grasps raise an alarm."""
+
+    window: int = Field(default=10, ge=3, le=100, description="grasps that are looked at")
+    least: int = Field(default=5, ge=3, le=100, description="grasps before an alarm may be raised")
+    bias: float = Field(default=0.004, gt=0.0, le=0.05, description="mean residual that is an alarm, m")
+    sigmas: float = Field(default=3.0, gt=0.0, le=10.0, description="and it must be so many times its own error")
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What the residuals of a camera come to.
+
+    Attributes:
+        camera: Which.
+        bias: (2,) mean residual, base frame, m: where the camera sees things, less where they are.
+        error: (2,) its standard error, m.
+        grasps: How many.
+        alarm: The bias is large and sure.
+    """
+
+    camera: str
+    bias: Array
+    error: Array
+    grasps: int
+    alarm: bool
+
+    @property
+    def message(self) -> str:
+        """One sentence."""
+        size = float(np.linalg.norm(self.bias)) * 1e3
+        text = (
+            f"camera {self.camera!r} is off by {size:.1f} mm (x {self.bias[0] * 1e3:+.1f}, y {self.bias[1] * 1e3:+.1f})"
+        )
+        text += f" over {self.grasps} grasps"
+        return f"{text}: its mount has moved, or its calibration is wrong; calibrate it again" if self.alarm else text
+
+
+class DriftWatch:
+    """Collects residuals by camera.
+
+    Args:
+        config: When to raise an alarm.
+    """
+
+    def __init__(self, config: DriftConfig) -> None:
+        self._config = config
+        self._seen: dict[str, deque[tuple[Array, float]]] = {}
+
+    def add(self, camera: str, direction: Array, residual: float) -> None:
+        """Take one measurement.
+
+        Args:
+            camera: That saw the object.
+            direction: (2,) unit vector in which the error was measured, base frame.
+            residual: Seen less true along it, m.
+        """
+        window = self._seen.setdefault(camera, deque(maxlen=self._config.window))
+        window.append((direction, residual))
+
+    def of(self, camera: str) -> Drift:
+        """What is known of a camera.
+
+        The bias is the least-squares solution of all measurements, each of which tells one direction; a little damping
+        keeps a direction that no grasp has measured at zero.
+        """
+        seen = self._seen.get(camera, deque[tuple[Array, float]]())
+        n = len(seen)
+        if n < self._config.least:
+            return Drift(camera, np.zeros(2), np.full(2, np.inf), n, alarm=False)
+        A = np.array([direction for direction, _ in seen])
+        b = np.array([residual for _, residual in seen])
+        information = A.T @ A + 0.1 * np.eye(2)
+        bias = np.asarray(np.linalg.solve(information, A.T @ b), dtype=np.float64)
+        sigma = max(float(np.std(b - A @ bias)), 0.0005)
+        error = sigma * np.sqrt(np.diag(np.linalg.inv(information)))
+        size = float(np.linalg.norm(bias))
+        along = bias / size if size > 0.0 else np.array([1.0, 0.0])
+        sure = size > self._config.sigmas * float(np.linalg.norm(along * error))
+        return Drift(camera, bias, error, n, alarm=size > self._config.bias and sure)

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The drift alarm: on residuals in the head, and on grasps with a camera whose mount has moved."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from openarm_bringup.campaign_robot import SimulatedSenses
+from openarm_bringup.campaign_tasks import make_task
+from openarm_bringup.campaign_trial import Trials
+from openarm_common import se3
+from openarm_common.cameras import load_cameras
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.drift import DriftConfig, DriftWatch
+
+
+def watched(bias: tuple[float, float], noise: float, n: int = 10, seed: int = 0) -> DriftWatch:
+    rng = np.random.default_rng(seed)
+    watch = DriftWatch(DriftConfig())
+    for _ in range(n):
+        angle = rng.uniform(0.0, np.pi)
+        axis = np.array([np.cos(angle), np.sin(angle)])
+        watch.add("overhead", axis, float(axis @ np.array(bias)) + rng.normal(0.0, noise))
+    return watch
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_n06_a_bias_of_8_mm_is_found_and_named_within_10_grasps(seed):
+    drift = watched((0.008, 0.0), 0.002, seed=seed).of("overhead")
+    assert drift.alarm
+    assert drift.bias == pytest.approx((0.008, 0.0), abs=0.003)
+    assert "'overhead'" in drift.message
+    assert "calibrate it again" in drift.message
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_n06_noise_alone_raises_no_alarm(seed):
+    assert not watched((0.0, 0.0), 0.003, seed=seed).of("overhead").alarm
+
+
+def test_n06_few_grasps_and_other_cameras_say_nothing():
+    watch = watched((0.008, 0.0), 0.001, n=4)
+    assert not watch.of("overhead").alarm
+    assert watch.of("wrist").grasps == 0
+
+
+def test_n06_old_grasps_are_forgotten():
+    watch = watched((0.008, 0.0), 0.001)
+    for k in range(10):
+        watch.add("overhead", np.array([1.0, 0.0]) if k % 2 else np.array([0.0, 1.0]), 0.0)
+    assert not watch.of("overhead").alarm
+
+
+def test_n06_grasps_with_a_mount_8_mm_off_raise_the_alarm() -> None:
+    camera = load_cameras()["overhead"]
+    believed = se3.make(p=(0.006, 0.0053, 0.0)) @ camera.T_parent_link
+    task = replace(make_task("nominal", 10001), labels=("red", "green") * 3)
+    trials = Trials(task, SimulatedSenses(depth_noise=False), GraspConfig(), mounts={"overhead": believed})
+    row = trials.run()
+    assert row["placed"], row["message"]
+    drift = trials.machine.drift.of("overhead")
+    assert drift.grasps == 6
+    assert drift.alarm, drift.message
+    assert drift.bias == pytest.approx((0.006, 0.0053), abs=0.003)
