@@ -15,8 +15,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
 from rclpy.node import Node
@@ -27,6 +26,7 @@ from rclpy.task import Future
 from openarm_common.config import Config, validate
 from openarm_common.description import RobotDescription
 from openarm_common.errors import OpenArmError
+from openarm_common.lockstep_node import LockstepNode
 
 ConfigT = TypeVar("ConfigT", bound=Config)
 P = ParamSpec("P")
@@ -62,8 +62,8 @@ QOS_LATCHED = _profile(1, latched=True)
 QOS_STATIC_TF = _profile(100, latched=True)
 
 
-class BaseNode(Node, Generic[ConfigT]):
-    """A node with validated parameters, /diagnostics and a worker pool.
+class BaseNode(LockstepNode, Generic[ConfigT]):
+    """A node with validated parameters, /diagnostics and a worker pool; it can take part in a lock-step.
 
     Args:
         name: Node name.
@@ -82,8 +82,7 @@ class BaseNode(Node, Generic[ConfigT]):
         self.__description: RobotDescription | None = None
         self.__status = DiagnosticStatus(level=DiagnosticStatus.STALE, name=f"{name}: status", hardware_id="openarm")
         self.__diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
-        self.wall_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0, self.__publish_diagnostics, clock=self.wall_clock)
+        self.create_timer(1.0, self.__publish_diagnostics, clock=self.steady_clock)
 
     @property
     def default_callback_group(self) -> CallbackGroup:
@@ -109,7 +108,8 @@ class BaseNode(Node, Generic[ConfigT]):
     def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Any:
         """Run `fn` in a worker thread; await the returned rclpy future (which carries no type) in a coroutine callback.
 
-        A future completed from another thread does not wake a waiting executor, so this does.
+        A future completed from another thread does not wake a waiting executor, so this does. In lock-step `fn` runs at
+        once: simulated time waits for it.
         """
         future = Future(executor=self.executor)
 
@@ -123,8 +123,21 @@ class BaseNode(Node, Generic[ConfigT]):
             if self.executor is not None:
                 self.executor.wake()
 
-        self.__pool.submit(work)
+        if self.lockstep:
+            work()
+        else:
+            self.__pool.submit(work)
         return future
+
+    def make_executor(self) -> Executor:
+        """Make the executor that spins this node in a process of its own; the node is in it."""
+        if self.lockstep:
+            from openarm_common.lockstep_executor import ParticipantExecutor  # an ordinary node needs none of it
+
+            return ParticipantExecutor(self)
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
+        return executor
 
     def close(self) -> None:
         """Stop what the node runs beside the executor; subclasses with threads extend this."""
@@ -185,12 +198,12 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
     signal.signal(signal.SIGINT, lambda *_: None)
     signal.signal(signal.SIGTERM, lambda *_: None)
     rclpy.init(signal_handler_options=SignalHandlerOptions.ALL)
-    executor = SingleThreadedExecutor()
+    executor: Executor | None = None
     node: BaseNode[Any] | None = None
     code = 0
     try:
         node = factory()
-        executor.add_node(node)
+        executor = node.make_executor()
         executor.spin()
     except OpenArmError as error:
         get_logger("openarm").fatal(str(error))
@@ -202,7 +215,8 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
             raise
         # The signal came while something of rcl was being made.
     finally:
-        executor.shutdown(timeout_sec=2.0)
+        if executor is not None:
+            executor.shutdown(timeout_sec=2.0)
         if node is not None:
             node.close()
             node.destroy_node()

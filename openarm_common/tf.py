@@ -7,15 +7,13 @@ the same.
 
 from __future__ import annotations
 
-import time
-
-from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 
 from openarm_common.convert import stamp_to_ns, transform_to_matrix
 from openarm_common.description import RobotDescription
+from openarm_common.lockstep_node import LockstepNode
 from openarm_common.node import QOS_COMMAND, QOS_STATIC_TF
 from openarm_common.robot_state import RobotStateBuffer
 
@@ -30,7 +28,7 @@ class RobotStateListener:
             node that needs it only now and then passes False and calls `enable`.
     """
 
-    def __init__(self, node: Node, description: RobotDescription, *, joints: bool = True) -> None:
+    def __init__(self, node: LockstepNode, description: RobotDescription, *, joints: bool = True) -> None:
         self.buffer = RobotStateBuffer(description)
         self.efforts: dict[str, float] = {}
         self.velocities: dict[str, float] = {}
@@ -38,8 +36,9 @@ class RobotStateListener:
         self._received_at: float | None = None
         self._joints: Subscription | None = None
         node.create_subscription(TFMessage, "/tf_static", self._on_static, QOS_STATIC_TF)
-        if joints:
+        if joints or node.lockstep:
             self.enable(True)
+            self.enable(joints)
 
     def enable(self, on: bool) -> None:
         """Listen to /joint_states, or stop; what is old when listening starts again is forgotten."""
@@ -53,10 +52,10 @@ class RobotStateListener:
 
     def age_s(self) -> float:
         """Seconds of wall clock since the newest joint state arrived; infinite before the first."""
-        return float("inf") if self._received_at is None else time.monotonic() - self._received_at
+        return float("inf") if self._received_at is None else self._node.monotonic() - self._received_at
 
     def _on_joints(self, message: JointState) -> None:
-        self._received_at = time.monotonic()
+        self._received_at = self._node.monotonic()
         self.buffer.add_joint_state(stamp_to_ns(message.header.stamp), message.name, message.position)
         self.efforts = dict(zip(message.name, message.effort, strict=False))
         self.velocities = dict(zip(message.name, message.velocity, strict=False))

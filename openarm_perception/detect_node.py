@@ -80,6 +80,18 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._retry.cancel()
         self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
         self.diagnose(True, "idle: nobody listens", **self._counts)
+        if self.lockstep:
+            self._subscribe()
+
+    def lockstep_missing(self) -> str:
+        """The pose of a fixed camera, without which its first frames would be skipped."""
+        if self._rides:
+            return ""
+        try:
+            self._poses.buffer.lookup(BASE_FRAME, self._optical_frame, 0)
+        except OpenArmError as error:
+            return error.message
+        return ""
 
     @property
     def waiting_ns(self) -> int | None:
@@ -143,7 +155,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             cast(NDArray[np.uint8], rgb),
             cast(DepthImage, image_to_array(depth)),
             intrinsics_from_info(info),
-            time.monotonic() + self.config.transform_wait,
+            self.monotonic() + self.config.transform_wait,
         )
 
     def _try_waiting(self) -> None:
@@ -154,7 +166,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         try:
             T_base_camera = self._poses.buffer.lookup(BASE_FRAME, self._optical_frame, frame.t_ns)
         except OpenArmError as error:
-            if time.monotonic() < frame.deadline and not self._too_old(frame, error):
+            if self.monotonic() < frame.deadline and not self._too_old(frame, error):
                 self._retry.reset()
                 return
             self._waiting = None

@@ -13,13 +13,14 @@ from typing import Any, Generic, TypeVar
 
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from openarm_common.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
 from openarm_common.errors import OpenArmError
+from openarm_common.lockstep_node import NamedActionServer
 from openarm_common.node import QOS_COMMAND, BaseNode
 from openarm_sim_bridge.actuation import End, FollowerState, TrajectoryFollower, TrajectoryOutcome
 from openarm_sim_bridge.simulation import Simulation
@@ -77,7 +78,7 @@ class ArmActionServer:
         self._feedback_timer = node.create_timer(
             FEEDBACK_PERIOD_S, self._publish_feedback, clock=node.wall_clock, autostart=False
         )
-        self._server = ActionServer(
+        self._server = NamedActionServer(
             node,
             FollowJointTrajectory,
             f"/{side}_joint_trajectory_controller/follow_joint_trajectory",

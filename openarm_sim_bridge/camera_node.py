@@ -48,6 +48,7 @@ class CameraNode(Node):
         self._fault = ""
         self._faults = receiver.faults
         self._report_at = 0.0
+        self._last_ns = -1
 
     def work(self) -> None:
         """Draw until the bridge ends.
@@ -62,6 +63,9 @@ class CameraNode(Node):
                 self._images.set_faults(self._faults)
             if work is not None and not self._fault:
                 self._attempt(work)
+                self._last_ns = work.snapshot.t_ns
+                if self._receiver.setup.lockstep:
+                    self._tell()
             if time.monotonic() >= self._report_at:
                 self._tell()
 
@@ -93,7 +97,9 @@ class CameraNode(Node):
         if wanted:
             self._images.faults.apply(work.snapshot.model)
             self._renderer.load(work.snapshot)
-        for name in work.names:
+        for name in self._cameras:
+            if name not in work.names:
+                continue
             if name in wanted:
                 self._images.draw(self._renderer, name)
                 self._rendered[name] += 1
@@ -103,8 +109,12 @@ class CameraNode(Node):
 
     def _tell(self) -> None:
         self._report_at = time.monotonic() + _REPORT_S
+        sent, listeners = self._images.counts() if self._receiver.setup.lockstep else ({}, {})
         self._receiver.report(
             CameraReport(
+                t_ns=self._last_ns,
+                sent=sent,
+                listeners=listeners,
                 ready=self._ready,
                 fault=self._fault,
                 watched=self._images.poll(),

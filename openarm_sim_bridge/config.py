@@ -14,6 +14,16 @@ from openarm_sim_bridge.model import PhysicsConfig
 from openarm_sim_bridge.noise import ColourNoiseConfig, DepthNoiseConfig
 
 
+class BarrierConfig(Config):
+    """Of a lock-step, which the parameter `lockstep` switches on."""
+
+    participants: tuple[str, ...] = Field(default=(), description="nodes that simulated time waits for")
+    command_rate: float = Field(
+        default=50.0, gt=0.0, le=100.0, description="ticks at which commands are taken, beside those with a frame, Hz"
+    )
+    timeout: float = Field(default=10.0, gt=0.0, description="an answer to a tick that misses so long ends the run, s")
+
+
 class BridgeConfig(Config):
     """What is simulated and how it is told."""
 
@@ -39,6 +49,7 @@ class BridgeConfig(Config):
     )
     depth_noise: DepthNoiseConfig = DepthNoiseConfig()
     colour_noise: ColourNoiseConfig = ColourNoiseConfig()
+    barrier: BarrierConfig = BarrierConfig()
     physics: PhysicsConfig = PhysicsConfig()
     trajectory: TrajectoryConfig = TrajectoryConfig()
     gripper: GripperConfig = GripperConfig()

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
+from rclpy.executors import Executor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
@@ -35,6 +36,7 @@ from openarm_sim_bridge.faults import Fault
 from openarm_sim_bridge.force_publisher import ForcePublisher
 from openarm_sim_bridge.gripper_executor import GripperActionServer
 from openarm_sim_bridge.handover import CameraSetup
+from openarm_sim_bridge.lockstep_executor import LeadExecutor
 from openarm_sim_bridge.priority import use_fifo
 from openarm_sim_bridge.service_executor import SimulationServices
 from openarm_sim_bridge.simulation import Simulation
@@ -52,6 +54,8 @@ LARGE_PROFILE = "OPENARM_LARGE_MESSAGES_PROFILE"
 REPORT_PERIOD_S = 1.0
 #: Slower than this share of the asked speed is told as a fault.
 _SLOW = 0.9
+#: Joint states that are further apart than this (p99, ms) are told as a fault.
+_LATE_MS = 15.0
 
 
 class MujocoBridge(BaseNode[BridgeConfig]):
@@ -70,7 +74,9 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         world = stage.world(scene)
         controller = RobotController(stage.arms(), stage.grippers(), world, config.trajectory, config.gripper)
         self._controller = controller
-        self._simulation = Simulation(world, controller, self._observe, speed=config.speed, crashed=self._on_crash)
+        self._simulation = Simulation(
+            world, controller, self._observe, speed=config.speed, crashed=self._on_crash, driven=self.lockstep
+        )
         self._simulation.set_paused(config.paused)
 
         self._states = StatePublisher(
@@ -94,22 +100,31 @@ class MujocoBridge(BaseNode[BridgeConfig]):
 
         self._scheduling = ""
         self._warned: set[str] = set()
+        self._commands = 0
         self._drawn = dict.fromkeys(cameras, 0)
-        self.create_timer(REPORT_PERIOD_S, self._report, clock=self.wall_clock)
+        self.create_timer(REPORT_PERIOD_S, self._report, clock=self.steady_clock)
 
         if self._images is not None:
-            self.create_timer(WATCH_PERIOD_S, self._images.poll, clock=self.wall_clock)
+            self.create_timer(WATCH_PERIOD_S, self._images.poll, clock=self.steady_clock)
             if not self._images.wait_ready(WARM_UP_S):
                 self.get_logger().warning(f"no image yet after {WARM_UP_S:.0f} s; the simulation begins without")
         self._on_scene(scene)
         self._simulation.start()
-        self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation is running")
+        how = "waits for the lock-step" if self.lockstep else "is running"
+        self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation {how}")
 
     def keep_time(self) -> None:
         """Ask the system for real-time scheduling of this process, where the simulation has to wait for the clock."""
-        if 0.0 < self.config.speed <= 1.0:  # as fast as it can, it would take a core from everything else
+        # As fast as it can, it would take a core from everything else.
+        if 0.0 < self.config.speed <= 1.0 and not self.lockstep:
             self._scheduling = use_fifo(self.config.thread_priority)
             self.get_logger().info(f"scheduled as {self._scheduling}")
+
+    def make_executor(self) -> Executor:
+        """In lock-step the bridge leads, and its executor steps the world."""
+        if not self.lockstep:
+            return super().make_executor()
+        return LeadExecutor(self, self._simulation, self._images, self.config.barrier)
 
     def close(self) -> None:
         """Stop physics and drawing, then the rest."""
@@ -131,6 +146,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
 
     def _on_command(self, message: JointState) -> None:
         """Position targets; a part of the joints will do."""
+        self._commands += 1
         logger = self.get_logger()
         try:
             self._simulation.check_able()
@@ -159,6 +175,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             depth_noise=self.config.depth_noise,
             colour_noise=self.config.colour_noise,
             noise_seed=self.config.seed,
+            lockstep=self.lockstep,
             topics={name: self.resolve_topic_name(name) for name in topics},
         )
         environ = {**os.environ, "ROS_DOMAIN_ID": str(self.context.get_domain_id())}
@@ -195,6 +212,12 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         slow = not simulation.paused and config.speed > 0.0 and period.n > 100 and factor < _SLOW * config.speed
         if not fault and slow:
             fault = f"slower than asked: {factor:.2f} simulated seconds a second, expected {config.speed:g}"
+        commands, self._commands = self._commands, 0
+        if not fault and not simulation.paused and period.n > 100 and period.p99_ms > _LATE_MS:
+            fault = (
+                f"late: one of a hundred joint states is {period.p99_ms:.0f} ms or more behind the one before, expected"
+                f" {_LATE_MS:.0f} at most; is the machine busy, or are {commands} commands a second too many?"
+            )
         self.diagnose(
             not fault,
             fault or ("paused" if simulation.paused else "running"),
@@ -203,6 +226,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             joint_state_period_p99_ms=f"{period.p99_ms:.2f}",
             joint_state_period_max_ms=f"{period.max_ms:.2f}",
             scheduling=self._scheduling,
+            commands_per_s=commands,
             wall_time_skipped_s=f"{simulation.skipped_s:.2f}",
             faults_active=" ".join(self._faults.active),
             frames_dropped=images.dropped if images is not None else 0,
