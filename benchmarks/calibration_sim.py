@@ -33,10 +33,11 @@ from openarm_calibration.detect import Detection, detect
 from openarm_calibration.gate import Matched
 from openarm_calibration.offline import calibrate
 from openarm_calibration.poses import visible
+from openarm_calibration.problem import difference
 from openarm_calibration.refine import mount_error
 from openarm_calibration.samples import SampleSet, SessionHead
 from openarm_common import se3
-from openarm_common.cameras import CameraConfig, load_cameras, true_mount
+from openarm_common.cameras import T_LINK_OPTICAL, CameraConfig, load_cameras, true_mount
 from openarm_common.description import RobotDescription
 from openarm_common.errors import OpenArmError
 from openarm_common.scene import load_scene
@@ -171,7 +172,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="where to write the metrics")
     arguments = parser.parse_args()
     cameras = load_cameras()
-    errors: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    errors: dict[tuple[str, int], list[tuple[float, float, float]]] = {}
     with tempfile.TemporaryDirectory() as name:
         write_board(BOARD, Path(name) / "board.xml")
         for seed in range(1, 1 + (arguments.seeds or (4 if arguments.quick else 20))):
@@ -185,7 +186,9 @@ def main() -> None:
                         bench.samples.remove("")
                     result = calibrate(bench.samples)
                     offset, angle = mount_error(result.calibration.T_parent_link, bench.true)
-                    errors.setdefault((camera, count), []).append((offset, angle))
+                    away = difference(result.solution.estimate.X[0], bench.true @ T_LINK_OPTICAL)
+                    square = float(away @ np.linalg.solve(result.solution.mount_covariance(), away))
+                    errors.setdefault((camera, count), []).append((offset, angle, square))
                     text.append(f"{count}: {offset * 1e3:.4f} mm {math.degrees(angle):.4f} deg {result.verdict.grade}")
                 before = mount_error(cameras[camera].T_parent_link, bench.true)[0]
                 px = result.solution.estimate.noise.px
@@ -198,11 +201,13 @@ def main() -> None:
                 bench.close()
     rows: list[Row] = []
     for (camera, count), values in errors.items():
-        t, r = np.array(values).T
+        t, r, squares = np.array(values).T
         for kind, figure, unit, target in (("mm", t * 1e3, "mm", 0.3), ("deg", np.degrees(r), "deg", 0.03)):
             stem = f"rendered_{camera}_{count}_{kind}"
             rows.append(Row(f"{stem}_p50", float(np.median(figure)), unit, "lower", target, n=len(values)))
             rows.append(Row(f"{stem}_max", float(np.max(figure)), unit, "lower", target, n=len(values)))
+        stem = f"rendered_{camera}_{count}_nees"
+        rows.append(Row(f"{stem}_mean", float(np.mean(squares)), "", "in 5..7", 6.0, n=len(values)))
     write_report(rows, arguments.json)
 
 

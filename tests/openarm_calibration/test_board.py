@@ -19,6 +19,7 @@ from openarm_calibration.projection import project
 from openarm_common import se3
 from openarm_common.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import models_dir
 
 K = Intrinsics.from_fovy(640, 480, 60.0)
 ROW = np.array([K.fx, K.fy, K.cx, K.cy])
@@ -157,6 +158,15 @@ def test_png_and_pdf_are_true_to_scale(board: Board, tmp_path: Path) -> None:
     assert page.rstrip().endswith(b"%%EOF")
     box = page[page.index(b"/MediaBox [") + 11 :].split(b"]")[0].split()
     assert float(box[2]) / 72 * 0.0254 >= board.size[0]
+
+
+def test_a43_the_board_of_the_scenes_is_the_one_that_the_suite_writes(tmp_path: Path) -> None:
+    write_board(CircleGrid(), tmp_path / "circles_4x11.xml")
+    kept = models_dir() / "boards"
+    assert (kept / "circles_4x11.xml").read_text() == (tmp_path / "circles_4x11.xml").read_text()
+    was, now = (cv2.imread(str(folder / "circles_4x11.png"), cv2.IMREAD_UNCHANGED) for folder in (kept, tmp_path))
+    assert was.shape == (2048, 2048)
+    assert np.array_equal(was, now)
 
 
 def test_drawn_marks_are_where_points_say() -> None:
