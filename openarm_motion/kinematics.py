@@ -141,7 +141,7 @@ class ArmKinematics:
         margin: float = 0.0,
         tolerance: tuple[float, float] = (1e-5, 1e-4),
         iterations: int = 100,
-        restarts: int = 30,
+        restarts: int = 60,
         random_seed: int = 0,
     ) -> IkResult:
         """Solve for a tool pose; never raises for one that is out of reach but returns the nearest found.
