@@ -38,6 +38,7 @@ def build_app() -> App:
         grasp_cli,
         inspect_cli,
         model_cli,
+        order_cli,
         pick_cli,
         record_cli,
         up_cli,
@@ -53,6 +54,7 @@ def build_app() -> App:
     )
     app.command(up_cli.up)
     app.command(pick_cli.pick)
+    app.command(order_cli.order)
     app.command(demo_cli.demo)
     app.command(record_cli.record)
     app.command(record_cli.replay)

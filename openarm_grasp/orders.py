@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Orders of several objects: which to pick next and where to put it, until nothing is left or nothing can be done.
+
+No ROS: whoever carries requests out (the client, a campaign) asks `Order.next` what to ask for and tells `Order.done`
+what came of it. Bins are rectangles on the table, base frame, m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from openarm_common.config import Config, load_config
+from openarm_common.errors import Code, OpenArmError
+
+#: With these a place in a bin could not be had, and the next may be.
+_OTHER_SLOT = (Code.IN_COLLISION, Code.UNREACHABLE, Code.NO_PLAN)
+#: There is no more of it in view.
+_GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
+
+
+class Bin(Config):
+    """A rectangle on the table."""
+
+    x: tuple[float, float] = Field(description="near and far edge, m")
+    y: tuple[float, float] = Field(description="right and left edge, m")
+
+    @model_validator(mode="after")
+    def _ascend(self) -> Self:
+        for name in ("x", "y"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"{name} {[low, high]} must ascend")
+        return self
+
+    def slots(self, spacing: float) -> tuple[tuple[float, float], ...]:
+        """Places for objects, row by row, `spacing` apart; a small bin has one, in its middle."""
+        return tuple((x, y) for x in _steps(*self.x, spacing) for y in _steps(*self.y, spacing))
+
+
+def _steps(low: float, high: float, spacing: float) -> list[float]:
+    n = max(1, int((high - low) / spacing + 1e-9))
+    middle = (low + high) / 2.0
+    return [round(float(v), 4) for v in middle + (np.arange(n) - (n - 1) / 2.0) * spacing]
+
+
+class Bins(Config):
+    """Bins, and which class belongs into which."""
+
+    bins: dict[str, Bin] = Field(min_length=1, description="by name")
+    classes: dict[str, str] = Field(default_factory=dict, description="name of the bin by label; others go to `rest`")
+    rest: str = Field(default="", description="bin of labels that `classes` lacks; empty: they are left alone")
+    spacing: float = Field(default=0.12, gt=0.02, le=0.5, description="between the middles of two objects, m")
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        for name in (*self.classes.values(), self.rest):
+            if name and name not in self.bins:
+                raise ValueError(f"there is no bin {name!r}; bins: {', '.join(self.bins)}")
+        return self
+
+    def of(self, label: str) -> str:
+        """Name of the bin of a label; "" when it belongs into none."""
+        return self.classes.get(label, self.rest)
+
+
+def load_bins(path: Path) -> Bins:
+    """Read bins from a YAML file.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming file and key.
+    """
+    return load_config(path, Bins)
+
+
+@dataclass(frozen=True)
+class Ask:
+    """What to ask for next; `place` is (x, y), or None for a free spot."""
+
+    label: str
+    place: tuple[float, float] | None = None
+
+
+@dataclass
+class Order:
+    """Objects to be picked one after the other.
+
+    Attributes:
+        labels: In this order; each is asked for until none of it is left, as often as `each` says at most.
+        bins: Where they go; None: to free spots.
+        each: Most objects of one label.
+        placed: Labels that were placed, in order.
+        failed: What could not be done: label and reason.
+    """
+
+    labels: Sequence[str]
+    bins: Bins | None = None
+    each: int = 1
+    placed: list[str] = field(default_factory=list[str])
+    failed: dict[str, str] = field(default_factory=dict[str, str])
+    _used: dict[str, int] = field(default_factory=dict[str, int])
+
+    def __post_init__(self) -> None:
+        """Refuse an order that asks for nothing, or for what has no bin.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT.
+        """
+        if not self.labels or not all(self.labels):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"an order needs labels, got {list(self.labels)}")
+        homeless = [label for label in self.labels if self.bins is not None and not self.bins.of(label)]
+        if homeless and self.bins is not None:
+            known = ", ".join(self.bins.classes) or "no label"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no bin for {', '.join(homeless)}; there are bins for {known}")
+
+    def next(self) -> Ask | None:
+        """What to ask for now; None when the order has ended."""
+        for label in dict.fromkeys(self.labels):
+            if label in self.failed or self.placed.count(label) >= self.each:
+                continue
+            if self.bins is None:
+                return Ask(label)
+            name = self.bins.of(label)
+            slots = self.bins.bins[name].slots(self.bins.spacing)
+            at = self._used.get(name, 0)
+            if at < len(slots):
+                return Ask(label, slots[at])
+            self.failed[label] = f"bin {name!r} is full: it has {len(slots)} places"
+        return None
+
+    def done(self, ask: Ask, code: Code, message: str) -> None:
+        """Note what came of a request."""
+        if self.bins is not None and (code is Code.OK or (code in _OTHER_SLOT and ask.place is not None)):
+            name = self.bins.of(ask.label)
+            self._used[name] = self._used.get(name, 0) + 1
+        if code is Code.OK:
+            self.placed.append(ask.label)
+        elif code in _GONE and ask.label in self.placed:
+            self.failed[ask.label] = ""  # there is no more of it, which is what was asked for
+        elif self.bins is None or code not in _OTHER_SLOT:
+            self.failed[ask.label] = f"{code}: {message}"
+
+    @property
+    def outcome(self) -> str:
+        """SUCCESS when nothing failed, PARTIAL when something was placed, else FAILED."""
+        if not any(self.failed.values()):
+            return "SUCCESS"
+        return "PARTIAL" if self.placed else "FAILED"
+
+    def faults(self) -> Mapping[str, str]:
+        """What could not be done, by label."""
+        return {label: why for label, why in self.failed.items() if why}

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Orders of several objects and their bins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.orders import Ask, Bin, Bins, Order, load_bins
+
+BINS = Bins(
+    bins={"left": Bin(x=(0.16, 0.28), y=(0.20, 0.44)), "right": Bin(x=(0.16, 0.28), y=(-0.32, -0.20))},
+    classes={"red": "left", "blue": "right"},
+)
+
+
+def carry_out(order: Order, codes: dict[Ask, Code] | None = None, table: dict[str, int] | None = None) -> list[Ask]:
+    """Answer every request: from `codes`, else OK while there is one on the table."""
+    asked: list[Ask] = []
+    table = {"red": 9, "blue": 9} if table is None else dict(table)
+    while ask := order.next():
+        asked.append(ask)
+        assert len(asked) < 50
+        code = (codes or {}).get(ask, Code.OK if table.get(ask.label) else Code.UNKNOWN_OBJECT)
+        if code is Code.OK:
+            table[ask.label] -= 1
+        order.done(ask, code, "as told")
+    return asked
+
+
+def test_p03_one_bin_per_class():
+    order = Order(("red", "blue"), BINS)
+    red, blue = carry_out(order)
+    assert red.place is not None
+    assert 0.20 < red.place[1] < 0.44
+    assert blue.place == (0.22, -0.26)
+    assert order.outcome == "SUCCESS"
+
+
+def test_p03_a_single_bin_takes_all_in_slots_of_their_own():
+    order = Order(("red", "blue"), Bins(bins={"tray": Bin(x=(0.15, 0.39), y=(0.10, 0.34))}, rest="tray"), each=2)
+    places = [ask.place for ask in carry_out(order)]
+    assert len(set(places)) == 4
+    assert min(np.hypot(a[0] - b[0], a[1] - b[1]) for i, a in enumerate(places) for b in places[:i]) >= 0.1199
+
+
+def test_p03_all_of_a_label_until_none_is_left():
+    order = Order(("red",), each=20)
+    assert [ask.label for ask in carry_out(order, table={"red": 3})] == ["red"] * 4
+    assert order.placed == ["red"] * 3
+    assert order.outcome == "SUCCESS"
+
+
+def test_p02_an_order_done_in_part_says_so():
+    order = Order(("red", "blue"))
+    carry_out(order, {Ask("red"): Code.TOO_WIDE})
+    assert order.outcome == "PARTIAL"
+    assert order.faults() == {"red": "TOO_WIDE: as told"}
+    assert order.placed == ["blue"]
+
+
+def test_a_label_that_was_never_there_failed():
+    order = Order(("red",), each=5)
+    carry_out(order, table={})
+    assert order.outcome == "FAILED"
+    assert "UNKNOWN_OBJECT" in order.faults()["red"]
+
+
+def test_p19_a_taken_slot_is_passed_over_and_a_full_bin_named():
+    first, second = BINS.bins["left"].slots(BINS.spacing)
+    order = Order(("red",), BINS, each=3)
+    asked = carry_out(order, {Ask("red", first): Code.IN_COLLISION})
+    assert [ask.place for ask in asked] == [first, second]
+    assert order.placed == ["red"]
+    assert order.faults() == {"red": "bin 'left' is full: it has 2 places"}
+
+
+def test_orders_and_bins_that_make_no_sense_are_refused(tmp_path):
+    with pytest.raises(OpenArmError, match="no bin for green; there are bins for red, blue"):
+        Order(("green",), BINS)
+    with pytest.raises(OpenArmError, match="an order needs labels"):
+        Order(())
+    path = tmp_path / "bins.yaml"
+    path.write_text("bins: {a: {x: [0.2, 0.1], y: [0.0, 0.1]}}\nrest: b\n")
+    with pytest.raises(OpenArmError, match="must ascend") as error:
+        load_bins(path)
+    assert error.value.code is Code.CONFIG_INVALID
+    path.write_text("bins: {a: {x: [0.1, 0.2], y: [0.0, 0.1]}}\nrest: b\n")
+    with pytest.raises(OpenArmError, match="no bin 'b'; bins: a"):
+        load_bins(path)
