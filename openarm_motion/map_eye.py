@@ -35,11 +35,11 @@ class MapEye:
     Args:
         config: Whether it is needed, and how old it may be.
         path: Of the shared distance field.
-        frame: Base frame of the robot; the map must be in it.
+        frames: Names of the base frame; the map must be in it.
     """
 
-    def __init__(self, config: MapConfig, path: Path, frame: str) -> None:
-        self._config, self._frame = config, frame
+    def __init__(self, config: MapConfig, path: Path, frames: Sequence[str]) -> None:
+        self._config, self._frames = config, tuple(frames)
         self._reader = DistanceFieldReader(path)
         self._cells: SeenMap | None = None
 
@@ -59,8 +59,9 @@ class MapEye:
             field = self._reader.latest()
             version, age = field.version, (now_ns - field.now_ns) * 1e-9
             field.require_fresh(now_ns, self._config.max_age, self._config.cameras or None)
-            if field.frame != self._frame:
-                raise OpenArmError(Code.NO_TRANSFORM, f"the map is in {field.frame!r}, expected {self._frame!r}")
+            if field.frame not in self._frames:
+                text = f"the map is in {field.frame!r}, expected {' or '.join(self._frames)}"
+                raise OpenArmError(Code.NO_TRANSFORM, text)
             return Look(self._read(field), version, age)
         except OpenArmError as error:
             if self._config.use == "required":

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
 from openarm_interfaces.srv import ComputeIK
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
@@ -26,6 +26,7 @@ from openarm_common.cameras import load_cameras
 from openarm_common.convert import matrix_to_pose, trajectory_from_msg
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.housings import with_housings
+from openarm_common.lockstep_node import NamedActionServer
 from openarm_common.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
 from openarm_common.tf import RobotStateListener
 from openarm_motion import convert, moves
@@ -299,8 +300,8 @@ class MotionNode(BaseNode[MotionConfig]):
         held = {name: (self._arms[name].kinematics.tool_link, boxes) for name, boxes in self._held.held.items()}
         self._attached.publish(convert.markers_msg(held))
 
-    def _serve(self, kind: Any, name: str, execute: Callable[[ServerGoalHandle], Any]) -> ActionServer:
-        return ActionServer(self, kind, name, execute, cancel_callback=lambda _: CancelResponse.ACCEPT)
+    def _serve(self, kind: Any, name: str, execute: Callable[[ServerGoalHandle], Any]) -> NamedActionServer:
+        return NamedActionServer(self, kind, name, execute, cancel_callback=lambda _: CancelResponse.ACCEPT)
 
     @staticmethod
     def _end(handle: ServerGoalHandle, result: Result) -> Result:

@@ -58,7 +58,7 @@ class Situations:
     ) -> None:
         self._node, self._states, self._arms, self._scene, self._held = node, states, arms, scene, held
         name = node.config.map.name or str(node.context.get_domain_id())
-        self._eye = MapEye(node.config.map, field_path(name), node.description.root)
+        self._eye = MapEye(node.config.map, field_path(name), (BASE_FRAME, node.description.root))
 
     def look(self) -> Look:
         """The map as it is now; what is required and missing is an error, see `MapEye.look`."""

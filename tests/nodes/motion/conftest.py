@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A fake robot for the motion node: joint states and two FollowJointTrajectory controllers in the same process."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from control_msgs.action import FollowJointTrajectory
+from geometry_msgs.msg import PoseStamped
+from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
+from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
+from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
+from rclpy.action.client import ClientGoalHandle
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from tf2_msgs.msg import TFMessage
+from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import Marker, MarkerArray
+
+from openarm_common import se3
+from openarm_common.config import Config
+from openarm_common.convert import matrix_to_pose, matrix_to_transform, ns_to_stamp, trajectory_from_msg
+from openarm_common.description import RobotDescription
+from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF, BaseNode
+from openarm_motion.node import MotionNode
+
+Result = FollowJointTrajectory.Result
+HZ = 100
+#: The fake robot's time runs this much faster than the wall clock.
+FASTER = 4
+
+
+class FakeRobot:
+    """Publishes joint states, and follows trajectories exactly, in a time of its own."""
+
+    def __init__(self, node, description: RobotDescription, state: dict[str, float]) -> None:
+        self.node, self.state = node, dict(state)
+        self.t_ns = 1_000_000_000
+        self.silent = False
+        self.answer: Callable[[FollowJointTrajectory.Result], None] = lambda result: None
+        self.stuck: set[str] = set()
+        self.accept = True
+        self.cancelled: list[str] = []
+        self.gone: set[str] = set()
+        #: Sides whose controller gives up after so many seconds of a motion.
+        self.fail_after: dict[str, float] = {}
+        self.active: dict[str, tuple[int, list[str], np.ndarray, np.ndarray]] = {}
+        self._wake = Future()
+        self._publisher = node.create_publisher(JointState, "/joint_states", QOS_COMMAND)
+        tf = node.create_publisher(TFMessage, "/tf_static", QOS_STATIC_TF)
+        table = matrix_to_transform("world", "table", se3.make(None, (0.0, 0.0, 0.40)), 0)
+        tf.publish(TFMessage(transforms=[table]))
+        self.tf = tf
+        node.create_timer(1.0 / HZ, self._tick)
+        self.servers = {
+            side: ActionServer(
+                node,
+                FollowJointTrajectory,
+                f"/{side}_joint_trajectory_controller/follow_joint_trajectory",
+                functools.partial(self._execute, side),
+                goal_callback=lambda _: GoalResponse.ACCEPT if self.accept else GoalResponse.REJECT,
+                cancel_callback=lambda _: CancelResponse.ACCEPT,
+            )
+            for side in ("left", "right")
+        }
+
+    def _tick(self) -> None:
+        self.t_ns += FASTER * 10_000_000
+        for start_ns, names, t, q in self.active.values():
+            now = (self.t_ns - start_ns) * 1e-9
+            for i, name in enumerate(names):
+                if name not in self.stuck:
+                    self.state[name] = float(np.interp(now, t, q[:, i]))
+        if not self.silent:
+            message = JointState(name=list(self.state), position=list(self.state.values()))
+            message.header.stamp = ns_to_stamp(self.t_ns)
+            self._publisher.publish(message)
+        wake, self._wake = self._wake, Future()
+        wake.set_result(None)
+
+    async def _execute(self, side: str, handle) -> FollowJointTrajectory.Result:
+        names, t, q, _, _ = trajectory_from_msg(handle.request.trajectory)
+        self.active[side] = (self.t_ns, names, t, q)
+        result = FollowJointTrajectory.Result(error_code=Result.SUCCESSFUL)
+        end_ns = self.t_ns + int(t[-1] * 1e9)
+        fail_ns = self.t_ns + int(self.fail_after.get(side, 1e6) * 1e9)
+        while self.t_ns < min(end_ns, fail_ns) and side not in self.gone and not handle.is_cancel_requested:
+            await self._wake
+        self.active.pop(side)
+        if side in self.gone:
+            return result
+        if handle.is_cancel_requested:
+            self.cancelled.append(side)
+            handle.canceled()
+            result.error_code, result.error_string = Result.INVALID_GOAL, "cancelled"
+            return result
+        if self.t_ns >= fail_ns:
+            result.error_code, result.error_string = Result.PATH_TOLERANCE_VIOLATED, "off the path"
+        self.answer(result)
+        handle.succeed() if result.error_code == Result.SUCCESSFUL else handle.abort()
+        return result
+
+
+class Bench:
+    """A motion node, a fake robot, and clients."""
+
+    #: Rotation of a tool that looks down, its opening along y.
+    DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
+
+    def __init__(self, ros, description: RobotDescription, **kwargs) -> None:
+        self.ros, self.description = ros, description
+        home = {**description.group_state("left_arm", "home"), **description.group_state("right_arm", "home")}
+        fingers = {description.finger_joint("left"): 0.0, description.finger_joint("right"): 0.0}
+        # a coroutine of the robot must not keep its own timer from running
+        self.robot = FakeRobot(ros.add(RobotNode()), description, {**home, **fingers})
+        self.node = ros.add(MotionNode(**kwargs))
+        self.plan_client = ActionClient(ros.node, PlanApproach, "/motion/plan_approach")
+        self.move_client = ActionClient(ros.node, MoveArm, "/motion/move")
+        self.execute_client = ActionClient(ros.node, ExecuteTrajectory, "/motion/execute")
+        self.both_client = ActionClient(ros.node, MoveArms, "/motion/move_arms")
+        self.apply_client = ros.node.create_client(ApplyScene, "/motion/apply_scene")
+        self.get_client = ros.node.create_client(GetScene, "/motion/get_scene")
+        self.ik_client = ros.node.create_client(ComputeIK, "/motion/compute_ik")
+        self.markers: list[MarkerArray] = []
+        ros.node.create_subscription(MarkerArray, "/motion/attached_objects", self.markers.append, QOS_LATCHED)
+        ros.spin_until(lambda: self.node._states.age_s() < 0.5, 10.0, "joint states")
+        ros.spin_until(lambda: "table" in self.node._states.buffer._static, 10.0, "the table's frame")
+        for follower in self.node._followers.values():
+            ros.spin_until(follower._client.server_is_ready, 10.0, "controllers")
+
+    def start(self, client: ActionClient, goal, **kwargs) -> tuple[ClientGoalHandle, Future]:
+        handle, future = self.ros.send_goal(client, goal, **kwargs)
+        assert handle.accepted
+        return handle, future
+
+    def run(self, client: ActionClient, goal, timeout: float = 10.0, **kwargs):
+        """Send a goal and return its result."""
+        _, future = self.start(client, goal, **kwargs)
+        return self.ros.result(future, timeout).result
+
+    def begin(self, side: str, trajectory: JointTrajectory) -> tuple[ClientGoalHandle, Future]:
+        """Send a trajectory and wait until the arm is on its way."""
+        goal = ExecuteTrajectory.Goal(arm=side, trajectory=trajectory)
+        handle, future = self.start(self.execute_client, goal)
+        self.ros.spin_until(lambda: side in self.robot.active or future.done(), 10.0, "the arm to start")
+        assert not future.done(), future.result()
+        return handle, future
+
+    @staticmethod
+    def stamped(T: np.ndarray, frame: str = "") -> PoseStamped:
+        """A pose message."""
+        pose = PoseStamped(pose=matrix_to_pose(T))
+        pose.header.frame_id = frame
+        return pose
+
+    @staticmethod
+    def named(arm: str = "right", posture: str = "official_home", **kwargs) -> MoveArm.Goal:
+        """A goal to a posture at full speed."""
+        return MoveArm.Goal(arm=arm, kind=MoveArm.Goal.NAMED, named=posture, velocity_scale=1.0, **kwargs)
+
+    def slow_plan(self) -> JointTrajectory:
+        """A motion that takes long enough to be disturbed: 40 s of the robot's time, 10 of the wall clock."""
+        goal = self.named(plan_only=True)
+        goal.velocity_scale = 0.02
+        return self.run(self.move_client, goal).trajectory
+
+    def q(self, side: str) -> np.ndarray:
+        return np.array([self.robot.state[name] for name in self.description.arm_joints(side)])
+
+    def held(self) -> list[str]:
+        """Ids of what the latest marker array shows as held."""
+        if not self.markers:
+            return []
+        return [marker.ns for marker in self.markers[-1].markers if marker.action == Marker.ADD]
+
+
+class RobotNode(BaseNode):
+    """A node whose callbacks overlap, as the bridge's do."""
+
+    def __init__(self) -> None:
+        super().__init__("fake_robot", Config)
+
+
+@pytest.fixture(scope="module")
+def description() -> RobotDescription:
+    return RobotDescription.load()
+
+
+@pytest.fixture
+def make_bench(ros, description: RobotDescription) -> Callable[..., Bench]:
+    """Makes the motion node and its robot; keyword arguments are the node's."""
+    return functools.partial(Bench, ros, description)
+
+
+@pytest.fixture
+def bench(make_bench) -> Bench:
+    return make_bench()

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion node against a fake robot (see conftest.py): execution and what disturbs it."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from control_msgs.action import FollowJointTrajectory
+from openarm_interfaces.action import ExecuteTrajectory
+
+from openarm_common.convert import (
+    trajectory_from_msg,
+    trajectory_to_msg,
+)
+
+
+# --- execution
+def test_a_bad_trajectory_is_refused_with_joint_and_value(bench) -> None:
+    good = bench.slow_plan()
+    names, t, q, v, a = trajectory_from_msg(good)
+    cases = []
+    cases.append((["elbow", *names[1:]], q, "INVALID_ARGUMENT", "unknown elbow"))
+    wrong = q.copy()
+    wrong[3, 2] = np.nan
+    cases.append((names, wrong, "INVALID_ARGUMENT", "openarm_right_joint3 at point 3 is nan"))
+    wrong = q.copy()
+    wrong[3, 3] = 4.0
+    cases.append((names, wrong, "LIMITS", "openarm_right_joint4 at point 3 is 4.0000 rad"))
+    for joints, positions, code, text in cases:
+        message = trajectory_to_msg(joints, t, positions, v, a)
+        result = bench.run(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=message))
+        assert (result.success, result.code) == (False, code)
+        assert text in result.message
+    assert not bench.robot.active
+
+
+def test_cancel_holds(bench) -> None:
+    handle, future = bench.start(
+        bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=bench.slow_plan())
+    )
+    bench.ros.spin_until(lambda: "right" in bench.robot.active, 5.0, "the arm to start")
+    bench.ros.result(handle.cancel_goal_async())
+    answer = bench.ros.result(future)
+    assert answer.status == 5  # canceled
+    assert (answer.result.success, answer.result.code) == (False, "CANCELLED")
+    assert bench.robot.cancelled == ["right"]
+    assert "holds" in answer.result.message
+
+
+def test_the_controllers_reason_is_passed_on(bench) -> None:
+    def violate(result: FollowJointTrajectory.Result) -> None:
+        result.error_code, result.error_string = (
+            FollowJointTrajectory.Result.PATH_TOLERANCE_VIOLATED,
+            "joint2 0.08 rad off the path",
+        )
+
+    bench.robot.answer = violate
+    result = bench.run(bench.move_client, bench.named())
+    assert (result.success, result.code) == (False, "EXECUTION_FAILED")
+    assert "PATH_TOLERANCE_VIOLATED: joint2 0.08 rad off the path" in result.message
+    bench.robot.accept = False
+    result = bench.run(bench.move_client, bench.named("left"))
+    assert result.code == "EXECUTION_FAILED"
+    assert "rejected" in result.message
+
+
+def test_a71_a_controller_that_says_success_is_not_evidence(bench) -> None:
+    bench.robot.stuck = {"openarm_right_joint2"}
+    result = bench.run(bench.move_client, bench.named())
+    assert (result.success, result.code) == (False, "EXECUTION_FAILED")
+    assert "openarm_right_joint2 ended" in result.message
+    assert "rad from its goal" in result.message
+
+
+def test_a_silent_robot_ends_a_motion_within_two_seconds(bench) -> None:
+    _, future = bench.begin("right", bench.slow_plan())
+    bench.robot.silent = True
+    begin = time.monotonic()
+    result = bench.ros.result(future).result
+    assert time.monotonic() - begin < 2.0
+    assert (result.success, result.code) == (False, "ROBOT_LOST")
+    assert "no /joint_states" in result.message
+    # and nothing new is begun
+    bench.ros.spin_until(lambda: bench.node._states.age_s() > 0.6, 5.0)
+    result = bench.run(bench.move_client, bench.named("left"))
+    assert result.code == "NOT_READY"
+    assert "no fresh /joint_states" in result.message
+
+
+def test_a_controller_that_vanishes_ends_a_motion_within_two_seconds(bench) -> None:
+    _, future = bench.begin("right", bench.slow_plan())
+    begin = time.monotonic()
+    bench.robot.servers["right"].destroy()
+    bench.robot.gone.add("right")
+    result = bench.ros.result(future).result
+    assert time.monotonic() - begin < 2.0
+    assert (result.success, result.code) == (False, "ROBOT_LOST")
