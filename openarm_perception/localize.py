@@ -32,6 +32,10 @@ Array = NDArray[np.float64]
 
 #: Depth with less noise than this is used as it is, m; 16UC1 alone rounds by 0.3 mm (1 sigma).
 _CLEAN = 0.0006
+#: More pixels without depth than this share, and it is used as it is no more.
+_FEW_HOLES = 0.001
+#: Stands for no depth among depths, m.
+_FAR = 100.0
 #: As many points of the sides as this are enough; tall objects show thousands.
 _SIDE_POINTS = 150
 #: Pixels around a detection that are looked at.
@@ -167,9 +171,11 @@ class Localizer:
         top = self._top_height(patch.points[..., 2][solid], patch.band)
         face = self._top_face(patch, top)
         pixel = float(np.median(patch.z[solid])) / intrinsics.fx
-        sides = patch.points[solid & (patch.points[..., 2] < top - patch.band), :2]
+        # not beside its borders: where depth jumps, a real sensor reports any value between both sides
+        flank = solid & (patch.points[..., 2] < top - patch.band)
+        sides = patch.points[cv2.erode(flank.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, :2]
         sides = sides[:: max(1, len(sides) // _SIDE_POINTS)]
-        edges, visible = self._edges(patch, face, top, T_base_camera[:3, 3])
+        edges, visible = self._edges(patch, face, flank, top, T_base_camera[:3, 3])
         try:
             shape = footprint.fit(np.concatenate([edges, sides]), pixel)
             if shape.rms > self.config.prism_rms:
@@ -224,8 +230,11 @@ class Localizer:
         count, labels, stats, _ = cv2.connectedComponentsWithStats(level.astype(np.uint8), connectivity=4)
         return labels == 1 + int(np.argmax(stats[1:count, cv2.CC_STAT_AREA]))
 
-    def _edges(self, patch: _Patch, face: Mask, top: float, camera: Array) -> tuple[Array, float]:
-        """Points (n, 2) on the edges of the top, base frame, m, and the share of its outline that is in view."""
+    def _edges(self, patch: _Patch, face: Mask, flank: Mask, top: float, camera: Array) -> tuple[Array, float]:
+        """Points (n, 2) on the edges of the top, base frame, m, and the share of its outline that is in view.
+
+        An edge lies between the face and what is far from it, or what belongs to the `flank`.
+        """
         h, w = face.shape
         found: list[Array] = []
         seen = hidden = 0
@@ -245,9 +254,12 @@ class Localizer:
             # a near neighbour is a hole in the mask, another colour or a side of the object: no silhouette
             close = (distance <= self.config.side_step) & (patch.points[far][:, 2] > self.table_height + margin)
             seen += int(np.count_nonzero(~hides))
-            silhouette = ~(close | hides)
-            ray = 0.5 * (patch.rays[near] + patch.rays[far])[silhouette]
-            found.append(camera[:2] + ray[:, :2] * ((top - camera[2]) / ray[:, 2])[:, None])
+            ridge = flank[far] & close & ~hides
+            edge = ~(close | hides) | ridge
+            ray = 0.5 * (patch.rays[near] + patch.rays[far])[edge]
+            # the face goes on down the flank as far as heights count as top
+            height = np.where(ridge[edge], top - patch.band, top)
+            found.append(camera[:2] + ray[:, :2] * ((height - camera[2]) / ray[:, 2])[:, None])
         return np.concatenate(found), seen / max(seen + hidden, 1)
 
     def _detection(
@@ -269,13 +281,16 @@ def _pixel(found: Detection2D) -> str:
 
 
 def _denoise(z: Array) -> tuple[Array, float]:
-    """Depth without the noise of a real sensor, and the standard deviation that is left, m; clean depth stays."""
+    """Depth without the noise and dropouts of a real sensor, and the noise that is left, m; clean depth stays."""
     holes = np.isnan(z)
     # the median keeps edges where they are; a hole counts as far away, as what lies behind the object
-    smooth = cv2.medianBlur(np.where(holes, np.float32(100.0), z).astype(np.float32), 5).astype(np.float64)
-    noise = 1.4826 * float(np.median(np.abs(smooth - z)[~holes])) if not holes.all() else 0.0
-    if noise < _CLEAN:
+    smooth = cv2.medianBlur(np.where(holes, np.float32(_FAR), z).astype(np.float32), 5).astype(np.float64)
+    residual = np.sort(np.abs(smooth - z)[~holes])
+    # without the tenth that lies on edges; the median alone would be 0 where whole millimetres hide the noise
+    inner = residual[: len(residual) * 9 // 10]
+    noise = 1.25 * float(np.sqrt(np.mean(inner**2))) if len(inner) else 0.0
+    if noise < _CLEAN and np.count_nonzero(holes) < _FEW_HOLES * z.size:
         return z, noise
-    smooth[holes | (smooth > 99.0)] = np.nan
+    smooth[smooth > 0.99 * _FAR] = np.nan
     # a median of 25 leaves a quarter of the noise (sqrt(pi / 2 / 25))
     return smooth, 0.25 * noise
