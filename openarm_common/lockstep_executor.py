@@ -193,7 +193,7 @@ class ParticipantExecutor(LockstepExecutor):
         self._told: dict[str, int] = {}
         self._name = node.get_name()
         self._ack = node.create_publisher(SimAck, ACK_TOPIC, QOS_TICK)
-        node.create_subscription(SimTick, TICK_TOPIC, self._ticks.append, QOS_TICK)
+        node.create_subscription(SimTick, TICK_TOPIC, self._on_tick, QOS_TICK)
 
     def spin(self) -> None:
         """Handle ticks until shutdown."""
@@ -202,6 +202,9 @@ class ParticipantExecutor(LockstepExecutor):
                 self._handle(self._ticks.popleft())
             else:
                 self.spin_once()
+
+    def _on_tick(self, tick: SimTick) -> None:
+        self._ticks.append(tick)
 
     def _handle(self, tick: SimTick) -> None:
         channels = {item.name: item for item in tick.channels}

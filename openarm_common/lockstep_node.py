@@ -198,6 +198,11 @@ class LockstepNode(Node):
         self.books.park(subscription)
         return True
 
+    def destroy_node(self) -> None:
+        """As `Node`; nothing is kept any more."""
+        self.books = None
+        super().destroy_node()
+
     def create_client(self, *args: Any, **kwargs: Any) -> Client:
         """As `Node`; in lock-step counted."""
         client = super().create_client(*args, **kwargs)
