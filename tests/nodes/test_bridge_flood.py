@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process of the bridge while somebody floods it: it keeps its rate, or says that it does not."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from openarm_interfaces.srv import SetPause
+from sensor_msgs.msg import JointState
+
+from openarm_common.node import QOS_COMMAND
+
+#: What a client gone wild sends, s and messages a second: right ones, ones of bad sizes and values, bytes that are no
+#: message, and messages of another type on a topic of the controller.
+FLOOD = """
+import sys, time
+import rclpy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+rclpy.init()
+node = rclpy.create_node("flood")
+publisher = node.create_publisher(JointState, "/joint_commands", 10)
+other = node.create_publisher(String, "/right_joint_trajectory_controller/joint_trajectory", 10)
+arm = [f"openarm_right_joint{i}" for i in range(1, 8)]
+messages = [
+    JointState(name=["openarm_right_joint4"], position=[1.2]),
+    JointState(name=arm, position=[0.1]),
+    JointState(name=arm, position=[float("nan")] * 7),
+    JointState(name=["tail"], position=[1.0]),
+    bytes([0, 1, 0, 0]) + bytes(8) + bytes([0, 0, 0, 0, 255, 255, 255, 127]),
+]
+rate, began, sent = float(sys.argv[1]), None, 0
+while True:
+    if not publisher.get_subscription_count():
+        time.sleep(0.01)
+        continue
+    began = began or time.monotonic()
+    due = int((time.monotonic() - began) * rate)
+    for i in range(sent, due):
+        publisher.publish(messages[i % len(messages)])
+    other.publish(String(data="go"))
+    sent = due
+    time.sleep(0.0005)
+"""
+
+
+def test_n23_four_thousand_commands_a_second_leave_the_rate_or_are_told(ros, tmp_path) -> None:
+    published: list[int] = []
+    told: list[DiagnosticArray] = []
+    ros.node.create_subscription(
+        JointState,
+        "/joint_states",
+        lambda _raw, info: published.append(info["source_timestamp"]),
+        QOS_COMMAND,
+        raw=True,
+    )
+    ros.node.create_subscription(DiagnosticArray, "/diagnostics", told.append, QOS_COMMAND)
+
+    def status() -> dict:
+        if not told:
+            return {}
+        (last,) = told[-1].status
+        return {"message": last.message, "ok": last.level == DiagnosticStatus.OK} | {
+            v.key: v.value for v in last.values
+        }
+
+    log = (tmp_path / "log").open("w")  # a pipe that nobody empties would hold the bridge up
+
+    def run(*command: str) -> subprocess.Popen:
+        return subprocess.Popen([sys.executable, *command], stderr=log, env=os.environ)
+
+    bridge = run("-m", "openarm_sim_bridge.node", "--ros-args", "-p", "scene:=empty", "-p", "images:=false")
+    flood: subprocess.Popen | None = None
+    try:
+        ros.spin_until(lambda: published and told, 30.0, "the bridge")
+        flood = run("-c", FLOOD, "4000")
+        ros.spin_until(lambda: int(status().get("commands_per_s", 0)) > 1000, 20.0, "the flood to be counted")
+        published.clear()
+        ros.spin_until(lambda: len(published) > 400, 20.0, "four seconds of joint states")
+        periods = np.diff(published) * 1e-6
+        reports = len(told)
+        ros.spin_until(lambda: len(told) >= reports + 2, 5.0, "/diagnostics")
+        kept = abs(periods.mean() - 10.0) < 0.2 and np.percentile(periods, 99) <= 15.0
+        assert kept or (not status()["ok"] and status()["message"].startswith(("late", "slower"))), status()
+        # It still listens to others.
+        assert ros.call(ros.node.create_client(SetPause, "/sim/set_pause"), SetPause.Request(paused=True)).success
+        ros.spin_until(lambda: status()["message"] == "paused", 5.0, "the pause on /diagnostics")
+        bridge.send_signal(signal.SIGINT)
+        code = bridge.wait(timeout=10.0)
+        errors = (tmp_path / "log").read_text()
+        assert code == 0, errors[-2000:]
+        assert "1 positions, expected as many" in errors  # said once a second, not four thousand times
+        assert errors.count("refused") < 60
+    finally:
+        for process in (bridge, flood):
+            if process is not None:
+                process.kill()
+                process.wait()
+        log.close()
