@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm test` and `openarm check`: the developer's loop."""
+"""`openarm test` and `openarm lint`: the developer's loop."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test(*args: Rest) -> Outcome:
     return Outcome(False, f"tests failed (pytest ended with {code}) after {seconds:.0f} s", Code.INTERNAL, data)
 
 
-def check() -> Outcome:
+def lint() -> Outcome:
     """Check style and types: ruff, and basedpyright on the cores (installed at the first call)."""
     root = _checkout()
     python = Path(sys.executable)

@@ -15,12 +15,12 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 
 from openarm_bringup.bag import Bag, Record, message_class
-from openarm_bringup.bag_qos import to_profile
 from openarm_bringup.environment import write_profile
 from openarm_bringup.graph import NodeSpec
 from openarm_common.convert import ns_to_stamp
@@ -175,3 +175,15 @@ class Player:
             pass  # the context was shut down by the end of the process
         finally:
             executor.remove_node(self._node)
+
+
+def to_profile(qos: Qos | None) -> QoSProfile:
+    """Return a profile to publish with; reliable and volatile where a bag says nothing."""
+    reliable = qos is None or qos.reliability != QosReliability.BEST_EFFORT
+    latched = qos is not None and qos.durability == QosDurability.TRANSIENT_LOCAL
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=max(qos.depth, 10) if qos is not None else 10,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )

@@ -144,6 +144,35 @@ def replay(
     return Outcome(True, f"{player.published} messages of {bag}{mended}{left}", data=data)
 
 
+def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update: bool = False) -> Outcome:
+    """Run detection, map and board detection on a bag, and compare with golden numbers; for CI. Needs no graph.
+
+    Args:
+        bag: Folder of rosbag2, or an MCAP file.
+        golden: File with the numbers that are expected; golden.json in the bag's folder when not given.
+        scene: Whose table the objects stand on.
+        update: Write the numbers instead of comparing.
+    """
+    from openarm_bringup import golden as stored
+    from openarm_bringup.bag import open_bag
+    from openarm_bringup.bag_client import numbers_of
+
+    path = golden or (bag if bag.is_dir() else bag.parent) / "golden.json"
+    expected = {} if update and not path.exists() else stored.read(path)
+    with open_bag(bag) as opened:
+        numbers = numbers_of(opened, scene=scene)
+    data: dict[str, Any] = {"bag": str(bag), "golden": str(path), "numbers": numbers}
+    if update:
+        stored.write(path, numbers, expected)
+        return Outcome(True, f"{len(numbers)} numbers written to {path}", data=data)
+    differences = stored.compare(expected, numbers)
+    data["differences"] = [str(difference) for difference in differences]
+    if differences:
+        said = f"{len(differences)} of {len(expected)} numbers differ from {path}"
+        return Outcome(False, said, Code.STALE_DATA, data, "\n".join(data["differences"]))
+    return Outcome(True, f"{len(numbers)} numbers are as {path} says", data=data)
+
+
 def _split(pair: str) -> tuple[str, str]:
     old, found, new = pair.partition(":=")
     if not found or not old.startswith("/") or not new.startswith("/"):

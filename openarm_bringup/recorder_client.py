@@ -21,12 +21,11 @@ from typing import Any, NamedTuple
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from rosbags.interfaces import Qos
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from openarm_bringup.bag import BagWriter, message_class
-from openarm_bringup.bag_qos import from_profile
 from openarm_common.errors import Code, OpenArmError
 
 #: What the profiles record: regular expressions of whole topic names.
@@ -48,6 +47,8 @@ _QUEUE_BYTES = 512 * 2**20
 _DISCOVERY_S = 0.5
 #: The disk is left this much room, so that the bag can still be closed.
 _SPARE_BYTES = 200 * 2**20
+#: What rosbag2 writes for "no limit".
+_NEVER_S = QosTime(9223372036, 854775807)
 
 
 @dataclass
@@ -242,3 +243,18 @@ class Thinner:
         sec, nanosec = int.from_bytes(data[4:8], "little"), int.from_bytes(data[8:12], "little")
         # The frame that is nearest to a multiple of the period, of cameras with 30 Hz.
         return (sec * 1_000_000_000 + nanosec + 5_000_000) % self._period_ns < 33_333_333
+
+
+def from_profile(profile: QoSProfile) -> Qos:
+    """Return the profile as it is kept in a bag."""
+    return Qos(
+        history=QosHistory[profile.history.name],
+        depth=profile.depth,
+        reliability=QosReliability[profile.reliability.name],
+        durability=QosDurability[profile.durability.name],
+        deadline=_NEVER_S,
+        lifespan=_NEVER_S,
+        liveliness=QosLiveliness[LivelinessPolicy.AUTOMATIC.name],
+        liveliness_lease_duration=_NEVER_S,
+        avoid_ros_namespace_conventions=False,
+    )
