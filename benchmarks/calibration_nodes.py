@@ -32,7 +32,7 @@ from openarm_calibration.refine import mount_error
 from openarm_calibration.samples import load_session
 from openarm_common.cameras import load_cameras, true_mount
 from openarm_common.description import RobotDescription
-from openarm_common.errors import OpenArmError
+from openarm_common.errors import Code, OpenArmError
 
 Array = NDArray[np.float64]
 #: Predicted errors that are never reached, so that the whole budget of poses is used: m, rad.
@@ -74,6 +74,8 @@ def measure(seed: int, cameras: tuple[str, ...], poses: int) -> list[dict[str, A
     run = run_calibration(CalibrationOptions(cameras, mount_seed=seed, poses=poses, enough=WHOLE_BUDGET))
     out: list[dict[str, Any]] = []
     if run.error is not None:
+        if run.error.code == Code.CANCELLED:
+            raise SystemExit(1)
         out.append({"seed": seed, "camera": "", "error": f"{run.error.code}: {run.error.message}"})
     for name, result in run.results.items():
         camera = load_cameras()[name]

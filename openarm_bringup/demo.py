@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from openarm_bringup import environment, report, runs
+from openarm_bringup import environment, mounts, report, runs
 from openarm_bringup.graph import Graph, load_graph
 from openarm_bringup.session import in_thread, running_graph
 from openarm_bringup.trial import Ask, Trial, choose_target, run_trial
@@ -35,6 +35,8 @@ class DemoOptions:
     Args:
         seeds: Random scenes, one after the other; empty: one grasp in `scene`.
         film: Pictures and a video.
+        mount_seed: Of the true camera mounts, or "none"; None is the graph's.
+        uncalibrated: Use the mounts of the configuration, to see what that does.
     """
 
     graph: str = "sim"
@@ -44,6 +46,8 @@ class DemoOptions:
     film: bool = True
     domain: int | None = None
     sets: tuple[str, ...] = ()
+    mount_seed: str | None = None
+    uncalibrated: bool = False
 
 
 @dataclass
@@ -54,16 +58,18 @@ class Listeners:
     on_ready: Callable[[float], None] = lambda seconds: None
     on_step: Callable[[Step], None] = lambda step: None
     on_trial: Callable[[Trial], None] = lambda trial: None
+    on_note: Callable[[str], None] = lambda note: None
 
 
 @dataclass
 class DemoResult:
-    """What came out; `pictures` are files in the run folder."""
+    """What came out; `pictures` are files in the run folder, `mounts` how far off cameras are (see `mounts.errors`)."""
 
     run_dir: Path
     trials: list[Trial] = field(default_factory=list["Trial"])
     pictures: list[str] = field(default_factory=list[str])
     warnings: list[str] = field(default_factory=list[str])
+    mounts: dict[str, dict[str, float]] = field(default_factory=dict[str, "dict[str, float]"])
     ready_s: float = 0.0
     error: OpenArmError | None = None
 
@@ -75,16 +81,26 @@ def run_demo(options: DemoOptions, listeners: Listeners | None = None) -> DemoRe
         OpenArmError: What is wrong with the options; what happens later is in the result.
     """
     domain = reserve_domain() if options.domain is None else options.domain
-    overrides = {"domain": domain, "scene": "random" if options.seeds else options.scene}
+    overrides = {
+        "domain": domain,
+        "scene": "random" if options.seeds else options.scene,
+        "mount_seed": options.mount_seed,
+    }
     if options.seeds:
         overrides["seed"] = options.seeds[0]
-    graph = load_graph(options.graph, overrides=overrides, sets=options.sets)
+    sets = (*options.sets, *(("calibration_publisher.nominal=true",) if options.uncalibrated else ()))
+    graph = load_graph(options.graph, overrides=overrides, sets=sets)
     # Faults of the call show before anything is started.
     for seed in options.seeds or (graph.seed,):
         choose_target(load_scene(graph.scene, seed), options.ask.label)
     result = DemoResult(runs.new_run_dir())
+    told = listeners or Listeners()
     try:
-        asyncio.run(_demo(options, graph, result, listeners or Listeners()))
+        if graph.mount_seed != "none":
+            if not options.uncalibrated:
+                mounts.calibrate_once(graph.mount_seed, told.on_note)
+            result.mounts = mounts.errors(graph.mount_seed, nominal=options.uncalibrated)
+        asyncio.run(_demo(options, graph, result, told))
     except OpenArmError as error:
         result.error = error
     write_report(options, graph, result)
@@ -224,6 +240,7 @@ def write_report(options: DemoOptions, graph: Graph, result: DemoResult) -> dict
         "graph": graph.name,
         "domain": graph.domain,
         "mount_seed": graph.mount_seed,
+        "mounts": result.mounts,
         "seeds": list(options.seeds),
         "ready_s": round(result.ready_s, 2),
         "summary": report.summarise(rows),

@@ -30,6 +30,8 @@ def demo(
     graph: str = "sim",
     set_: Annotated[tuple[str, ...], Parameter(name="--set")] = (),
     video: bool | None = None,
+    mount_seed: str | None = None,
+    uncalibrated: Annotated[bool, Parameter(negative=())] = False,
     domain: int | None = None,
     accept: float = 0.9,
 ) -> Outcome:
@@ -46,6 +48,9 @@ def demo(
         graph: Name of a graph, or a file.
         set_: A parameter, as node.param=value.
         video: Pictures and a video; by default for a single grasp only.
+        mount_seed: Of the true camera mounts, or "none" for those of the configuration. Mounts of a seed that was never
+            calibrated are calibrated first, once.
+        uncalibrated: Use the mounts of the configuration, to see what that does.
         domain: ROS_DOMAIN_ID; a free one when not given.
         accept: With seeds: the share of objects placed that counts as success.
     """
@@ -61,9 +66,13 @@ def demo(
         film=not chosen if video is None else video,
         domain=domain,
         sets=tuple(set_),
+        mount_seed=mount_seed,
+        uncalibrated=uncalibrated,
     )
     show = _Show(quiet_steps=bool(chosen))
-    listeners = Listeners(on_event=show.event, on_ready=show.ready, on_step=show.step, on_trial=show.trial)
+    listeners = Listeners(
+        on_event=show.event, on_ready=show.ready, on_step=show.step, on_trial=show.trial, on_note=show.note
+    )
     return _outcome(run_demo(options, listeners), options.seeds, accept)
 
 
@@ -77,6 +86,9 @@ class _Show:
         self._quiet = quiet_steps
         self._first_ns: int | None = None
         self._rows = 0
+
+    def note(self, note: str) -> None:
+        self._console.print(note, style="yellow", markup=False)
 
     def event(self, event: Event) -> None:
         if event.state in ("failed", "backoff"):
@@ -124,8 +136,14 @@ def _outcome(result: DemoResult, seeds: tuple[int, ...], accept: float) -> Outco
         "summary": summary,
         "rows": rows,
         "warnings": result.warnings,
+        "mounts": result.mounts,
     }
     notes = "".join(f"note: {warning}\n" for warning in result.warnings)
+    for camera, off in result.mounts.items():
+        notes += (
+            f"{camera}: the mount in use is {off['used_mm']:.2f} mm and {off['used_deg']:.3f}° off,"
+            f" that of the configuration {off['nominal_mm']:.1f} mm and {off['nominal_deg']:.2f}°\n"
+        )
     if result.error is not None:
         return Outcome(False, f"{result.error.message}; the logs are in {where}/logs", result.error.code, data, notes)
     if seeds:

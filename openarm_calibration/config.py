@@ -46,6 +46,7 @@ class PublisherConfig(StoreConfig):
     """Parameters of the node `calibration_publisher`."""
 
     period: float = Field(default=0.5, gt=0.0, le=60.0, description="between looks at the store, s of wall clock")
+    nominal: bool = Field(default=False, description="publish the mounts of the configuration whatever is stored")
 
 
 class PlaceConfig(Config):

@@ -3,7 +3,8 @@
 
 For each camera: parent → `<camera>_link` (the mount) and `<camera>_link` → `<camera>_color_optical_frame` (the turn of
 the axes). The mount is the stored calibration of the camera, or, where there is none of these mounts, the nominal one.
-A change of the store is published within `period`. Nothing else publishes these edges.
+A change of the store is published within `period`. Nothing else publishes these edges. Simulated mounts of a seed may
+also be calibrated in the store's subfolder `mount_seed_<seed>`, or by what comes with the suite.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from tf2_msgs.msg import TFMessage
 
 from openarm_calibration.config import PublisherConfig
-from openarm_calibration.store import CalibrationStore, check_mount_seed, default_folder
+from openarm_calibration.store import default_folder, of_these_mounts, places
 from openarm_common.cameras import T_LINK_OPTICAL, CameraConfig, load_cameras
 from openarm_common.convert import matrix_to_transform
 from openarm_common.errors import Code, OpenArmError
@@ -39,15 +40,19 @@ class PublisherNode(BaseNode[PublisherConfig]):
                     f"camera {camera.name!r}: parent {camera.parent!r} is no link of the robot;"
                     f" links: {', '.join(links)}",
                 )
-        self._store = CalibrationStore(Path(self.config.store) if self.config.store else default_folder())
-        self._seen = self._store.state()
+        folder = Path(self.config.store) if self.config.store else default_folder()
+        self._stores = places(folder, self.config.seed)
+        self._seen = self._state()
         self._last: dict[str, Array] = {}
         self._mounts = self.create_publisher(TFMessage, "/tf_static", QOS_LATCHED)
         self._publish()
         self.create_timer(self.config.period, self._look, clock=self.wall_clock)
 
+    def _state(self) -> tuple[object, ...]:
+        return tuple(store.state() for store in self._stores)
+
     def _look(self) -> None:
-        state = self._store.state()
+        state = self._state()
         if state != self._seen:
             self._seen = state
             self._publish()
@@ -72,25 +77,20 @@ class PublisherNode(BaseNode[PublisherConfig]):
 
     def _mount(self, camera: CameraConfig, faults: list[str]) -> tuple[Array, str]:
         """The mount of a camera and where it is from; a stored one that can't be used is a fault."""
-        try:
-            found = self._store.find(camera.name)
-            if found is None:
-                return camera.T_parent_link, "nominal"
-            calibration = found.calibration
-            check_mount_seed(calibration, self.config.seed if camera.mount_error else None)
-            if calibration.parent != camera.parent:
-                raise OpenArmError(
-                    Code.CONFIG_INVALID,
-                    f"the calibration of {camera.name!r} is for parent {calibration.parent!r}, the camera is on"
-                    f" {camera.parent!r}; calibrate again",
-                )
-        except OpenArmError as error:
-            faults.append(error.message)
+        if self.config.nominal:
+            return camera.T_parent_link, "nominal, as asked"
+        seed = self.config.seed if camera.mount_error else None
+        found, told = of_these_mounts(self._stores, camera.name, camera.parent, seed)
+        if found is None:
+            faults += told
             if camera.name in self._last:
                 return self._last[camera.name], "calibrated, the file before"
             return camera.T_parent_link, "nominal"
+        if told:  # one of other mounts may well be there beside the right one: that is no fault
+            self.get_logger().info("; ".join(told))
         if found.warning:
             faults.append(found.warning)
+        calibration = found.calibration
         self._last[camera.name] = calibration.T_parent_link
         return calibration.T_parent_link, f"calibrated {calibration.digest()[:12]}"
 

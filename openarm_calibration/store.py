@@ -13,6 +13,7 @@ import json
 import os
 import re
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from pydantic import Field, field_validator
 from openarm_common import se3
 from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import config_dir
 
 Array = NDArray[np.float64]
 
@@ -254,6 +256,49 @@ def check_mount_seed(calibration: StoredCalibration, mount_seed: int | None) -> 
             f"the calibration of {calibration.camera!r} is of mount seed {names[0]}, the mounts in use are of mount"
             f" seed {names[1]}; calibrate again",
         )
+
+
+def places(folder: Path, mount_seed: int | None) -> tuple[CalibrationStore, ...]:
+    """Where calibrations of the mounts in use are looked for, the first that has one wins.
+
+    That is the folder itself; for simulated mounts also its subfolder of that seed, and what comes with the suite.
+    """
+    stores = [CalibrationStore(folder)]
+    if mount_seed is not None:
+        name = f"mount_seed_{mount_seed}"
+        stores += [CalibrationStore(folder / name), CalibrationStore(config_dir() / "calibration" / name)]
+    return tuple(stores)
+
+
+def of_these_mounts(
+    stores: Sequence[CalibrationStore], camera: str, parent: str, mount_seed: int | None
+) -> tuple[Found | None, tuple[str, ...]]:
+    """The first calibration of a camera as it is mounted now, and why others that were met are not used.
+
+    Args:
+        stores: As `places` lists them.
+        camera: Name of the camera.
+        parent: Link that carries it.
+        mount_seed: Of the simulated mounts in use.
+    """
+    faults: list[str] = []
+    for store in stores:
+        try:
+            found = store.find(camera)
+            if found is None:
+                continue
+            check_mount_seed(found.calibration, mount_seed)
+            if found.calibration.parent != parent:
+                raise OpenArmError(
+                    Code.CONFIG_INVALID,
+                    f"the calibration of {camera!r} is for parent {found.calibration.parent!r}, the camera is on"
+                    f" {parent!r}; calibrate again",
+                )
+        except OpenArmError as error:
+            faults.append(error.message)
+            continue
+        return found, (*faults, *([found.warning] if found.warning else []))
+    return None, tuple(faults)
 
 
 def default_folder() -> Path:

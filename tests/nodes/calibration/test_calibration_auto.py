@@ -27,8 +27,8 @@ from openarm_common.convert import pose_to_matrix
 from openarm_common.scene import load_scene
 
 QUICK = {
-    "auto.search.draws": 500, "auto.search.candidates": 12, "auto.tries": 10, "auto.settle_timeout": 1.0, "image_timeout": 0.5,
-    "state_timeout": 0.5,
+    "auto.search.draws": 500, "auto.search.candidates": 12, "auto.tries": 10, "auto.settle_timeout": 1.0,
+    "image_timeout": 0.5, "state_timeout": 0.5,
 }  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from tf2_msgs.msg import TFMessage
 from openarm_calibration.publisher import PublisherNode
 from openarm_calibration.store import CalibrationStore, StoredCalibration, default_folder
 from openarm_common import se3
-from openarm_common.cameras import load_cameras
+from openarm_common.cameras import load_cameras, true_mount
 from openarm_common.convert import transform_to_matrix
 from openarm_common.description import RobotDescription
 from openarm_common.errors import OpenArmError
@@ -115,3 +115,15 @@ def test_a_calibration_of_other_mounts_is_refused_and_the_nominal_mount_served(r
     ros.add(PublisherNode())
     camera = load_cameras()["wrist"]
     np.testing.assert_allclose(edges(ros)[camera.parent, "wrist_link"], camera.T_parent_link, atol=1e-9)
+
+
+@pytest.mark.parametrize("nominal", [False, True])
+def test_the_suite_s_calibration_of_mount_seed_1_is_served_unless_the_nominal_mounts_are_asked_for(
+    ros, nominal: bool
+) -> None:
+    ros.add(PublisherNode(parameter_overrides=[Parameter("mount_seed", value=1), Parameter("nominal", value=nominal)]))
+    published = edges(ros)
+    for name in ("overhead", "wrist"):
+        camera = load_cameras()[name]
+        expected = camera.T_parent_link if nominal else true_mount(camera, 1)
+        np.testing.assert_allclose(published[camera.parent, f"{name}_link"], expected, atol=1e-4)
