@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import signal
+import socket
 import sys
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Generic, ParamSpec, TypeVar, get_args
@@ -32,6 +34,9 @@ ConfigT = TypeVar("ConfigT", bound=Config)
 P = ParamSpec("P")
 R = TypeVar("R")
 
+#: A node that moves something has this long to bring it to rest before the process ends, s.
+_HOLD = 2.0
+_ENDING = (signal.SIGINT, signal.SIGTERM)
 #: Where poses of the suite are expressed.
 BASE_FRAME = "openarm_body_link0"
 
@@ -139,6 +144,9 @@ class BaseNode(LockstepNode, Generic[ConfigT]):
         executor.add_node(self)
         return executor
 
+    async def hold(self) -> None:
+        """Bring to rest what the node moves: called when the process is to end, while the graph is still there."""
+
     def close(self) -> None:
         """Stop what the node runs beside the executor; subclasses with threads extend this."""
         self.__pool.shutdown(wait=True, cancel_futures=True)
@@ -194,16 +202,15 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
 
     The process exits with 0 after a signal and with 1 when the node could not be created.
     """
-    # rclpy's handlers shut the context down and then call these; a KeyboardInterrupt could cut the shutdown short.
-    signal.signal(signal.SIGINT, lambda *_: None)
-    signal.signal(signal.SIGTERM, lambda *_: None)
-    rclpy.init(signal_handler_options=SignalHandlerOptions.ALL)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    signals = _Signals()
     executor: Executor | None = None
     node: BaseNode[Any] | None = None
     code = 0
     try:
         node = factory()
         executor = node.make_executor()
+        signals.node = node
         executor.spin()
     except OpenArmError as error:
         get_logger("openarm").fatal(str(error))
@@ -222,3 +229,30 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
             node.destroy_node()
         rclpy.try_shutdown()
     sys.exit(code)
+
+
+class _Signals:
+    """Ends the context when SIGINT or SIGTERM comes, after `BaseNode.hold`: rclpy's own handlers end it at once.
+
+    They are read in a thread: the main one may be waiting in rcl, where Python's handlers don't run. And these do
+    nothing: a KeyboardInterrupt could cut the shutdown short.
+    """
+
+    def __init__(self) -> None:
+        self.node: BaseNode[Any] | None = None
+        self._reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        for kind in _ENDING:
+            signal.signal(kind, lambda *_: None)
+        threading.Thread(target=self._wait, name="signals", daemon=True).start()
+
+    def _wait(self) -> None:
+        while self._reader.recv(1)[0] not in _ENDING:
+            pass
+        executor = self.node.executor if self.node is not None else None
+        if self.node is not None and executor is not None:
+            rested = threading.Event()
+            executor.create_task(self.node.hold).add_done_callback(lambda _: rested.set())
+            rested.wait(_HOLD)
+        rclpy.try_shutdown()

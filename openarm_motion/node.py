@@ -2,9 +2,8 @@
 """The motion node: plans and executes motions of each arm, and of both at once.
 
 Offers the actions /motion/plan_approach, /motion/move, /motion/move_arms and /motion/execute, the service
-/motion/compute_ik, the planning scene (`scene_executor`), and latched /motion/attached_objects and /motion/preview:
-what each arm holds, as far as plans say so, and the way of the latest plan. Poses are in the base frame or any frame
-that the description or /tf_static knows.
+/motion/compute_ik, the planning scene (`scene_executor`), and latched /motion/attached_objects: what each arm holds, as
+far as plans say so. Poses are in the base frame or any frame that the description or /tf_static knows.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from openarm_common.convert import matrix_to_pose, trajectory_from_msg
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.housings import with_housings
 from openarm_common.lockstep_node import NamedActionServer
-from openarm_common.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
+from openarm_common.node import QOS_LATCHED, BaseNode, run
 from openarm_common.tf import RobotStateListener
 from openarm_motion import convert, moves
 from openarm_motion.alternative import explained, near_joints, near_pose
@@ -37,10 +36,11 @@ from openarm_motion.both_executor import BothExecutor
 from openarm_motion.checks import check_against_others, check_trajectory
 from openarm_motion.collision import Box
 from openarm_motion.config import MotionConfig
-from openarm_motion.executor import Follower
+from openarm_motion.executor import Follower, Watch
 from openarm_motion.goals import posture
 from openarm_motion.memory import HeldMemory
 from openarm_motion.planning_scene import PlanningScene
+from openarm_motion.preview_publisher import PreviewPublisher
 from openarm_motion.scene_executor import SceneExecutor, table_boxes
 from openarm_motion.situation_client import Situations
 from openarm_motion.trajectory import Trajectory
@@ -50,8 +50,8 @@ Result = TypeVar("Result")
 
 #: Pace of feedback while planning, s.
 _FEEDBACK = 0.1
-#: Points of a previewed trajectory.
-_PREVIEW = 50
+#: Arms that move have this long to come to rest when the process is to end, s.
+_HOLD = 1.8
 
 
 class MotionNode(BaseNode[MotionConfig]):
@@ -69,7 +69,7 @@ class MotionNode(BaseNode[MotionConfig]):
         self._held = HeldMemory()
         self._attached = self.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
         self._publish_held()
-        self._preview = self.create_publisher(MarkerArray, "/motion/preview", QOS_LATCHED)
+        self._preview = PreviewPublisher(self, self._arms)
         self._situations = Situations(self, self._states, self._arms, scene, self._held)
         self._scene = SceneExecutor(self, scene, self._situations)
         self._both = BothExecutor(self, self._states, self._arms, self._followers, self._situations)
@@ -81,8 +81,17 @@ class MotionNode(BaseNode[MotionConfig]):
         ]
         self.create_service(ComputeIK, "/motion/compute_ik", self._on_ik)
         self.create_timer(1.0, self._report, clock=self.wall_clock)
-        for name, arm in self._arms.items():
-            self.get_logger().info(f"{name} arm: {', '.join(arm.names)}; inverse kinematics: {arm.inverse.method}")
+        for arm in self._arms.values():
+            self.get_logger().info(f"{arm.name} arm: {', '.join(arm.names)}; inverse kinematics: {arm.inverse.method}")
+
+    async def hold(self) -> None:
+        """End all plans and motions; the arms hold where they are."""
+        self._closing = True
+        watch = Watch(self, self._states)
+        try:
+            await watch.until(lambda: not any(f.running for f in self._followers.values()), lambda: None, _HOLD)
+        finally:
+            watch.close()
 
     def close(self) -> None:
         """Stop planning, then as every node."""
@@ -124,7 +133,7 @@ class MotionNode(BaseNode[MotionConfig]):
             result.approach = convert.trajectory_msg(plan.approach)
             result.retreat = convert.trajectory_msg(plan.retreat)
             result.refusals = convert.refusals_msg(plan.refusals)
-            self._show_ways({goal.arm: (plan.transfer, plan.approach, plan.retreat)})
+            self._preview.show({goal.arm: (plan.transfer, plan.approach, plan.retreat)})
             self._held.expect(goal.arm, (plan.transfer, plan.approach), request.attached)
             self._held.expect(goal.arm, (plan.retreat,), plan.held_after)
         except ApproachFailedError as error:
@@ -164,7 +173,7 @@ class MotionNode(BaseNode[MotionConfig]):
                 result.trajectory = convert.trajectory_msg(trajectory)
                 result.planning_time = time.monotonic() - begin
                 result.message = f"planned, {trajectory.duration:.2f} s{prepared.note}"
-                self._show_ways({goal.arm: (trajectory,)})
+                self._preview.show({goal.arm: (trajectory,)})
                 if not goal.plan_only:
                     self._situations.unchanged(prepared.version)
                     self._hold(goal.arm, tuple(around.attached))
@@ -185,7 +194,7 @@ class MotionNode(BaseNode[MotionConfig]):
             with self._claim(*names, wanted=not goal.plan_only):
                 handle.publish_feedback(MoveArms.Feedback(stage="planning"))
                 plan, held = await self._both.plan(goal, result, self._stopper(handle))
-                self._show_ways({name: (part,) for name, part in zip(names, plan.trajectories, strict=True)})
+                self._preview.show({name: (part,) for name, part in zip(names, plan.trajectories, strict=True)})
                 if not goal.plan_only:
                     self._situations.unchanged(result.scene_version)
                     for name, boxes in zip(names, held, strict=True):
@@ -270,14 +279,6 @@ class MotionNode(BaseNode[MotionConfig]):
             return lambda now: moves.to_pose_on_line(arm, now, pose, around)
         raise OpenArmError(Code.INVALID_ARGUMENT, f"kind is {goal.kind}; valid: JOINTS 0, POSE 1, LINEAR 2, NAMED 3")
 
-    def _show_ways(self, plans: dict[str, tuple[Trajectory, ...]]) -> None:
-        """Show the tools' ways: what a plan would do, for whoever has to agree to it."""
-        ways: dict[str, Array] = {}
-        for name, parts in plans.items():
-            q = np.concatenate([part.at(np.linspace(0.0, part.duration, _PREVIEW))[0] for part in parts])
-            ways[name] = self._arms[name].kinematics.fk_many(q)[:, :3, 3]
-        self._preview.publish(convert.preview_markers(ways, BASE_FRAME))
-
     def _arm(self, name: str) -> Arm:
         if name not in self._arms:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"arm is {name!r}; arms: {', '.join(self._arms)}")
@@ -317,9 +318,8 @@ class MotionNode(BaseNode[MotionConfig]):
 
     def _report(self) -> None:
         age = self._states.age_s()
-        fresh = age <= self.config.execution.stale_after
         moving = [name for name, follower in self._followers.items() if follower.running is not None]
-        faults = [] if fresh else ["no fresh /joint_states"]
+        faults = [] if age <= self.config.execution.stale_after else ["no fresh /joint_states"]
         values: dict[str, object] = {"joint_state_age_s": round(age, 2), "moving": ", ".join(moving) or "none"}
         try:
             look = self._situations.look()

@@ -127,6 +127,26 @@ def test_p34_a_signal_ends_the_process_in_order_with_exit_code_0(stop: signal.Si
         assert (process.returncode, out) == (0, "closed\n")
 
 
+def test_a_signal_lets_the_node_bring_to_rest_what_it_moves_while_the_graph_is_there() -> None:
+    script = _SCRIPT.replace(
+        "    def close(self):",
+        """\
+    async def hold(self):
+        import asyncio, rclpy
+        done = rclpy.task.Future(executor=self.executor)
+        self.create_timer(0.1, lambda: done.done() or done.set_result(None), clock=self.steady_clock)
+        await done
+        print("held", rclpy.ok(), flush=True)
+    def close(self):""".replace("\\\n", ""),
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env=os.environ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGTERM)
+        out, _ = process.communicate(timeout=10.0)
+        assert (process.returncode, out) == (0, "held True\nclosed\n")
+
+
 def test_a_wrong_parameter_ends_the_process_with_a_sentence_and_exit_code_1() -> None:
     command = [sys.executable, "-c", _SCRIPT, "--ros-args", "-p", "rate:=fast"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=False)

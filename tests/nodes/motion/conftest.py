@@ -110,13 +110,12 @@ class Bench:
     #: Rotation of a tool that looks down, its opening along y.
     DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
-    def __init__(self, ros, description: RobotDescription, **kwargs) -> None:
+    def __init__(self, ros, description: RobotDescription, *, motion: bool = True, **kwargs) -> None:
         self.ros, self.description = ros, description
         home = {**description.group_state("left_arm", "home"), **description.group_state("right_arm", "home")}
         fingers = {description.finger_joint("left"): 0.0, description.finger_joint("right"): 0.0}
         # a coroutine of the robot must not keep its own timer from running
         self.robot = FakeRobot(ros.add(RobotNode()), description, {**home, **fingers})
-        self.node = ros.add(MotionNode(**kwargs))
         self.plan_client = ActionClient(ros.node, PlanApproach, "/motion/plan_approach")
         self.move_client = ActionClient(ros.node, MoveArm, "/motion/move")
         self.execute_client = ActionClient(ros.node, ExecuteTrajectory, "/motion/execute")
@@ -126,9 +125,14 @@ class Bench:
         self.ik_client = ros.node.create_client(ComputeIK, "/motion/compute_ik")
         self.markers: list[MarkerArray] = []
         ros.node.create_subscription(MarkerArray, "/motion/attached_objects", self.markers.append, QOS_LATCHED)
-        ros.spin_until(lambda: self.node._states.age_s() < 0.5, 10.0, "joint states")
-        ros.spin_until(lambda: "table" in self.node._states.buffer._static, 10.0, "the table's frame")
-        for follower in self.node._followers.values():
+        if motion:
+            self._add_motion(ros.add(MotionNode(**kwargs)))
+
+    def _add_motion(self, node: MotionNode) -> None:
+        self.node, ros = node, self.ros
+        ros.spin_until(lambda: node._states.age_s() < 0.5, 10.0, "joint states")
+        ros.spin_until(lambda: "table" in node._states.buffer._static, 10.0, "the table's frame")
+        for follower in node._followers.values():
             ros.spin_until(follower._client.server_is_ready, 10.0, "controllers")
 
     def start(self, client: ActionClient, goal, **kwargs) -> tuple[ClientGoalHandle, Future]:

@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -96,3 +100,21 @@ def test_a_controller_that_vanishes_ends_a_motion_within_two_seconds(bench) -> N
     result = bench.ros.result(future).result
     assert time.monotonic() - begin < 2.0
     assert (result.success, result.code) == (False, "ROBOT_LOST")
+
+
+def test_stopping_the_motion_process_on_the_way_holds_the_arm(make_bench) -> None:
+    bench = make_bench(motion=False)
+    command = [sys.executable, "-m", "openarm_motion.node"]
+    with subprocess.Popen(command, env=os.environ, stderr=subprocess.DEVNULL) as process:
+        try:
+            bench.ros.spin_until(bench.move_client.server_is_ready, 60.0, "the process")
+            goal = ExecuteTrajectory.Goal(arm="right", trajectory=bench.slow_plan())
+            bench.start(bench.execute_client, goal)
+            bench.ros.spin_until(lambda: "right" in bench.robot.active, 20.0, "the arm to start")
+            process.send_signal(signal.SIGTERM)
+            bench.ros.spin_until(lambda: process.poll() is not None, 20.0, "its end")
+        finally:
+            process.kill()
+    assert process.returncode == 0
+    assert bench.robot.cancelled == ["right"]
+    assert not bench.robot.active
