@@ -12,6 +12,7 @@ from contextlib import contextmanager
 import numpy as np
 from openarm_interfaces.msg import ObjectState, ObjectStateArray
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
@@ -22,12 +23,14 @@ from tf2_msgs.msg import TFMessage
 from openarm_common import se3
 from openarm_common.convert import matrix_to_pose, matrix_to_transform, ns_to_stamp, vector
 from openarm_common.description import BASE_LINK, SIDES, RobotDescription
-from openarm_common.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_TF, reliable
+from openarm_common.node import QOS_CLOCK, QOS_LATCHED, QOS_TF, reliable
 from openarm_sim_bridge.edges import MovingEdges
 from openarm_sim_bridge.pacing import RateDivider
 from openarm_sim_bridge.world import JointReadout, ObjectReadout, World
 
 WORLD_FRAME = "world"
+#: Joint states come at least so often, paused or not: a subscriber that asks for this deadline is told of any gap.
+JOINT_STATE_DEADLINE = Duration(nanoseconds=200_000_000)
 
 
 @contextmanager
@@ -60,7 +63,9 @@ class StatePublisher:
         ground_truth_rate: float,
     ) -> None:
         self._clock = node.create_publisher(Clock, "/clock", QOS_CLOCK)
-        self._joint_states = node.create_publisher(JointState, "/joint_states", QOS_COMMAND)
+        qos = reliable(10)
+        qos.deadline = JOINT_STATE_DEADLINE
+        self._joint_states = node.create_publisher(JointState, "/joint_states", qos)
         self._tf = node.create_publisher(TFMessage, "/tf", QOS_TF)
         self._tf_static = node.create_publisher(TFMessage, "/tf_static", QOS_LATCHED)
         self._description = node.create_publisher(String, "/robot_description", QOS_LATCHED)

@@ -16,7 +16,8 @@ from control_msgs.action import FollowJointTrajectory
 from diagnostic_msgs.msg import DiagnosticArray
 from openarm_interfaces.msg import ObjectStateArray
 from rclpy.action import ActionClient
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
@@ -28,7 +29,8 @@ from openarm_common.convert import (
     transform_to_matrix,
 )
 from openarm_common.description import RobotDescription
-from openarm_common.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF, QOS_TF
+from openarm_common.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, reliable
+from openarm_sim_bridge.state_publisher import JOINT_STATE_DEADLINE
 
 
 def test_a15_a16_a17_names_types_and_qos(seeing) -> None:
@@ -93,6 +95,34 @@ def test_a18_a19_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
     assert factors[-1].data == pytest.approx(1.0, abs=0.1)
     assert len(clocks) > 300
     assert np.median(np.diff(bench.joint_arrivals[-300:])) == pytest.approx(0.01, abs=0.0015)
+
+
+def test_a04_a_subscriber_that_asks_for_a_deadline_is_told_of_a_gap(bench) -> None:
+    """Lateness is noticed by the middleware; who asks for no deadline, or for best effort, hears all the same."""
+    got: list[JointState] = []
+    missed: list[int] = []
+    events = SubscriptionEventCallbacks(deadline=lambda event: missed.append(event.total_count))
+    qos = reliable(10)
+    qos.deadline = JOINT_STATE_DEADLINE
+    node = bench.ros.node
+    node.create_subscription(JointState, "/joint_states", got.append, qos, event_callbacks=events)
+    bench.ros.spin_until(lambda: len(got) > 20, 5.0, "joint states")
+    before = len(missed)
+    bench.inject("joint_state_gap", "{ms: 500, every: 1.0}")
+    bench.ros.spin_until(lambda: len(missed) >= before + 2, 10.0, "missed deadlines")
+    bench.clear()
+    n = len(got)
+    bench.ros.spin_until(lambda: len(got) > n + 50, 5.0, "joint states again")
+
+
+def test_a04_a_sensor_can_not_be_had_reliably_and_that_is_told(seeing) -> None:
+    refused: list[QoSPolicyKind] = []
+    events = SubscriptionEventCallbacks(incompatible_qos=lambda event: refused.append(event.last_policy_kind))
+    seeing.ros.node.create_subscription(
+        Image, "/overhead/color/image_raw", lambda _m: None, QOS_COMMAND, event_callbacks=events
+    )
+    seeing.ros.spin_until(lambda: refused, 10.0, "the refusal")
+    assert refused[0] == QoSPolicyKind.RELIABILITY
 
 
 def test_a73_the_tree_of_frames_is_complete_and_has_no_gaps(bench) -> None:
