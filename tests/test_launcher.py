@@ -153,6 +153,20 @@ def test_a_changed_message_rebuilds_its_package_only_and_a_second_clone_builds_n
     assert not any(call.startswith("build") for call in machine.uv_calls())
 
 
+def test_kernels_that_a_pull_has_changed_are_compiled_before_anything_runs(machine: Machine) -> None:
+    """Else every node would compile at its first use, and miss its time limits."""
+    kernels = machine.root / "openarm_motion" / "kernels.py"
+    kernels.parent.mkdir()
+    kernels.write_text("from numba import njit\n")
+    machine.run()
+    assert machine.run("x").stderr == ""
+    kernels.write_text("from numba import njit, prange\n")
+    answer = machine.run("x")
+    assert "numba kernels have changed" in answer.stderr
+    assert answer.stdout.startswith("args: x\n")
+    assert machine.run("x").stderr == ""
+
+
 def test_an_interrupted_set_up_leaves_no_stamp_and_the_next_starts_the_environment_anew(machine: Machine) -> None:
     reached = machine.root.parent / "reached"
     command = [machine.root / "openarm", "x"]
