@@ -19,8 +19,11 @@ Array = NDArray[np.float64]
 FLOOR_TRANSLATION = 1e-7  # m
 FLOOR_ROTATION = 1e-7  # rad
 #: Chance, before anything is seen, that the robot is exact; the factor within which others are like a typical one.
-_EXACT = 0.3
+_EXACT = 0.4
 _FACTOR = 3.0
+#: How much the logarithm of the likelihood counts: with five poses it is itself a matter of luck, and an answer that
+#: believes it fully is now and then far too sure.
+_TRUST = 0.7
 #: Where the average over spreads is taken: their size against a typical robot's, and translation against rotation.
 _LEVELS = np.geomspace(0.015, 30.0, 12)
 _BALANCES = np.geomspace(1.0 / 8.0, 8.0, 5)
@@ -198,7 +201,7 @@ def averaged(full: Array, KMK: Array, both: Array, typical: tuple[float, float])
     size, count = len(full) - 1, len(spreads)
     values, answers, covariances = np.full(count, np.inf), np.zeros((count, size)), np.zeros((count, size, size))
     _answers(full, np.ascontiguousarray(KMK), np.ascontiguousarray(both), spreads, values, answers, covariances)
-    weight = prior * np.exp(-0.5 * (values - np.min(values)))
+    weight = prior * np.exp(-0.5 * _TRUST * (values - np.min(values)))
     weight[~np.isfinite(values)] = 0.0
     weight /= weight.sum()
     return np.einsum("k,kpq->pq", weight, covariances) + np.einsum("k,kp,kq->pq", weight, answers, answers)
