@@ -3,23 +3,31 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import signal
 
+import cv2
 import numpy as np
 import pytest
+from openarm_interfaces.msg import ObjectStateArray
 from openarm_interfaces.srv import ResetWorld
 from sensor_msgs.msg import CameraInfo, Image
+from tf2_msgs.msg import TFMessage
 
+from openarm_calibration.publisher import PublisherNode
+from openarm_common import se3
 from openarm_common.cameras import load_cameras
 from openarm_common.convert import (
     depth_to_metres,
     image_to_array,
     intrinsics_from_info,
+    pose_to_matrix,
     stamp_to_ns,
+    transform_to_matrix,
 )
-from openarm_common.node import QOS_SENSOR
+from openarm_common.node import QOS_SENSOR, QOS_STATIC_TF, QOS_TF
 
 
 def test_a26_a28_a30_images_info_and_joint_states_belong_together(seeing) -> None:
@@ -62,6 +70,48 @@ def test_a26_a28_a30_images_info_and_joint_states_belong_together(seeing) -> Non
     points = rays.deproject(np.stack([u, v], axis=-1), z[v, u].astype(float))
     heights = (points @ T[:3, :3].T + T[:3, 3])[:, 2]
     np.testing.assert_allclose(heights, 0.40, atol=1e-3)
+
+
+@pytest.mark.parametrize(("camera", "keyframe"), [("overhead", "home"), ("wrist", "wrist_look")])
+def test_p27_a30_a_cube_is_seen_where_camera_info_and_tf_say(bridge, camera: str, keyframe: str) -> None:
+    """Its eight corners, from the world over /tf and /tf_static into the image, outline the red pixels."""
+    bench = bridge()
+    bench.ros.add(PublisherNode())
+    assert bench.call(ResetWorld, "/sim/reset_world", keyframe=keyframe).success
+    images = bench.collect(Image, f"/{camera}/color/image_raw", QOS_SENSOR)
+    depths = bench.collect(Image, f"/{camera}/depth/image_raw", QOS_SENSOR)
+    infos = bench.collect(CameraInfo, f"/{camera}/color/camera_info", QOS_SENSOR)
+    truth = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
+    edges: dict[str, tuple[str, np.ndarray]] = {}
+
+    def on_tf(message: TFMessage) -> None:
+        for edge in message.transforms:
+            edges[edge.child_frame_id] = edge.header.frame_id, transform_to_matrix(edge.transform)
+
+    bench.ros.node.create_subscription(TFMessage, "/tf", on_tf, QOS_TF)
+    bench.ros.node.create_subscription(TFMessage, "/tf_static", on_tf, QOS_STATIC_TF)
+    bench.spin_sim(0.5)  # all is at rest, so that every stamp shows the same
+    bench.fresh(images, 2), bench.fresh(depths, 1), bench.fresh(infos, 1), bench.fresh(truth, 1)
+
+    T, frame = np.eye(4), images[-1].header.frame_id
+    while frame in edges:
+        frame, T_parent = edges[frame]
+        T = T_parent @ T
+    cube = next(o for o in truth[-1].objects if o.name == "red_cube")
+    half = 0.5 * np.array([cube.size.x, cube.size.y, cube.size.z])
+    corners = half * np.array(list(itertools.product((-1, 1), repeat=3)))
+    in_camera = se3.apply(se3.inverse(T) @ pose_to_matrix(cube.pose), corners)
+    outline = cv2.convexHull(intrinsics_from_info(infos[-1]).project(in_camera).astype(np.float32))
+    moments = cv2.moments(outline)
+    centre = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
+
+    pixels = image_to_array(images[-1]).astype(float)
+    red = (pixels[..., 0] > 2.0 * pixels[..., 1]) & (pixels[..., 0] > 2.0 * pixels[..., 2])
+    v, u = np.nonzero(red)
+    assert red.sum() == pytest.approx(moments["m00"], rel=0.02)  # nothing hides it
+    np.testing.assert_allclose([u.mean(), v.mean()], centre, atol=0.5)
+    nearest = depth_to_metres(depths[-1])[red].min()
+    assert nearest == pytest.approx(in_camera[:, 2].min(), abs=0.002)  # the nearest corner, to a pixel
 
 
 def test_p24_cameras_without_subscribers_draw_nothing(seeing) -> None:

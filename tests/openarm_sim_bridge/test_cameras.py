@@ -79,6 +79,26 @@ def test_a28_a29_depth_is_planar_within_a_millimetre(renderer: SnapshotRenderer,
     assert np.abs(depth[seen] * 1e-3 - expected[seen]).max() <= 1e-3
 
 
+@pytest.mark.parametrize("ball", [(0.05, 0.1, 0.2), (-0.2, -0.1, 0.3)])
+def test_a28_depth_of_a_sphere_is_that_of_the_ray_that_meets_it(
+    renderer: SnapshotRenderer, ball: tuple[float, float, float]
+) -> None:
+    radius = 0.05
+    state = snapshot(0.2, ball, radius=radius)
+    colour, depth = draw(renderer, state)
+    centre = se3.apply(se3.inverse(pose_of(state)), np.array(ball))
+    v, u = np.mgrid[0:240, 0:320]
+    rays = CAMERA.intrinsics.deproject(np.stack([u, v], axis=-1), np.ones((240, 320)))  # |z| = 1: t is planar depth
+    a, b, c = (rays**2).sum(axis=-1), rays @ centre, centre @ centre - radius**2
+    root = np.maximum(b * b - a * c, 0.0)
+    expected = (b - np.sqrt(root)) / a
+    # Not its rim, where the drawn facets (a sphere has none) turn away from the ray.
+    inside = root > 0.5 * root.max()
+    assert inside.sum() > 200
+    assert (colour[inside][:, 0] > 60).all()
+    assert np.abs(depth[inside] * 1e-3 - expected[inside]).max() <= 1e-3
+
+
 def test_p27_a30_a_point_is_seen_where_the_intrinsics_project_it(renderer: SnapshotRenderer) -> None:
     for ball in ((0.2, 0.1, 0.3), (-0.25, 0.3, 0.2), (0.1, -0.05, 0.5)):
         state = snapshot(0.2, ball, radius=0.03)
@@ -86,8 +106,11 @@ def test_p27_a30_a_point_is_seen_where_the_intrinsics_project_it(renderer: Snaps
         p_optical = se3.apply(se3.inverse(pose_of(state)), ball)
         red = (colour[..., 0] > 60) & (colour[..., 1] < 40)
         v, u = np.nonzero(red)
-        # The outline of a sphere is an ellipse whose centre lies a little further out than the sphere's.
-        np.testing.assert_allclose([u.mean(), v.mean()], CAMERA.intrinsics.project(p_optical), atol=1.0)
+        # The outline of a sphere is an ellipse whose centre lies a little further out than the sphere's: by the ratio
+        # of z² to z² - r², along the line to the principal point.
+        x, y, z = p_optical
+        apparent = np.array([x, y, z - 0.03**2 / z])
+        np.testing.assert_allclose([u.mean(), v.mean()], CAMERA.intrinsics.project(apparent), atol=0.5)
         assert depth[red].min() * 1e-3 == pytest.approx(p_optical[2] - 0.03, abs=0.004)
 
 
