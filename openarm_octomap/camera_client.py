@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from typing import Generic, TypeVar
 
@@ -25,7 +26,7 @@ MessageT = TypeVar("MessageT", Image, PointCloud2)
 _KEPT = 5
 
 
-class Source(Generic[MessageT]):
+class Source(ABC, Generic[MessageT]):
     """A stream of messages and what became of them.
 
     Attributes:
@@ -71,6 +72,11 @@ class Source(Generic[MessageT]):
             self.late += 1
         return None
 
+    @property
+    def waiting(self) -> int:
+        """Frames that wait for an update."""
+        return len(self._waiting)
+
     def took(self, t_ns: int) -> None:
         """Note that a frame is in the map."""
         self.used += 1
@@ -81,8 +87,9 @@ class Source(Generic[MessageT]):
         """Seconds of wall clock since a frame was last used; infinite before the first."""
         return (time.monotonic_ns() - self.used_at_ns) * 1e-9 if self.used_at_ns else float("inf")
 
+    @abstractmethod
     def _scan(self, message: MessageT, T_base_frame: np.ndarray) -> DepthScan | CloudScan:
-        raise NotImplementedError
+        """The scan of a message; OpenArmError where it does not fit."""
 
     def _keep(self, message: MessageT) -> None:
         self._waiting.append(message)

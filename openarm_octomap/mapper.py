@@ -6,6 +6,7 @@ A `Mapper` may be called from several threads; each call has the map to itself. 
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,12 +19,15 @@ from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.lattice import DEPTH, Lattice
 from openarm_common.octomap_codec import Payload, encode_states, read_file, write_file
-from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
+from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig, UnknownPolicy
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
 from openarm_octomap.self_filter import HeldBox, SelfFilter, Shapes
 
 Floats = NDArray[np.float32]
+
+#: Beyond any workspace, and still a whole number of cells, m.
+_FAR = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +62,21 @@ class Snapshot:
     binary: Payload
     full: Payload | None = None
     states: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What the map says at points.
+
+    Attributes:
+        states: (n,) UNKNOWN, FREE or OCCUPIED; a coarse cell is occupied when a part of it is.
+        blocked: (n,) whether to keep clear.
+        resolution: Edge of the cells that answered, m.
+    """
+
+    states: NDArray[np.uint8]
+    blocked: NDArray[np.bool_]
+    resolution: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,11 +229,38 @@ class Mapper:
         write_file(path, payload, self._grid.lattice.resolution)
         return payload.nodes
 
-    def load(self, path: Path) -> int:
+    def query(self, points: ArrayLike, resolution: float, unknown: UnknownPolicy) -> Answer:
+        """What the map says at points.
+
+        Args:
+            points: (n, 3), finite, m.
+            resolution: Largest cell that may answer, m; 0 is the map's own.
+            unknown: What unknown cells count as, and so does what lies outside of the workspace.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for points that are not finite, or a resolution finer than the map's.
+        """
+        at = np.asarray(points, np.float64).reshape(-1, 3)
+        if not np.isfinite(at).all():
+            raise OpenArmError(Code.INVALID_ARGUMENT, "points are not finite; expected metres in the base frame")
+        edge = self._grid.lattice.resolution
+        # a hair of tolerance: 0.04 means cells of twice 0.02
+        if not (resolution == 0.0 or edge * (1.0 - 1e-6) <= resolution < math.inf):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"resolution is {resolution:g} m; expected 0 or at least the map's {edge:g} m"
+            )
+        levels = math.floor(math.log2(resolution / edge) + 1e-6) if resolution > 0.0 else 0
+        depth = max(DEPTH - levels, 1)
+        at = np.clip(at, -_FAR, _FAR)
+        with self._lock:
+            states, blocked = self._grid.states_at(at, depth), self._grid.blocked_at(at, unknown, depth)
+        return Answer(states, blocked, edge * 2 ** (DEPTH - depth))
+
+    def load(self, path: Path) -> tuple[int, int]:
         """Replace the map by that of a file.
 
         Returns:
-            How many of its leaves lie outside of the workspace.
+            Nodes of its tree, and how many of its leaves lie outside of the workspace.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, when the file is damaged or has cells of another size; the map is as it was.
@@ -222,7 +268,7 @@ class Mapper:
         leaves = read_file(path)
         with self._lock:
             try:
-                return self._grid.load(leaves)
+                return leaves.nodes, self._grid.load(leaves)
             except OpenArmError as error:
                 raise OpenArmError(error.code, f"{path}: {error.message}") from error
 

@@ -11,13 +11,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from octomap_msgs.srv import BoundingBoxQuery, GetOctomap
 from sensor_msgs.msg import Image, PointCloud2
-from std_srvs.srv import Empty, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common.cameras import load_cameras
-from openarm_common.convert import xyz
 from openarm_common.distance_field import CameraMoment, DistanceFieldWriter, field_path
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.housings import with_housings
@@ -26,10 +23,10 @@ from openarm_common.tf import RobotStateListener
 from openarm_octomap import convert
 from openarm_octomap.camera_client import CloudSource, DepthSource, Source
 from openarm_octomap.config import OctomapNodeConfig
-from openarm_octomap.kernels import FREE, UNKNOWN
 from openarm_octomap.map_publisher import MapPublisher
 from openarm_octomap.mapper import Frame, Mapper, Report
 from openarm_octomap.self_filter import HeldBox
+from openarm_octomap.service_executor import MapServices
 
 
 class OctomapNode(BaseNode[OctomapNodeConfig]):
@@ -57,18 +54,8 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
         self._fault = ""
         self._field = self._open_field() if config.field.enabled else None
         self._publisher = MapPublisher(self, full=config.publish_full)
-        # not read-only, unlike the others: ~/save and ~/load take the file from here
-        self.declare_parameter("file", config.map_file)
         self.create_subscription(MarkerArray, config.held_topic, self._on_held, QOS_LATCHED)
-        self.create_service(GetOctomap, "octomap_binary", self._on_binary)
-        self.create_service(GetOctomap, "octomap_full", self._on_full)
-        for depth in config.coarse_depths:
-            self.create_service(GetOctomap, f"~/depth_{depth}/octomap_binary", self._answer_at(depth))
-        self.create_service(BoundingBoxQuery, "~/clear_bbox", self._clear_to(FREE))
-        self.create_service(BoundingBoxQuery, "~/forget_bbox", self._clear_to(UNKNOWN))
-        self.create_service(Empty, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/save", self._on_save)
-        self.create_service(Trigger, "~/load", self._on_load)
+        MapServices(self, self._mapper, config.coarse_depths, lambda: self._t_ns, self._show)
         self.create_timer(config.period, self._on_timer, clock=self.wall_clock)
         self.create_timer(1.0, self._report, clock=self.wall_clock)
         if config.map_file:
@@ -79,6 +66,11 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
         super().close()
         if self._field is not None:
             self._field.close()
+
+    @property
+    def idle(self) -> bool:
+        """Whether no update runs and no frame waits for one."""
+        return not self._busy and not any(source.waiting for source in self._sources)
 
     # --- updates
     async def _on_timer(self) -> None:
@@ -134,69 +126,6 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
             self._held = convert.held_from_msg(message)
         except OpenArmError as error:
             self.get_logger().warning(f"{self.config.held_topic}: {error.message}")
-
-    # --- services
-    def _on_binary(self, _: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
-        snapshot = self._mapper.snapshot()
-        response.map = convert.octomap_msg(snapshot.binary, snapshot.lattice.resolution, self._t_ns)
-        return response
-
-    def _on_full(self, _: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
-        snapshot = self._mapper.snapshot({"full"})
-        if snapshot.full is not None:
-            response.map = convert.octomap_msg(snapshot.full, snapshot.lattice.resolution, self._t_ns)
-        return response
-
-    def _answer_at(self, depth: int) -> Any:
-        def answer(_: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
-            lattice, payload = self._mapper.coarse(depth)
-            response.map = convert.octomap_msg(payload, lattice.resolution, self._t_ns)
-            return response
-
-        return answer
-
-    def _clear_to(self, state: int) -> Any:
-        def clear(request: BoundingBoxQuery.Request, response: BoundingBoxQuery.Response) -> BoundingBoxQuery.Response:
-            try:
-                self._mapper.clear_box(xyz(request.min), xyz(request.max), state)
-                self._show()
-            except OpenArmError as error:  # the service has no field for a reason
-                self.get_logger().error(str(error))
-            return response
-
-        return clear
-
-    def _on_reset(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
-        self._mapper.reset()
-        self._show()
-        return response
-
-    def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            path = self._file()
-            nodes = self._mapper.save(path)
-            response.success, response.message = True, f"{path}: {nodes} nodes"
-        except OpenArmError as error:
-            response.message = str(error)
-        return response
-
-    def _on_load(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            path = self._file()
-            outside = self._mapper.load(path)
-            self._show()
-            response.success, response.message = True, f"{path} loaded; {outside} leaves outside of the workspace"
-        except OpenArmError as error:
-            response.message = str(error)
-        return response
-
-    def _file(self) -> Path:
-        name = str(self.get_parameter("file").value)
-        if not name:
-            raise OpenArmError(
-                Code.INVALID_ARGUMENT, "no file: set the parameter `file` to a path that ends in .bt or .ot"
-            )
-        return Path(name).expanduser()
 
     # --- health
     def _report(self) -> None:

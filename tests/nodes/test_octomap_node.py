@@ -13,9 +13,10 @@ from geometry_msgs.msg import Point
 from nav_msgs.msg import OccupancyGrid
 from octomap_msgs.msg import Octomap
 from octomap_msgs.srv import BoundingBoxQuery, GetOctomap
+from openarm_interfaces.srv import ClearMap, MapFile, QueryMap
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
-from std_srvs.srv import Empty, Trigger
+from std_srvs.srv import Empty
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -29,6 +30,7 @@ from openarm_common.convert import (
     matrix_to_transform,
     ns_to_stamp,
     points_from_cloud,
+    stamp_to_ns,
 )
 from openarm_common.description import RobotDescription
 from openarm_common.distance_field import DistanceFieldReader, field_path
@@ -183,42 +185,80 @@ def test_a75_coarse_maps_are_answered(bench) -> None:
 
 def test_p06_reset_is_visible_at_once_and_boxes_are_cleared(bench) -> None:
     bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
+    # an update under way would put back what it saw
+    bench.ros.spin_until(lambda: bench.node.idle, 10.0, "all images are in the map")
     box = BoundingBoxQuery.Request(min=Point(x=0.4, y=0.2, z=0.38), max=Point(x=0.5, y=0.3, z=0.44))
     bench.call(BoundingBoxQuery, "/octomap/clear_bbox", box)
     bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", 5.0, "the box is free")
-    bench.call(BoundingBoxQuery, "/octomap/forget_bbox", box)
+    answer = bench.call(ClearMap, "/octomap/clear", ClearMap.Request(min=box.min, max=box.max, state="unknown"))
+    assert (answer.success, answer.code, answer.cells) == (True, "OK", 6 * 6 * 4)
     bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", 5.0, "the box is unknown")
+    answer = bench.call(ClearMap, "/octomap/clear", ClearMap.Request(min=box.min, max=box.max))
+    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", 5.0, "the box is free")
     bench.call(Empty, "/octomap/reset")
     bench.ros.spin_until(lambda: len(bench.maps[-1].data) == 0, 5.0, "the map is empty")
     wrong = BoundingBoxQuery.Request(min=Point(x=1.0), max=Point(x=0.0))
     bench.call(BoundingBoxQuery, "/octomap/clear_bbox", wrong)
+    for request, text in (
+        (ClearMap.Request(min=wrong.min, max=wrong.max), "the lower one first"),
+        (ClearMap.Request(min=Point(x=float("nan"))), "expected finite corners"),
+        (ClearMap.Request(state="gone"), "valid: free, unknown"),
+    ):
+        answer = bench.call(ClearMap, "/octomap/clear", request)
+        assert (answer.success, answer.code) == (False, "INVALID_ARGUMENT")
+        assert text in answer.message
+
+
+def test_a75_points_are_answered_by_cells_of_any_size_with_a_policy_for_unknown_ones(bench) -> None:
+    bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
+    points = [Point(x=x, y=y, z=z) for x, y, z in (ON_TABLE, (0.45, 0.25, 0.45), (0.45, 0.25, 0.2), (9.0, 0.0, 0.0))]
+
+    def ask(**fields) -> QueryMap.Response:
+        return bench.call(QueryMap, "/octomap/query", QueryMap.Request(points=points, **fields))
+
+    fine = ask()
+    assert fine.success, fine.message
+    assert list(fine.states) == [fine.OCCUPIED, fine.FREE, fine.UNKNOWN, fine.UNKNOWN]
+    assert list(fine.blocked) == [True, False, True, True]
+    assert (fine.resolution, stamp_to_ns(fine.stamp) > 0) == (0.02, True)
+    assert list(ask(unknown="free").blocked) == [True, False, False, False]
+    coarse = ask(resolution=0.3)  # the largest cells not larger than this
+    assert coarse.resolution == pytest.approx(0.16)
+    assert list(coarse.states)[:2] == [coarse.OCCUPIED, coarse.OCCUPIED]
+    for fields, text in (({"resolution": 0.01}, "at least the map's 0.02 m"), ({"unknown": "maybe"}, "occupied, free")):
+        answer = ask(**fields)
+        assert (answer.success, answer.code) == (False, "INVALID_ARGUMENT")
+        assert text in answer.message
+    points.append(Point(x=float("inf")))
+    assert "not finite" in ask().message
 
 
 def test_maps_are_saved_and_loaded_and_damaged_files_leave_the_map_alone(bench, tmp_path) -> None:
     bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
-    assert "no file" in bench.call(Trigger, "/octomap/save").message
 
-    def file(path: Path) -> None:
-        bench.node.set_parameters([Parameter("file", value=str(path))])
+    def file(name: str, path: object) -> MapFile.Response:
+        return bench.call(MapFile, f"/octomap/{name}", MapFile.Request(path=str(path)))
 
+    assert "path is empty" in bench.call(MapFile, "/octomap/save").message
+    assert "needs the suffix" in file("save", tmp_path / "map.pcd").message
     for suffix in (".bt", ".ot"):
-        file(tmp_path / f"map{suffix}")
-        answer = bench.call(Trigger, "/octomap/save")
+        answer = file("save", tmp_path / f"map{suffix}")
         assert answer.success, answer.message
+        assert answer.nodes > 1000
     (tmp_path / "damaged.bt").write_bytes((tmp_path / "map.bt").read_bytes()[:-5])
     (tmp_path / "map.pcd").write_text("VERSION .7")
     before = bytes(bench.call(GetOctomap, "octomap_full").map.data)
     for name, text in (("damaged.bt", "octree is damaged"), ("map.pcd", "not an octree"), ("none.bt", "can't be read")):
-        file(tmp_path / name)
-        answer = bench.call(Trigger, "/octomap/load")
-        assert not answer.success
+        answer = file("load", tmp_path / name)
+        assert (answer.success, answer.code) == (False, "INVALID_ARGUMENT")
         assert text in answer.message
     assert bytes(bench.call(GetOctomap, "octomap_full").map.data) == before
     for suffix in (".bt", ".ot"):
+        bench.ros.spin_until(lambda: bench.node.idle, 10.0, "all images are in the map")
         bench.call(Empty, "/octomap/reset")
         bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", 5.0, "the map is empty")
-        file(tmp_path / f"map{suffix}")
-        assert bench.call(Trigger, "/octomap/load").success
+        answer = file("load", tmp_path / f"map{suffix}")
+        assert (answer.success, answer.outside) == (True, 0)
         bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "occupied", 5.0, "the map is back")
 
 
