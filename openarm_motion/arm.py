@@ -290,6 +290,7 @@ class Arm:
             edge_free=edge_free,
             cost=lambda a, b: segment_time(a, b, limits),
             time_limit=time_limit,
+            iterations=search.iterations,
             seed=search.seed,
             stopped=now.stopped,
             fast=cache(lambda: FastScene([scene], scene.distances)),

@@ -194,6 +194,7 @@ class BothArms:
             edge_free=lambda a, b: scene.edge_free(a, b, step, travel),
             cost=lambda a, b: segment_time(a, b, limits),
             time_limit=time_limit,
+            iterations=search.iterations,
             seed=search.seed,
             stopped=stopped,
             fast=cache(lambda: FastScene([scene.first, scene.second], scene.first.distances)),

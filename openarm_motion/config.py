@@ -53,6 +53,9 @@ class PlanningConfig(Config):
     )
     swivels: int = Field(default=48, ge=4, le=720, description="elbow angles tried a turn")
     time_limit: float = Field(default=5.0, gt=0.0, le=120.0, description="of a search, s of wall clock")
+    iterations: int = Field(
+        default=0, ge=0, description="samples of a search, which then may take as long as it takes; 0: limited by time"
+    )
     seed: int = Field(default=1, ge=1, description="of random numbers; the same request gives the same plan")
     edge_step: float = Field(default=0.05, gt=0.0, le=0.2, description="joint turn between two collision checks, rad")
     edge_travel: float = Field(default=0.02, gt=0.0, le=0.1, description="travel of any point between two checks, m")

@@ -102,7 +102,8 @@ class FastPlanner:
                 break
             if query.stopped():
                 raise _cancelled()
-            if time.monotonic() > end or int(counts.max()) >= _ROOM:
+            spent = chunk * _CHUNK >= query.iterations if query.iterations else time.monotonic() > end
+            if spent or int(counts.max()) >= _ROOM:
                 return None
         there, back = _branch(parents[0], a), _branch(parents[1], b)
         path = np.concatenate([trees[0, there[::-1]], trees[1, back[1:]]])

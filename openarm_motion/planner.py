@@ -53,6 +53,8 @@ class PlanQuery:
         edge_free: Whether the straight joint line between two configurations is free, ends included.
         cost: Of a straight segment from rest to rest, for example its duration; what shortening makes small.
         time_limit: Wall clock, s.
+        iterations: Samples of the search, in place of the time limit; 0 leaves it to the time. The same query then ends
+            the same way on a busy machine.
         seed: Of the random numbers: the same query gives the same path.
         stopped: Asked often; planning ends with CANCELLED when it says True.
         fast: Makes the fast layer's view of the same; None leaves the two questions above.
@@ -68,6 +70,7 @@ class PlanQuery:
     edge_free: Callable[[Array, Array], bool]
     cost: Callable[[Array, Array], float] = _length
     time_limit: float = 5.0
+    iterations: int = 0
     seed: int = 1
     stopped: Callable[[], bool] = field(default=never)
     fast: Callable[[], FastScene] | None = None
@@ -158,15 +161,20 @@ class OmplPlanner:
             planner.setRange(self._range)
             planner.setProblemDefinition(problem)
             planner.setup()
-        end = time.monotonic() + query.time_limit
-        condition = ob.PlannerTerminationCondition(lambda: time.monotonic() > end or query.stopped())
-        planner.solve(condition)
+        end, looks = time.monotonic() + query.time_limit, itertools.count()
+
+        def enough() -> bool:  # asked once a sample
+            limit = next(looks) >= query.iterations if query.iterations else time.monotonic() > end
+            return limit or query.stopped()
+
+        planner.solve(ob.PlannerTerminationCondition(enough))
         if query.stopped():
             raise _cancelled()
         if not problem.hasExactSolution():
+            limit = f"{query.iterations} samples" if query.iterations else f"{query.time_limit:g} s"
             raise OpenArmError(
                 Code.NO_PLAN,
-                f"no free path to any of {len(query.goals)} goal(s) within {query.time_limit:g} s"
+                f"no free path to any of {len(query.goals)} goal(s) within {limit}"
                 f" ({edges.count} lines checked); allow more time, or move what is in the way",
             )
         states = problem.getSolutionPath().getStates()

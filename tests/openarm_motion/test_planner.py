@@ -151,6 +151,37 @@ def test_what_has_no_way_is_given_up_in_time() -> None:
     assert time.monotonic() - begin < 1.5
 
 
+def test_n18_samples_limit_a_search_in_place_of_time() -> None:
+    seen = 0
+
+    def collides(q: np.ndarray) -> bool:
+        nonlocal seen
+        seen += 1
+        return bool(abs(q[0]) < 0.1)
+
+    def give_up(iterations: int) -> int:
+        nonlocal seen
+        seen = 0
+        nothing = PlanQuery(
+            start=np.array([-0.5, 0.0]),
+            goals=np.array([[0.5, 0.0]]),
+            lower=np.full(2, -1.0),
+            upper=np.full(2, 1.0),
+            collides=collides,
+            edge_free=lambda a, b: a[0] * b[0] > 0.0,
+            time_limit=1e-9,
+            iterations=iterations,
+        )
+        with pytest.raises(OpenArmError, match=f"within {iterations} samples"):
+            OmplPlanner().plan(nothing)
+        return seen
+
+    few = give_up(100)
+    assert few > 10
+    assert few == give_up(100)
+    assert give_up(400) > 2 * few
+
+
 def test_a_plan_can_be_stopped(right: Arm, home: dict[str, float]) -> None:
     scene = right.scene(home)
     asked = []
