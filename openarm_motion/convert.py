@@ -36,6 +36,11 @@ def boxes_from_msg(messages: Sequence[CollisionBox]) -> tuple[Box, ...]:
     return tuple(Box(box.id, pose_to_matrix(box.pose), xyz(box.size)) for box in messages)
 
 
+def box_msg(box: Box) -> CollisionBox:
+    """Message of a box; the frame is what the using message states."""
+    return CollisionBox(id=box.id, pose=matrix_to_pose(box.T), size=vector(box.size))
+
+
 def solid_from_msg(message: CollisionObject, pose: Callable[[PoseStamped], Array]) -> Solid:
     """A body of the planning scene; `pose` brings its pose to the base frame.
 

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion node asked by `MotionClient`, from another thread."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from openarm_interfaces.msg import ArmTarget
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.client import MotionClient
+from openarm_motion.solids import Sphere, box_from
+
+
+def asked(bench, work: Callable[[MotionClient], Any]) -> Any:
+    """What a program does with the client, while the graph spins here."""
+    out: list[Any] = []
+    faults: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            with MotionClient() as motion:
+                out.append(work(motion))
+        except BaseException as error:
+            faults.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    bench.ros.spin_until(lambda: not thread.is_alive(), 40.0, "the program")
+    if faults:
+        raise faults[0]
+    return out[0]
+
+
+def test_a_program_plans_agrees_and_moves(bench) -> None:
+    told: list[tuple[str, float]] = []
+
+    def work(motion: MotionClient) -> None:
+        plan = motion.move_to_named("right", "official_home", scale=1.0, plan_only=True).raise_for_code()
+        assert plan.scene_version == 1
+        assert plan.trajectories[0].q.shape[1] == 7
+        assert motion.execute("right", plan).raise_for_code().message == "arrived"
+        q = motion.compute_ik("right", se3.make(bench.DOWN, (0.26, -0.24, 0.55)))
+        motion.move_to_joints("right", q, scale=1.0, on_feedback=lambda *stage: told.append(stage)).raise_for_code()
+        T = se3.make(bench.DOWN, (0.26, -0.24, 0.50))
+        motion.move_on_line("right", T, scale=1.0).raise_for_code()
+
+    asked(bench, work)
+    tip = bench.node._arms["right"].kinematics.fk(bench.q("right"))
+    np.testing.assert_allclose(tip[:3, 3], (0.26, -0.24, 0.50), atol=2e-3)
+    assert told[0][0] == "planning"
+    assert told[-1][0] == "executing"
+
+
+def test_a_program_changes_the_scene_and_reads_why_there_is_no_plan(bench) -> None:
+    tip = bench.node._arms["right"].kinematics.fk([0, 0, 0, 1.5708, 0, 0, 0])
+
+    def work(motion: MotionClient) -> None:
+        assert motion.apply_scene([Sphere("ball", se3.make(None, tip[:3, 3]), 0.05)]) == 2
+        assert [o.id for o in motion.scene().objects] == ["table", "ball"]
+        result = motion.move_to_named("right", "official_home")
+        assert (result.success, result.code) == (False, Code.IN_COLLISION)
+        assert result.failure is not None
+        assert (result.failure.stage, result.failure.second) == ("goal", "ball")
+        assert result.failure.alternative is not None
+        assert motion.move_to_joints("right", result.failure.alternative, scale=1.0).success
+        with pytest.raises(OpenArmError, match="can't remove 'cup'"):
+            motion.apply_scene(remove=["cup"])
+        assert motion.apply_scene(clear=True) == 3
+        crate = box_from("crate", tip[:3, 3], (0.1, 0.1, 0.1))
+        blocked = motion.move_to_pose("right", tip, obstacles=[crate])
+        assert blocked.failure is not None
+        assert blocked.failure.second == "crate"
+        with pytest.raises(OpenArmError) as caught:
+            motion.compute_ik("left", np.eye(4))
+        assert caught.value.code == Code.UNREACHABLE
+
+    asked(bench, work)
+
+
+def test_a_program_moves_both_arms(bench) -> None:
+    targets = [ArmTarget(arm=arm, kind=ArmTarget.NAMED, named="official_home") for arm in ("left", "right")]
+    result = asked(bench, lambda motion: motion.move_both(targets, scale=1.0))
+    assert result.success, result.message
+    assert [t.names[0] for t in result.trajectories] == ["openarm_left_joint1", "openarm_right_joint1"]
+    np.testing.assert_allclose(bench.q("left")[3], 1.5708, atol=1e-3)
