@@ -7,7 +7,7 @@ Everything that is planned goes through here; it holds no state between requests
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
+from openarm_motion.blending import time_blended, time_quintic
 from openarm_motion.cartesian import Line
 from openarm_motion.certificate import Certificate, certify
 from openarm_motion.collision import Box, CollisionScene, Contact, Surroundings
@@ -23,10 +24,10 @@ from openarm_motion.collision_robot import CollisionRobot
 from openarm_motion.config import MotionConfig
 from openarm_motion.failure import PlanFailedError
 from openarm_motion.fast import FastScene
-from openarm_motion.fast_planner import FastPlanner
 from openarm_motion.inverse import InverseKinematics
 from openarm_motion.kinematics import ArmKinematics
-from openarm_motion.planner import OmplPlanner, PlannedPath, Planner, PlanQuery, never
+from openarm_motion.planner import PlannedPath, Planner, PlanQuery, never
+from openarm_motion.planners import make_planner
 from openarm_motion.seen import NOTHING, Known
 from openarm_motion.trajectory import JointLimits, Trajectory, profile, time_path, time_polyline
 
@@ -97,7 +98,7 @@ class Arm:
         self.inverse = InverseKinematics(self.kinematics, config.planning.swivels)
         self.robot = CollisionRobot(description, self.kinematics)
         self.static: tuple[Box, ...] = tuple(static)
-        self._planner: Planner = planner or (FastPlanner() if config.planning.planner == "fast" else OmplPlanner())
+        self._planner: Planner = planner or make_planner(config.planning.planner)
         limits = config.limits
         if len(limits.velocity) != self.kinematics.n:
             raise OpenArmError(
@@ -262,11 +263,11 @@ class Arm:
         fault, contact = "", None
         for fineness in _FINENESS:
             path = self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
-            trajectory = self.time_free(path, now.scale)
-            try:
-                return CertifiedPlan(path, trajectory, certify(scene, trajectory))
-            except PlanFailedError as error:
-                fault, contact = error.message, error.contact
+            for trajectory in self.timings(path, now.scale):
+                try:
+                    return CertifiedPlan(path, trajectory, certify(scene, trajectory))
+                except PlanFailedError as error:
+                    fault, contact = error.message, error.contact
         text = f"the {self.name} arm's plan did not pass the dense look: {fault}"
         raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
 
@@ -298,9 +299,16 @@ class Arm:
             limits=(limits.velocity, limits.acceleration, limits.jerk),
         )
 
-    def time_free(self, path: PlannedPath, scale: float) -> Trajectory:
-        """Timed free path, at rest in its corners."""
-        return time_polyline(self.names, path.waypoints, self.limits(scale), self.config.planning.period)
+    def timings(self, path: PlannedPath, scale: float) -> Iterator[Trajectory]:
+        """Timed free paths, the best first; the last one is at rest in the corners, where nothing leaves the path."""
+        asked = (self.names, path.waypoints, self.limits(scale), self.config.planning.period)
+        timing = self.config.planning.timing
+        if timing == "quintic":
+            yield time_quintic(*asked)
+            return
+        if timing == "blended" and len(path.waypoints) > 2:
+            yield time_blended(*asked)
+        yield time_polyline(*asked)
 
     def time_line(self, line: Line, scale: float) -> Trajectory:
         """Timed straight line."""

@@ -47,7 +47,15 @@ class StraightClearance(Clearance):
 class PlanningConfig(Config):
     """How plans are searched for."""
 
-    planner: Literal["fast", "ompl"] = Field(default="fast", description="what searches for free paths")
+    planner: str = Field(
+        default="fast",
+        pattern=r"^(fast|ompl|[A-Za-z_][\w.]*:[A-Za-z_]\w*)$",
+        description="what searches for free paths: fast, ompl, or package.module:Class of another one",
+    )
+    timing: Literal["blended", "stops", "quintic"] = Field(
+        default="blended",
+        description="corners of free paths: rounded where that is proven free, with a stop, or quintic with a stop",
+    )
     joint_margin: float = Field(
         default=0.05, ge=0.0, le=0.5, description="kept from joint limits at goals and on lines, rad"
     )

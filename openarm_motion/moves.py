@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.arm import Arm, Situation, first_contact, segment_time
 from openarm_motion.cartesian import line_contact, solve_line
+from openarm_motion.certificate import certify
 from openarm_motion.collision import Box, CollisionScene
 from openarm_motion.failure import PlanFailedError
 from openarm_motion.trajectory import Trajectory
@@ -85,7 +86,7 @@ def to_pose(arm: Arm, now: Situation, pose: Array, around: Around, *, free_orien
 
 
 def to_pose_on_line(arm: Arm, now: Situation, pose: Array, around: Around) -> Trajectory:
-    """Straight line of the tool to a pose (4, 4), without a change of branch.
+    """Straight line of the tool to a pose (4, 4), without a change of branch, looked at densely when it is timed.
 
     Raises:
         OpenArmError: UNREACHABLE, saying where the line ends and why; IN_COLLISION, naming the pair.
@@ -104,9 +105,16 @@ def to_pose_on_line(arm: Arm, now: Situation, pose: Array, around: Around) -> Tr
             faults.append(PlanFailedError(error.code, error.message, "line"))
             continue
         contact = line_contact(scene, line)
-        if contact is None:
-            return arm.time_line(line, now.scale)
-        faults.append(PlanFailedError(Code.IN_COLLISION, f"on the straight line {contact}", "line", contact))
+        if contact is not None:
+            faults.append(PlanFailedError(Code.IN_COLLISION, f"on the straight line {contact}", "line", contact))
+            continue
+        trajectory = arm.time_line(line, now.scale)
+        try:
+            certify(scene, trajectory)
+        except PlanFailedError as error:
+            faults.append(error)
+            continue
+        return trajectory
     worst = next((fault for fault in faults if fault.code == Code.IN_COLLISION), faults[0])
     raise PlanFailedError(worst.code, f"{arm.name} arm: {worst.message}", "line", worst.contact)
 

@@ -27,7 +27,7 @@ _FINE = 400
 #: A path shorter than this, rad or m, is none.
 _NOTHING = 1e-9
 #: Two samples are at least this far apart, s.
-_SPACING = 1e-3
+SPACING = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +165,7 @@ def time_polyline(names: Sequence[str], waypoints: Array, limits: JointLimits, p
         q = start + s[:, None] * difference
         q[-1] = end
         parts.append(_at_rest(tuple(names), t, q, ds[:, None] * difference, dds[:, None] * difference))
-    return _joined(tuple(names), parts, waypoints[0], period)
+    return joined(tuple(names), parts, waypoints[0], period)
 
 
 def time_path(
@@ -185,7 +185,7 @@ def time_path(
         period: Greatest time between two samples, s.
     """
     if s[-1] < _NOTHING:
-        return _joined(tuple(names), [], path[0], period)
+        return joined(tuple(names), [], path[0], period)
     curve = make_interp_spline(s, path, k=5)
     d1, d2, d3 = (curve.derivative(k) for k in (1, 2, 3))
     fine = np.linspace(0.0, float(s[-1]), _FINE)
@@ -213,9 +213,9 @@ def _sample_times(way: Profile, period: float) -> Array:
     """Grid of at most `period`, joined with the borders of the pieces; grid points next to a border give way."""
     grid = np.linspace(0.0, way.duration, max(2, int(np.ceil(way.duration / period)) + 1))
     borders = np.concatenate([way.t, [way.duration]])
-    borders = borders[np.concatenate([[True], np.diff(borders) > _SPACING])]
+    borders = borders[np.concatenate([[True], np.diff(borders) > SPACING])]
     borders[-1] = way.duration
-    far = np.min(np.abs(grid[:, None] - borders[None, :]), axis=1) > _SPACING
+    far = np.min(np.abs(grid[:, None] - borders[None, :]), axis=1) > SPACING
     return np.sort(np.concatenate([grid[far], borders]))
 
 
@@ -226,7 +226,7 @@ def _at_rest(names: tuple[str, ...], t: Array, q: Array, v: Array, a: Array) -> 
     return Trajectory(names, t, q, v, a)
 
 
-def _joined(names: tuple[str, ...], parts: list[Trajectory], q: Array, period: float) -> Trajectory:
+def joined(names: tuple[str, ...], parts: list[Trajectory], q: Array, period: float) -> Trajectory:
     """Parts one after the other, each beginning at rest where the last ended; a rest of one period without any."""
     if not parts:
         rest = np.zeros((2, q.size))

@@ -28,7 +28,7 @@ def test_a68_a_planned_trajectory_is_certified_with_no_point_moving_far_between_
     scene = right.scene(home)
     path = across(right, home)
     planned = right.plan(scene, Situation(home, path.waypoints[0]), path.waypoints[1:], 5.0)
-    certificate = certify(scene, right.time_free(planned, 0.5))
+    certificate = certify(scene, [*right.timings(planned, 0.5)][-1])
     way = float(np.sum(np.abs(np.diff(planned.waypoints, axis=0)) @ scene.levers))
     assert certificate.states >= way / certificate.travel
     assert certificate.share == 0.5
@@ -37,7 +37,7 @@ def test_a68_a_planned_trajectory_is_certified_with_no_point_moving_far_between_
 def test_a_trajectory_through_a_thin_sheet_is_refused_with_the_time_and_the_pair(
     right: Arm, home: dict[str, float]
 ) -> None:
-    trajectory = right.time_free(across(right, home), 0.5)
+    trajectory = [*right.timings(across(right, home), 0.5)][-1]
     sheet = box_from("sheet", (0.32, -0.21, 0.6), (0.5, 0.001, 0.4))
     with pytest.raises(OpenArmError, match=r"after \d\.\d\d s of the trajectory openarm_right_.* sheet") as caught:
         certify(right.scene(home, [sheet]), trajectory)
