@@ -63,7 +63,10 @@ class PhysicsConfig(Config):
     impratio: float = Field(default=10.0, ge=1.0, le=1000.0, description="friction impedance over normal impedance")
     iterations: int = Field(default=100, ge=1, le=1000, description="of the solver, at most")
     noslip_iterations: int = Field(default=4, ge=0, le=100, description="of the no-slip pass")
-    jacobian: Literal["dense", "sparse", "auto"] = Field(default="dense", description="of the constraints")
+    jacobian: Literal["dense", "sparse", "auto"] = Field(
+        default="auto",
+        description="of the constraints; auto: sparse from eight objects on, where it takes less time",
+    )
     contact_solref: tuple[float, float] = Field(default=(0.005, 1.0), description="time constant (s) and damping ratio")
     contact_solimp: tuple[float, float, float, float, float] = Field(
         default=(0.95, 0.99, 0.001, 0.5, 2.0), description="impedance of contacts and of the finger coupling"

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import itertools
+import time
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -11,7 +14,7 @@ from scipy.optimize import least_squares
 from openarm_common.cameras import load_cameras
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import Scene, load_scene
+from openarm_common.scene import Scene, SceneObject, load_scene
 from openarm_sim_bridge.actuation import TrajectoryConfig, TrajectoryOutcome
 from openarm_sim_bridge.config import BridgeConfig
 from openarm_sim_bridge.controller import RobotController
@@ -190,3 +193,38 @@ def test_mount_seed_none_is_the_nominal_mounts() -> None:
     assert BridgeConfig(mount_seed=3).mount_seed == 3
     with pytest.raises(ValidationError, match="mount_seed"):
         BridgeConfig(mount_seed=-2)
+
+
+def test_thirty_objects_stand_still_in_real_time(stage: Stage) -> None:
+    """Half of a tick is left for everything else; time of this thread, so that a busy machine does not count."""
+    sizes = itertools.cycle(
+        [("box", (0.05, 0.05, 0.05)), ("cylinder", (0.05, 0.05, 0.08)), ("box", (0.04, 0.06, 0.08))]
+    )
+    spots = itertools.product(np.linspace(0.16, 0.76, 6), np.linspace(-0.5, 0.5, 5))
+    items = [
+        SceneObject(name=f"o{i}", label=f"l{i}", shape=shape, size=size, color="red", position=(x, y), yaw=0.1 * i)
+        for i, ((x, y), (shape, size)) in enumerate(zip(spots, itertools.cycle(kinds), strict=False))
+    ]
+    world = stage.world(Scene(objects=tuple(items)))
+    assert len(world.objects()) == 30
+    for _ in range(30):
+        world.step_tick()
+    before = np.array([o.T_world_object for o in world.objects()])
+    spent: list[float] = []
+    for _ in range(100):
+        began = time.thread_time()
+        world.step_tick()
+        spent.append(time.thread_time() - began)
+    assert np.percentile(spent, 95) < 0.005
+    np.testing.assert_allclose([o.T_world_object for o in world.objects()], before, atol=1e-4)
+
+
+def test_p25_a_keyframe_is_a_posture_of_both_arms(stage: Stage) -> None:
+    look, home = stage.posture("wrist_look"), stage.posture("home")
+    assert home == stage.home
+    assert look.keys() == home.keys()
+    assert look["openarm_right_joint2"] == pytest.approx(2.46)
+    assert {name: look[name] for name in look if "left" in name} == {n: home[n] for n in home if "left" in n}
+    with pytest.raises(OpenArmError, match=r"no keyframe 'bow'; keyframes: .*hands_up, home.*zero") as caught:
+        stage.posture("bow")
+    assert caught.value.code is Code.INVALID_ARGUMENT
