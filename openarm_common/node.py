@@ -251,7 +251,8 @@ class _Signals:
         while self._reader.recv(1)[0] not in _ENDING:
             pass
         executor = self.node.executor if self.node is not None else None
-        if self.node is not None and executor is not None:
+        # In lock-step nothing moves any more: simulated time waits for a node that ends.
+        if self.node is not None and executor is not None and not self.node.lockstep:
             rested = threading.Event()
             executor.create_task(self.node.hold).add_done_callback(lambda _: rested.set())
             rested.wait(_HOLD)
