@@ -197,9 +197,7 @@ def test_mount_seed_none_is_the_nominal_mounts() -> None:
 
 def test_thirty_objects_stand_still_in_real_time(stage: Stage) -> None:
     """Half of a tick is left for everything else; time of this thread, so that a busy machine does not count."""
-    sizes = itertools.cycle(
-        [("box", (0.05, 0.05, 0.05)), ("cylinder", (0.05, 0.05, 0.08)), ("box", (0.04, 0.06, 0.08))]
-    )
+    kinds = [("box", (0.05, 0.05, 0.05)), ("cylinder", (0.05, 0.05, 0.08)), ("box", (0.04, 0.06, 0.08))]
     spots = itertools.product(np.linspace(0.16, 0.76, 6), np.linspace(-0.5, 0.5, 5))
     items = [
         SceneObject(name=f"o{i}", label=f"l{i}", shape=shape, size=size, color="red", position=(x, y), yaw=0.1 * i)
