@@ -20,7 +20,8 @@ class DetectNodeConfig(Config):
     camera: str = Field(default="overhead", description="camera of cameras.yaml; gives frame and depth limits")
     color_topic: str = Field(default="/{camera}/color/image_raw", description="colour image; {camera} is filled in")
     depth_topic: str = Field(
-        default="/{camera}/depth/image_raw", description="aligned depth image; {camera} is filled in"
+        default="/{camera}/depth/image_raw",
+        description="aligned depth image; {camera} is filled in; empty: none, see localizer.heights",
     )
     info_topic: str = Field(
         default="/{camera}/depth/camera_info", description="CameraInfo of both; {camera} is filled in"

@@ -66,7 +66,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             config.label,
         )
         self._poses = RobotStateListener(self, self.description, joints=False)
-        self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(("color", "depth", "info"), self._on_frame)
+        self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(tuple(self._topics()), self._on_frame)
         self._inputs: list[Subscription] = []
         self._waiting: _Frame | None = None
         self._last_ns: int | None = None
@@ -112,14 +112,18 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             self._poses.enable(False)
             self.diagnose(True, "idle: nobody listens", **self._counts)
 
+    def _topics(self) -> dict[str, tuple[type[Image | CameraInfo], str]]:
+        """Streams that make a frame: without a depth topic, objects of known height are located by colour alone."""
+        config = self.config
+        topics: dict[str, tuple[type[Image | CameraInfo], str]] = {
+            "color": (Image, config.color_topic),
+            "info": (CameraInfo, config.info_topic),
+        }
+        return topics | ({"depth": (Image, config.depth_topic)} if config.depth_topic else {})
+
     def _subscribe(self) -> None:
         self._poses.enable(self._rides)
-        topics: tuple[tuple[str, type[Image | CameraInfo], str], ...] = (
-            ("color", Image, self.config.color_topic),
-            ("depth", Image, self.config.depth_topic),
-            ("info", CameraInfo, self.config.info_topic),
-        )
-        for stream, kind, topic in topics:
+        for stream, (kind, topic) in self._topics().items():
 
             def add(message: Image | CameraInfo, stream: str = stream) -> None:
                 self._matcher.add(stream, stamp_to_ns(message.header.stamp), message)
@@ -142,8 +146,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._try_waiting()
 
     def _check(self, t_ns: int, messages: dict[str, Image | CameraInfo]) -> _Frame:
-        color, depth = cast(Image, messages["color"]), cast(Image, messages["depth"])
-        info = cast(CameraInfo, messages["info"])
+        color, info = cast(Image, messages["color"]), cast(CameraInfo, messages["info"])
         convert.check_frames(messages, self._optical_frame)
         rgb = image_to_array(color)
         if color.encoding not in ("rgb8", "bgr8"):
@@ -153,7 +156,9 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         return _Frame(
             t_ns,
             cast(NDArray[np.uint8], rgb),
-            cast(DepthImage, image_to_array(depth)),
+            cast(DepthImage, image_to_array(cast(Image, messages["depth"])))
+            if "depth" in messages
+            else np.zeros(rgb.shape[:2], np.uint16),
             intrinsics_from_info(info),
             self.monotonic() + self.config.transform_wait,
         )

@@ -13,18 +13,19 @@ and says so.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from openarm_common import se3
 from openarm_common.cameras import Intrinsics
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
-from openarm_perception import footprint
+from openarm_perception import footprint, plane
 from openarm_perception.depth import DepthImage, DepthLimits, check_size, unit_scale
 from openarm_perception.detector import Detection2D, Mask
 
@@ -55,6 +56,28 @@ class LocalizerConfig(Config):
         default=0.0025, gt=0.0, description="an outline farther from its shape (rms) is no prism's, m"
     )
     std_floor: float = Field(default=0.0005, gt=0.0, description="smallest standard deviation of the position, m")
+    heights: tuple[str, ...] = Field(
+        default=(), description="known heights, as `label=metres`: such objects are located without depth too"
+    )
+    height_std: float = Field(default=0.002, gt=0.0, le=0.1, description="standard deviation of those heights, m")
+
+    @model_validator(mode="after")
+    def _pairs(self) -> LocalizerConfig:
+        self.known_heights()
+        return self
+
+    def known_heights(self) -> dict[str, float]:
+        """The known heights by label, m."""
+        out: dict[str, float] = {}
+        for item in self.heights:
+            label, _, metres = item.partition("=")
+            try:
+                out[label.strip()] = float(metres)
+            except ValueError:
+                raise ValueError(f"heights {item!r}: expected `label=metres`, such as red=0.05") from None
+            if not 0.005 <= out[label.strip()] <= 0.5:
+                raise ValueError(f"heights {item!r}: expected 0.005 .. 0.5 m")
+        return out
 
 
 @dataclass(frozen=True)
@@ -70,6 +93,7 @@ class Detection3D:
         points: Pixels with depth that were used.
         visible: Share of the outline of the top that was in view, 0 to 1.
         method: `rectangle` or `circle` through the outline of the top; `bound`: rectangle around all points.
+        measured: Whether depth was measured; else the height is what the configuration says.
     """
 
     source: Detection2D
@@ -80,6 +104,7 @@ class Detection3D:
     points: int
     visible: float
     method: footprint.Kind
+    measured: bool = True
 
     @property
     def label(self) -> str:
@@ -121,6 +146,7 @@ class Localizer:
         self.config = config
         self.limits = limits
         self.table_height = table_height
+        self._heights = config.known_heights()
 
     def coarse(self, found: Detection2D, depth: DepthImage, intrinsics: Intrinsics, T_base_camera: Array) -> Array:
         """Point on the visible surface: the median pixel of the mask at the median of its valid depths.
@@ -159,6 +185,8 @@ class Localizer:
                 f"{found.label} at pixel {_pixel(found)} is cut by the border of the image; its size is unknown",
             )
         patch = self._patch(found, depth, intrinsics, T_base_camera)
+        if found.label in self._heights and self._valid(patch).sum() < self.config.min_points:
+            return self.locate_on_plane(found, self._heights[found.label], intrinsics, T_base_camera)
         solid = self._on_object(found, patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
         count = int(np.count_nonzero(solid))
         if count < self.config.min_points:
@@ -185,6 +213,38 @@ class Localizer:
             raise OpenArmError(error.code, f"{where}: {error.message}") from error
         return self._detection(found, shape, top, count, visible)
 
+    def locate_on_plane(
+        self, found: Detection2D, height: float, intrinsics: Intrinsics, T_base_camera: Array
+    ) -> Detection3D:
+        """The object of a detection without depth: an upright convex prism of known height on the table.
+
+        Args:
+            found: In the colour image.
+            height: Of the object, m.
+            intrinsics: Of the camera.
+            T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image; any attitude.
+
+        Raises:
+            OpenArmError: NOTHING_DETECTED, when no such prism has this silhouette.
+        """
+        camera, top = T_base_camera[:3, 3], self.table_height + height
+        middle = plane.intersect(found.centre, intrinsics, T_base_camera, (0.0, 0.0, 1.0), top)
+        distance = float(np.linalg.norm(middle - camera))
+        pixel = distance / intrinsics.fx
+        try:
+            points = plane.outline(found, intrinsics, T_base_camera, self.table_height, top, 0.5 * pixel)
+            shape = footprint.fit(points, pixel)
+            if shape.rms > self.config.prism_rms:
+                shape = footprint.bound(points, 0.0)
+        except OpenArmError as error:
+            raise OpenArmError(error.code, f"{found.label} at pixel {_pixel(found)}: {error.message}") from error
+        # a wrong height moves the object along the view: half of it, as its bottom stays where it is
+        lean = 0.5 * self.config.height_std * float(np.linalg.norm(middle[:2] - camera[:2])) / (camera[2] - top)
+        stds = (math.hypot(shape.centre_std[0], lean), math.hypot(shape.centre_std[1], lean))
+        located = self._detection(found, replace(shape, centre_std=stds), top, 0, 1.0)
+        located.covariance[2, 2] = (0.5 * self.config.height_std) ** 2
+        return replace(located, measured=False)
+
     def _patch(self, found: Detection2D, depth: DepthImage, intrinsics: Intrinsics, T_base_camera: Array) -> _Patch:
         scale = unit_scale(depth)
         check_size("depth image", depth.shape, intrinsics)
@@ -204,8 +264,12 @@ class Localizer:
         band = max(self.config.top_band, 3.0 * noise)
         return _Patch(rays, z, rays * z[..., None] + T_base_camera[:3, 3], mask, band)
 
+    @staticmethod
+    def _valid(patch: _Patch) -> Mask:
+        return np.asarray(patch.mask & np.isfinite(patch.z))
+
     def _on_object(self, found: Detection2D, patch: _Patch) -> Mask:
-        valid = patch.mask & np.isfinite(patch.z)
+        valid = self._valid(patch)
         count = int(np.count_nonzero(valid))
         if count < self.config.min_points:
             raise OpenArmError(

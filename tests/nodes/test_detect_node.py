@@ -79,7 +79,8 @@ class FakeCamera:
             "info": info_from_intrinsics(self.K, self.frame, t_ns),
         }
         for stream, message in (messages | replace).items():
-            self.pubs[stream].publish(message)
+            if stream in self.pubs:
+                self.pubs[stream].publish(message)
 
     def watched(self) -> bool:
         return all(pub.get_subscription_count() for pub in self.pubs.values())
@@ -169,6 +170,16 @@ def test_a63_b01_b29_a_box_is_found_where_it_stands(bench) -> None:
     size = found.bbox.size
     np.testing.assert_allclose((size.x, size.y, size.z), (0.04, 0.06, 0.05), atol=0.0015)
     assert found.results[0].pose.covariance[0] > 0.0
+
+
+def test_b31_b62_without_a_depth_topic_an_object_of_known_height_is_found_by_its_silhouette(ros) -> None:
+    camera = FakeCamera(ros)
+    ros.node.destroy_publisher(camera.pubs.pop("depth"))
+    bench = Bench(ros, camera=camera, depth_topic="", **{"localizer.heights": ["red=0.05"]})
+    (found,) = bench.detect().detections
+    np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.001)
+    size = found.bbox.size
+    np.testing.assert_allclose((size.x, size.y, size.z), (0.04, 0.06, 0.05), atol=0.0015)
 
 
 def test_b04_a61_boxes_in_the_image_by_their_centre(ros, bench) -> None:
