@@ -34,7 +34,7 @@ def disagreements(arm: Arm, home: dict[str, float], count: int, seed: int) -> tu
     """States called free wrongly, called a collision needlessly, and truly free, with boxes and something held."""
     rng = np.random.default_rng(seed)
     wrong = needless = free = 0
-    per_scene = 500
+    per_scene = 1000
     for _ in range(count // per_scene):
         held = [box_from("thing", (0.0, 0.0, 0.03), rng.uniform(0.02, 0.12, 3))]
         exact = arm.scene(home, turned_boxes(rng, 6), held)
@@ -57,7 +57,6 @@ def test_a68_never_free_where_the_exact_layer_says_collision(
     assert needless < 0.05 * free  # it is of use, too
 
 
-@pytest.mark.slow
 def test_a68_never_free_where_the_exact_layer_says_collision_1e5(arms: dict[str, Arm], home: dict[str, float]) -> None:
     for seed, arm in enumerate(arms.values()):
         wrong, needless, free = disagreements(arm, home, 50_000, 1000 + seed)
@@ -168,3 +167,40 @@ def test_b13_another_robot_goes_through_the_same_code(six: RobotDescription) -> 
     truth = np.array([not exact.collides(q) for q in states])
     assert not np.any(free & ~truth)
     assert int(np.sum(free)) > 0.9 * int(np.sum(truth)) > 100
+
+
+def test_what_a_line_leaves_out_is_free_in_all_its_states(arms: dict[str, Arm], home: dict[str, float]) -> None:
+    """Both arms among turned boxes: the look at a line agrees with one look after the other, by the exact layer."""
+    both = BothArms(arms["left"], arms["right"])
+    rng = np.random.default_rng(21)
+    exact = both.scene(home, turned_boxes(rng, 2))
+    fast = FastScene([exact.first, exact.second])
+    starts = rng.uniform(both.lower, both.upper, (600, 14))
+    starts = starts[fast.free_many(starts)]
+    agreed = [0, 0]
+    for a in starts:
+        b = np.clip(a + rng.normal(0.0, 0.25, 14), both.lower, both.upper)
+        n = int(np.ceil(max(np.abs(b - a).max() / 0.05, np.abs(b - a) @ fast.levers / 0.02, 1.0)))
+        states = a + np.arange(n + 1)[:, None] / n * (b - a)
+        line, each = fast.edge_free(a, b, 0.05, 0.02), fast.free_many(states)
+        assert line or not each.all()
+        if line:
+            assert not any(exact.collides(q) for q in states[~each])
+        agreed[line] += 1
+    assert min(agreed) > 15
+
+
+def test_a_line_past_cells_of_a_map_agrees_with_its_states(right: Arm, home: dict[str, float]) -> None:
+    rng = np.random.default_rng(22)
+    cells = np.zeros((50, 80, 50), np.bool_)
+    cells[tuple(rng.integers(0, cells.shape, (80, 3)).T)] = True
+    exact, fast = right.scene(home, map_boxes(cells)), FastScene([right.scene(home)], map_of(cells, 0.15))
+    starts = rng.uniform(right.kinematics.lower, right.kinematics.upper, (400, 7))
+    agreed = [0, 0]
+    for a in starts[fast.free_many(starts)]:
+        b = np.clip(a + rng.normal(0.0, 0.15, 7), right.kinematics.lower, right.kinematics.upper)
+        line = fast.edge_free(a, b, 0.05, 0.02)
+        if line:
+            assert exact.edge_free(a, b, 0.05, 0.02)
+        agreed[line] += 1
+    assert min(agreed) > 5
