@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from openarm_motion.arm import Arm, segment_time
-from openarm_motion.collision import Box, Clearance, CollisionScene, Contact, Surroundings, spread
+from openarm_motion.collision import Box, Clearance, CollisionScene, Contact, Surroundings
 from openarm_motion.fast import FastScene
+from openarm_motion.looks import spread
 from openarm_motion.planner import PlanQuery, never
 from openarm_motion.seen import NOTHING, Known
 from openarm_motion.trajectory import JointLimits

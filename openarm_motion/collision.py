@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import lru_cache
 
 import coal
 import numpy as np
@@ -20,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.collision_robot import CollisionRobot
+from openarm_motion.looks import spread
 from openarm_motion.seen import MAP, DistanceMap
 from openarm_motion.solids import Box, Solid, box_from
 from openarm_motion.surroundings import Clearance, Contact, Surroundings
@@ -57,6 +57,8 @@ class CollisionScene:
         self._names = [*robot.links]
         self._boxes: dict[str, int] = {}
         self._solids: dict[str, Solid] = {}
+        self._balls: dict[int, tuple[Array, float]] = {}
+        self._towards: dict[frozenset[str], NDArray[np.int64]] = {}
         self.levers = robot.levers
         pairs, required = self._pairs()
         for i, j in pairs:
@@ -211,8 +213,33 @@ class CollisionScene:
         """Smallest distance between what moves and some links, m (< 0: overlap); infinite where no pair is checked."""
         self._robot.put(self._q, q)
         pin.updateGeometryPlacements(self._robot.model, self._data, self._geometry, self._geometry_data, self._q)
-        pairs = [k for k, (_, j) in enumerate(self._pair_index) if self._names[j] in links]
-        return min((self._contact(k).distance for k in pairs), default=float("inf"))
+        if links not in self._towards:
+            pairs = [(k, i, j) for k, (i, j) in enumerate(self._pair_index) if self._names[j] in links]
+            self._towards[links] = np.array(pairs, np.int64).reshape(-1, 3).T
+        rows, first, second = self._towards[links]
+        if not rows.size:
+            return float("inf")
+        used = {int(i): self._ball(int(i)) for i in np.unique(np.concatenate([first, second]))}
+        centres, radii = np.zeros((max(used) + 1, 3)), np.zeros(max(used) + 1)
+        for i, (centre, radius) in used.items():
+            centres[i], radii[i] = centre, radius
+        # balls about the shapes say which pairs are worth a look
+        least = np.linalg.norm(centres[first] - centres[second], axis=1) - radii[first] - radii[second]
+        best = float("inf")
+        for n in np.argsort(least):
+            if least[n] >= best:
+                break
+            best = min(best, self._contact(int(rows[n])).distance)
+        return best
+
+    def _ball(self, i: int) -> tuple[Array, float]:
+        """Centre (3,) and radius of the ball about a shape where it is now."""
+        shape = self._geometry.geometryObjects[i].geometry
+        if i not in self._balls:
+            shape.computeLocalAABB()
+            self._balls[i] = np.asarray(shape.aabb_center).ravel(), float(shape.aabb_radius)
+        centre, radius = self._balls[i]
+        return np.asarray(self._geometry_data.oMg[i].act(centre)), radius
 
     def put_other(self, other: CollisionScene, q: ArrayLike) -> None:
         """Move the arm of another scene of the same robot to its configuration (n,)."""
@@ -236,9 +263,8 @@ class CollisionScene:
         for k in pairs:
             i = self._pair_index[k][0]
             place, shape = self._geometry_data.oMg[i], self._geometry.geometryObjects[i].geometry
-            shape.computeLocalAABB()
-            middle = place.act(np.asarray(shape.aabb_center).ravel())
-            for c in np.flatnonzero(np.linalg.norm(centres - middle, axis=1) < float(shape.aabb_radius) + edge):
+            middle, radius = self._ball(i)
+            for c in np.flatnonzero(np.linalg.norm(centres - middle, axis=1) < radius + edge):
                 there = coal.Transform3s(np.eye(3), centres[c])
                 here = coal.Transform3s(place.rotation, place.translation)
                 if coal.distance(shape, here, cell, there, request, coal.DistanceResult()) < 2.0 * _LESS:
@@ -312,18 +338,3 @@ class CollisionScene:
         self._names.append(name)
         self._boxes[name] = int(self._geometry.addGeometryObject(pin.GeometryObject(name, joint, pin.SE3(T), geometry)))
         return self._boxes[name]
-
-
-@lru_cache(maxsize=512)
-def spread(n: int) -> tuple[float, ...]:
-    """0, 1/n, ..., 1 with the ends and far-apart points first, so that a collision is found early."""
-    order: list[int] = [n, 0]
-    gap = n
-    seen = {0, n}
-    while len(seen) <= n:
-        gap = max(gap // 2, 1)
-        for k in range(gap, n, gap):
-            if k not in seen:
-                seen.add(k)
-                order.append(k)
-    return tuple(k / n for k in order)

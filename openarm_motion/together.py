@@ -110,7 +110,7 @@ def plan_staggered(both: BothArms, now: Situation, wanted: BothGoals, time_limit
     Raises:
         OpenArmError: as `plan_together`.
     """
-    found: list[BothPlan] = []
+    found: list[_Staggered] = []
     faults: list[OpenArmError] = []
     for first in range(2):
         try:
@@ -122,7 +122,9 @@ def plan_staggered(both: BothArms, now: Situation, wanted: BothGoals, time_limit
     if not found:
         text = "; ".join(f"{arm.name} first: {e.message}" for arm, e in zip(both.arms, faults, strict=True))
         raise OpenArmError(faults[0].code, f"neither arm can go first: {text}")
-    return min(found, key=lambda plan: max(part.duration for part in plan.trajectories))
+    best = min(found, key=lambda plan: max(part.duration for part in plan.parts))
+    scene = both.scene(now.state, held=wanted.held)
+    return BothPlan(best.parts, best.waits, separation(scene, joined(both, best.parts)))
 
 
 def plan_any(both: BothArms, now: Situation, wanted: BothGoals, time_limit: float) -> BothPlan:
@@ -171,13 +173,18 @@ def delayed(trajectory: Trajectory, wait: float) -> Trajectory:
     )
 
 
-def _in_order(both: BothArms, now: Situation, wanted: BothGoals, first: int, time_limit: float) -> BothPlan:
+@dataclass(frozen=True, eq=False)
+class _Staggered:
+    parts: tuple[Trajectory, Trajectory]
+    waits: tuple[float, float]
+
+
+def _in_order(both: BothArms, now: Situation, wanted: BothGoals, first: int, time_limit: float) -> _Staggered:
     second = 1 - first
     early = _alone(both, first, now, now.state, wanted, time_limit)
     there = {**now.state, **dict(zip(both.arms[first].names, early.q[-1].tolist(), strict=True))}
     late = _alone(both, second, now, there, wanted, time_limit)
-    scene = both.scene(now.state, held=wanted.held)
-    least = _least(scene, now.start)
+    least = _least(both.scene(now.state, held=wanted.held), now.start)
     pair = both.pair_scene(now.state, least, wanted.held)
     for wait in np.append(np.arange(0.0, early.duration, _WAIT_STEP), early.duration):
         if now.stopped():
@@ -188,7 +195,7 @@ def _in_order(both: BothArms, now: Situation, wanted: BothGoals, first: int, tim
         whole = joined(both, parts)
         states = whole.at(dense_times(whole, pair.levers, _TRAVEL))[0]
         if not any(pair.collides(q) for q in states):
-            return BothPlan(parts, waits, separation(scene, whole))
+            return _Staggered(parts, waits)
     raise OpenArmError(
         Code.IN_COLLISION,
         f"the {both.arms[second].name} arm would come within {least * 1e3:.0f} mm of the {both.arms[first].name} arm"
