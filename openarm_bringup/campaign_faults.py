@@ -93,7 +93,7 @@ def _far(task: Task, rng: np.random.Generator) -> Task:
 
 
 def _walled(task: Task, rng: np.random.Generator) -> Task:
-    """The object stands in a close court of higher boxes."""
+    """The object stands in a close court of boxes a little higher."""
     side = float(rng.choice((-1.0, 1.0)))
     x, y = float(rng.uniform(0.22, 0.30)), side * float(rng.uniform(0.18, 0.30))
     low = _target(task).model_copy(update={"shape": "box", "size": (0.05, 0.05, 0.05), "position": (x, y), "yaw": 0.0})
@@ -103,7 +103,7 @@ def _walled(task: Task, rng: np.random.Generator) -> Task:
         colors, ((0.055, 0, 0.04, 0.15), (-0.055, 0, 0.04, 0.15), (0, 0.055, 0.068, 0.04), (0, -0.055, 0.068, 0.04)),
         strict=False,
     ):  # fmt: skip
-        size = (long_x, long_y, 0.08)
+        size = (long_x, long_y, 0.055)
         walls.append(SceneObject(name=f"{color}_wall", shape="box", size=size, color=color, position=(x + dx, y + dy)))
     return replace(task, scene=_objects(task, low, *walls), codes=_NO_WAY)
 

@@ -152,16 +152,17 @@ class DirectLink:
         if faults:
             raise faults[0]
 
-    async def observe(self, count: int) -> Frames:
+    async def observe(self, count: int, *, near: bool = False) -> Frames:
         """Frames that are taken from now on.
 
         Raises:
             OpenArmError: STALE_DATA, when they do not come; CANCELLED; ROBOT_LOST.
         """
         since_ns, robot = self.now_ns, self.robot
-        robot.look("overhead")
+        config = self._config
+        robot.look(config.near.camera if near else config.camera)
         robot.frames.clear()
-        limit = self._config.detect.frame_timeout
+        limit = config.near.timeout if near else config.detect.frame_timeout
 
         def fresh() -> list[Any]:
             return [frame for frame in robot.frames if frame.t_ns >= since_ns]

@@ -47,7 +47,7 @@ _NOT_SEEN = 200
 
 
 def with_mounts(
-    task: Task, mount_seeds: Sequence[int], folder: Path, names: Sequence[str] = ("overhead",)
+    task: Task, mount_seeds: Sequence[int], folder: Path, names: Sequence[str] = ("overhead", "wrist")
 ) -> tuple[Task, Mapping[str, Array]]:
     """The task with true mounts of one of the seeds (each in turn), and T_parent_link by camera as calibrated.
 

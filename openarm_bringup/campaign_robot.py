@@ -53,7 +53,6 @@ class SimulatedSenses(Config):
     depth_noise: bool = Field(default=True, description="depth as noisy as a D435's")
     max_rate: float = Field(default=10.0, gt=0.0, description="most frames that are detected in, Hz")
     latency: float = Field(default=0.06, ge=0.0, le=1.0, description="from an image to its detections, s")
-    camera: str = Field(default="overhead", description="that is looked through first")
 
 
 class SimRobot:

@@ -112,6 +112,19 @@ class DetectConfig(Config):
     )
 
 
+class NearLookConfig(Config):
+    """A second look from before the object, by a camera that rides on the hand; without its detector it is left out."""
+
+    enabled: bool = Field(default=True, description="whether the camera on the hand is asked before the grasp")
+    camera: str = Field(default="wrist", description="that rides on the hand")
+    arm: Literal["left", "right"] = Field(default="right", description="whose hand")
+    topic: str = Field(default="/wrist/detections_3d", description="what its detector finds")
+    frames: int = Field(default=2, ge=1, le=10, description="that are averaged")
+    least: float = Field(default=0.001, ge=0.0, le=0.01, description="smaller corrections are not made, m")
+    largest: float = Field(default=0.03, gt=0.0, le=0.1, description="what is seen farther off is another object, m")
+    timeout: float = Field(default=2.0, gt=0.0, le=20.0, description="wait for its frames, wall clock, s")
+
+
 class PlaceConfig(Config):
     """Where and how objects are put down."""
 
@@ -182,6 +195,7 @@ class GraspConfig(Config):
     timing: TimingConfig = TimingConfig()
     held: HeldConfig = HeldConfig()
     detect: DetectConfig = DetectConfig()
+    near: NearLookConfig = NearLookConfig()
     place: PlaceConfig = PlaceConfig()
     limits: LimitsConfig = LimitsConfig()
     drift: DriftConfig = DriftConfig()

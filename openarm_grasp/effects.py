@@ -67,9 +67,15 @@ class GoHome:
 
 @dataclass(frozen=True)
 class Observe:
-    """Collect `frames` frames of detections that are taken from now on; result `Frames`."""
+    """Collect `frames` frames of detections that are taken from now on; result `Frames`.
+
+    Attributes:
+        frames: How many.
+        near: By the camera on the hand instead of the one over the table.
+    """
 
     frames: int
+    near: bool = False
 
 
 @dataclass(frozen=True)

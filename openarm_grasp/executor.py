@@ -21,7 +21,7 @@ from openarm_common.robot_state import RobotStateBuffer
 from openarm_grasp import convert, effects
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames, Planned, Trajectory
-from openarm_grasp.link_executor import RobotLink
+from openarm_grasp.link_executor import DETECTIONS, RobotLink
 from openarm_grasp.performer import Performer, check_deadline
 from openarm_grasp.routing import ARMS
 
@@ -79,7 +79,7 @@ class GraspExecutor:
             "action /motion/plan_approach (motion node)": self._plan.server_is_ready(),
             "action /motion/execute (motion node)": self._execute.server_is_ready(),
             "action /motion/move (motion node)": self._move.server_is_ready(),
-            "publisher of /detections_3d (detector)": self._link.sees_detector,
+            "publisher of /detections_3d (detector)": self._link.sees(DETECTIONS),
             "/joint_states (bridge or robot driver)": self._link.hears_joints,
         }
         if moves:
@@ -158,9 +158,14 @@ class GraspExecutor:
         if faults:
             raise faults[0]
 
-    async def observe(self, count: int) -> Frames:
+    async def observe(self, count: int, *, near: bool = False) -> Frames:
         """Frames of detections that are taken from now on."""
-        return await self._link.observe(count)
+        if not near:
+            return await self._link.observe(count, DETECTIONS, self._config.detect.frame_timeout)
+        config = self._config.near
+        if not self._link.sees(config.topic):
+            raise OpenArmError(Code.NOT_READY, f"nobody publishes {config.topic}")
+        return await self._link.observe(count, config.topic, config.timeout)
 
     def stop_looking(self) -> None:
         """Leave /detections_3d."""

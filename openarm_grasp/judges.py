@@ -18,19 +18,12 @@ from openarm_grasp import recipes
 from openarm_grasp.candidates import propose
 from openarm_grasp.effects import Frames, Outcome, Planned, Reach
 from openarm_grasp.evidence import Evidence, Grip, Verdict, judge_grip, judge_lift, judge_place, judge_sight
+from openarm_grasp.judge_near import Judgement, fail, move_to_pregrasp
 from openarm_grasp.memory import Kept, Memory, Surroundings
 from openarm_grasp.observation import Detection, Frame, Sighting, find, labels_in_view, on_table
 from openarm_grasp.place import check_position, free_spots, place_targets
 from openarm_grasp.routing import arm_order, out_of_reach
 from openarm_grasp.states import Event, State
-
-Judgement = tuple[Event, str]
-
-
-def fail(m: Memory, code: Code, reason: str, *, final: bool = False) -> Judgement:
-    """Write a failure down; `final` allows no further try."""
-    m.failure = Verdict(code, reason)
-    return (Event.END if final else Event.AGAIN), reason
 
 
 # --- looking
@@ -196,13 +189,6 @@ def _offer_places(m: Memory, around: Surroundings, *, origin: bool = False) -> N
 
 
 # --- grasping
-def move_to_pregrasp(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
-    """The arm came to the pre-grasp with an open hand, or not."""
-    if not outcome.ok:
-        return fail(m, outcome.code, outcome.message)
-    return Event.DONE, "the open hand is before the object"
-
-
 def move_to_grasp(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
     """A hand that stops short has met the object."""
     m.hand.at_object = True

@@ -26,6 +26,8 @@ from openarm_grasp.effects import Frames
 from openarm_grasp.hand import Silence
 from openarm_grasp.observation import Frame
 
+#: What the detector of the camera over the table finds.
+DETECTIONS = "/detections_3d"
 _TICK_S = 0.025
 #: A longer pause between two ticks is this process being starved, not the robot being silent.
 _STARVED_S = 0.2
@@ -47,6 +49,7 @@ class RobotLink:
         self._config = config
         self.robot = RobotStateListener(node, node.description, joints=False)
         self._detections: Subscription | None = None
+        self._topic = DETECTIONS
         self._frames: list[Frame] = []
         self._frame_id = BASE_FRAME
         self._looking_since_ns = 0
@@ -56,7 +59,7 @@ class RobotLink:
         self._silence = Silence(_STARVED_S)
         self._cancelled = self._active = False
         if node.lockstep:
-            self._look()
+            self._look(DETECTIONS)
             self.stop_looking()
 
     # --- begin, end, cancel
@@ -101,10 +104,9 @@ class RobotLink:
         """Whether a joint state has come since `begin`."""
         return self.robot.age_s() < float("inf")
 
-    @property
-    def sees_detector(self) -> bool:
-        """Whether somebody publishes detections."""
-        return self._node.count_publishers(self._node.resolve_topic_name("/detections_3d")) > 0
+    def sees(self, topic: str) -> bool:
+        """Whether somebody publishes detections there."""
+        return self._node.count_publishers(self._node.resolve_topic_name(topic)) > 0
 
     # --- waiting
     def _on_tick(self) -> None:
@@ -196,30 +198,30 @@ class RobotLink:
         return result.result().result
 
     # --- looking
-    async def observe(self, count: int) -> Frames:
-        """Collect frames of detections that are taken from now on.
+    async def observe(self, count: int, topic: str, limit: float) -> Frames:
+        """Collect frames of detections that are taken from now on; `limit` is s of wall clock.
 
         Raises:
             OpenArmError: STALE_DATA, when they do not come; CANCELLED; ROBOT_LOST.
         """
         self._frames = []
         self._looking_since_ns = self.now_ns
-        self._look()
-        limit = self._config.detect.frame_timeout
+        self._look(topic)
         try:
             await self.until(lambda: len(self._frames) >= count, limit, "looking")
         except OpenArmError as error:
             if error.code is not Code.TIMEOUT:
                 raise
-            seen = f"{len(self._frames)} of {count} frames came from /detections_3d within {limit:g} s"
+            seen = f"{len(self._frames)} of {count} frames came from {topic} within {limit:g} s"
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
         return Frames(tuple(self._frames[-count:]), self._frame_id)
 
-    def _look(self) -> None:
+    def _look(self, topic: str) -> None:
+        if self._detections is not None and self._topic != topic:
+            self.stop_looking()
         if self._detections is None:
-            self._detections = self._node.create_subscription(
-                Detection3DArray, "/detections_3d", self._on_detections, reliable(5)
-            )
+            self._topic = topic
+            self._detections = self._node.create_subscription(Detection3DArray, topic, self._on_detections, reliable(5))
 
     def _on_detections(self, message: Detection3DArray) -> None:
         # What the camera took before this look began shows another state of the world.

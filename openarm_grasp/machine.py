@@ -143,7 +143,7 @@ class GraspMachine:
             return ()
         if self.state is State.DETECT and came_from in (State.TRANSFORM, State.PLAN, State.RESET):
             start_over(m, came_from)
-        if self.state is State.MOVE_TO_PREGRASP or (self.state is State.PLACE and came_from is State.TRANSFORM):
+        if self.state in (State.MOVE_TO_PREGRASP, State.PLACE) and came_from in (State.PLAN, State.TRANSFORM):
             m.tried += 1
         return RECIPES[self.state](m, self._around)
 

@@ -50,6 +50,7 @@ class Hand:
         try_again: What kept it from its place may not do so at the next attempt.
         homed: The arm is home again.
         retreats: Ways home that failed.
+        near: How far the second look has come: "", "look", "plan", "go".
     """
 
     holding: bool = False
@@ -60,6 +61,7 @@ class Hand:
     try_again: bool = False
     homed: bool = False
     retreats: int = 0
+    near: str = ""
 
 
 @dataclass(frozen=True)

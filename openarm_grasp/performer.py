@@ -94,8 +94,8 @@ class Link(Protocol):
         """Carry out several things at once; all end before this does, then the first error is raised."""
         ...
 
-    async def observe(self, count: int) -> Frames:
-        """Frames of detections that are taken from now on."""
+    async def observe(self, count: int, *, near: bool = False) -> Frames:
+        """Frames of detections that are taken from now on, by the camera over the table or the one on the hand."""
         ...
 
     async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
@@ -188,7 +188,7 @@ class Performer:
             case effects.Wait():
                 return await self._wait(effect.duration)
             case effects.Observe():
-                return await link.observe(effect.frames)
+                return await link.observe(effect.frames, near=effect.near)
             case effects.ToBase():
                 return self._to_base(effect)
             case effects.PlanGrasp() | effects.PlanPlace():
@@ -289,7 +289,17 @@ class Performer:
         end_ns = ready_ns + round(effect.settle * 1e9)
         still = self._config.held.max_speed
         rest = "waiting for the fingers to rest"
-        await link.until(lambda: link.now_ns >= end_ns or abs(hand.gap_speed()) < still, limit, rest)
+
+        def at_rest() -> bool:
+            try:
+                speed = hand.gap_speed()
+            except OpenArmError as error:
+                if error.code is not Code.STALE_DATA:
+                    raise
+                return False  # joint states were missing for a moment; the speed is known again soon
+            return abs(speed) < still or link.now_ns >= end_ns
+
+        await link.until(at_rest, limit, rest)
         return hand.evidence(effect.expected, link.effort(hand.joint), effect.T_base_tcp)
 
 

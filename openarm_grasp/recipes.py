@@ -72,7 +72,14 @@ def plan(m: Memory, around: Surroundings) -> Effects:
 
 
 def move_to_pregrasp(m: Memory, around: Surroundings) -> Effects:
-    """Open the hand on the way to the pre-grasp."""
+    """Open the hand on the way to the pre-grasp; then look from near, and go where the object was seen from there."""
+    if m.hand.near == "look":
+        return (Observe(around.config.near.frames, near=True),)
+    if m.hand.near == "plan":
+        s, config = m.need_sighting(), around.config
+        return (PlanGrasp(m.arm, m.offered, obstacle_boxes(s.others, config), target_box(s.target, config)),)
+    if m.hand.near == "go":
+        return (Execute(m.arm, m.need_grasp_plan().transfer, "move to where it was seen from near"),)
     go = Execute(m.arm, m.need_grasp_plan().transfer, "move to the pre-grasp")
     return (Together((MoveGripper(m.arm, around.config.hand.opening, "open"), go)),)
 

@@ -72,6 +72,7 @@ def _settled(node: Node) -> dict[str, list[str]]:
 def _told_publishers() -> dict[str, list[str]]:
     rows = [(name, rest.split("|")[1].strip()) for name, kind, rest in ROW.findall(README) if "/msg/" in kind]
     everyone = ["calibration_publisher", "cloud", "detector", "grasp", "motion", "mujoco_bridge", "octomap"]
+    everyone.append("wrist_detector")
     return {name: everyone if who == "all" else sorted(w.strip() for w in who.split(",")) for name, who in rows}
 
 

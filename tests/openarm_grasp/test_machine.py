@@ -44,7 +44,11 @@ class World:
         self.place_error = 0.0
         self.frame_age = 0.0
         self.machine = GraspMachine(
-            Surroundings(GraspConfig.model_validate(config), Table(), {"left": (0.0, 0.15), "right": (0.0, -0.15)})
+            Surroundings(
+                GraspConfig.model_validate({"near": {"enabled": False}, **config}),
+                Table(),
+                {"left": (0.0, 0.15), "right": (0.0, -0.15)},
+            )
         )
         self._target = np.zeros(3)
         self._label = ""

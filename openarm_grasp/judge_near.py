@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pre-grasp judged: the way there, the second look from there, and the correction that it asks for.
+
+The camera over the table says roughly where the object is; the camera on the hand, a hand's breadth away, says it
+better. Whatever keeps the second look from helping, the grasp goes on with what is known. Base frame, m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.candidates import GraspCandidate, propose
+from openarm_grasp.effects import Frames, Outcome, Planned
+from openarm_grasp.evidence import Verdict
+from openarm_grasp.memory import Memory, Surroundings
+from openarm_grasp.observation import Detection, Frame, find, on_table
+from openarm_grasp.states import Event
+
+Judgement = tuple[Event, str]
+
+
+def fail(m: Memory, code: Code, reason: str, *, final: bool = False) -> Judgement:
+    """Write a failure down; `final` allows no further try."""
+    m.failure = Verdict(code, reason)
+    return (Event.END if final else Event.AGAIN), reason
+
+
+def move_to_pregrasp(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """The arm came to the pre-grasp with an open hand, or not; then the second look."""
+    hand, near = m.hand, around.config.near
+    if hand.near == "look":
+        return _seen_from_near(m, outcome, around)
+    if hand.near == "plan":
+        return _corrected_plan(m, outcome)
+    if not outcome.ok:
+        return fail(m, outcome.code, outcome.message)
+    if hand.near == "" and near.enabled and m.arm == near.arm:
+        hand.near = "look"
+        return Event.MORE, f"the open hand is before the object; looking with the {near.camera} camera"
+    return Event.DONE, "the open hand is before the object"
+
+
+def _seen_from_near(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
+    if not outcome.ok:
+        return Event.DONE, f"no second look: {outcome.message}"
+    before, config = m.need_sighting(), around.config
+    frames = [_near(frame, before.target, config.near.largest) for frame in outcome.last(Frames).frames]
+    try:
+        found = find(
+            frames, m.label, match_radius=config.detect.match_radius, agree_within=config.detect.agree_within
+        ).target
+        target = on_table(found, around.table.top_z)
+        candidate = _same_way(m.need_candidate(), propose(target, config))
+    except OpenArmError as error:
+        return Event.DONE, f"the second look does not help: {error.message}"
+    dx, dy, _ = target.p_base - before.target.p_base
+    size = float(np.hypot(dx, dy))
+    text = f"the {config.near.camera} camera sees it {size * 1e3:.1f} mm off ({dx * 1e3:+.1f}, {dy * 1e3:+.1f})"
+    if size < config.near.least:
+        return Event.DONE, text
+    m.sighting = replace(before, target=target)
+    m.offered, m.hand.near = (candidate,), "plan"
+    return Event.MORE, f"{text}; correcting"
+
+
+def _near(frame: Frame, target: Detection, largest: float) -> Frame:
+    """The detections of a frame that may be the object."""
+    kept = (
+        d
+        for d in frame.detections
+        if d.label == target.label and float(np.linalg.norm((d.p_base - target.p_base)[:2])) <= largest
+    )
+    return Frame(frame.t_ns, tuple(kept))
+
+
+def _same_way(chosen: GraspCandidate, offered: tuple[GraspCandidate, ...]) -> GraspCandidate:
+    """The candidate whose hand stands most like the chosen one's: a box seen anew may have its edges swapped."""
+    return min(offered, key=lambda c: se3.angle_between(c.T_base_tcp[:3, :3], chosen.T_base_tcp[:3, :3]))
+
+
+def _corrected_plan(m: Memory, outcome: Outcome) -> Judgement:
+    if not outcome.ok:
+        return Event.DONE, f"the correction cannot be planned, going on without: {outcome.message}"
+    m.grasp_plan, m.candidate, m.hand.near = outcome.last(Planned), m.offered[0], "go"
+    return Event.MORE, f"correcting to {m.candidate.id}"
