@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tf2_msgs.msg import TFMessage
 
-from openarm_calibration.config import PublisherConfig
 from openarm_calibration.store import default_folder, of_these_mounts, places
+from openarm_calibration.store_config import PublisherConfig
 from openarm_common.cameras import T_LINK_OPTICAL, CameraConfig, load_cameras
 from openarm_common.convert import matrix_to_transform
 from openarm_common.errors import Code, OpenArmError
