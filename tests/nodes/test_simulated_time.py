@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every node takes `use_sim_time`: its clock is /clock then, and what it does by the wall clock goes on."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
+
+from openarm_common.convert import ns_to_stamp, stamp_to_ns
+from openarm_common.node import QOS_CLOCK, QOS_COMMAND
+
+NODES = {
+    "openarm_calibration.node": "CalibrationNode",
+    "openarm_calibration.publisher": "PublisherNode",
+    "openarm_grasp.node": "GraspNode",
+    "openarm_motion.node": "MotionNode",
+    "openarm_octomap.node": "OctomapNode",
+    "openarm_perception.cloud_node": "CloudNode",
+    "openarm_perception.detect_node": "DetectNode",
+}
+NOW = 123_000_000_000
+
+
+@pytest.mark.parametrize("module", NODES)
+def test_p30_a_node_takes_simulated_time(ros, tmp_path, monkeypatch, module: str) -> None:
+    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path))
+    kind = getattr(import_module(module), NODES[module])
+    node = ros.add(kind(parameter_overrides=[Parameter("use_sim_time", value=True)]))
+    told: list[int] = []
+    publisher = ros.node.create_publisher(Clock, "/clock", QOS_CLOCK)
+    ros.node.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda m: told.append(stamp_to_ns(m.header.stamp)), QOS_COMMAND
+    )
+
+    def at_now() -> bool:
+        publisher.publish(Clock(clock=ns_to_stamp(NOW)))
+        return node.get_clock().now().nanoseconds == NOW
+
+    ros.spin_until(at_now, 5.0, "the clock of the node to be /clock")
+    # Once a second of the wall clock, though simulated time stands still.
+    ros.spin_until(lambda: told.count(NOW) >= 2, 10.0, "diagnostics with simulated stamps")
+
+
+def test_p30_the_bridge_stamps_with_the_time_it_makes(bridge) -> None:
+    bench = bridge(images=False, use_sim_time=True)
+    told = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    bench.ros.spin_until(lambda: len(told) > 1, 10.0, "diagnostics")
+    assert 0 < stamp_to_ns(told[-1].header.stamp) < 60_000_000_000  # seconds since the world began, not since 1970
+    assert abs(stamp_to_ns(told[-1].header.stamp) - bench.t_ns) < 2_000_000_000
