@@ -111,3 +111,18 @@ def test_what_an_arm_holds_keeps_away_from_the_other_arm(both, home) -> None:
     scene = both.scene(home, held=((), [plate]))
     start = np.array([home[name] for name in both.names])
     assert scene.separation(start) < both.scene(home).separation(start)
+
+
+def test_separation_is_the_least_of_all_pairs(both, home) -> None:
+    rng = np.random.default_rng(8)
+    scene, pair = both.scene(home), both.pair_scene(home, 0.1)
+    near = 0
+    for _ in range(200):
+        q = rng.uniform(both.lower, both.upper)
+        contacts = pair.contacts(q)
+        if contacts:
+            near += 1
+            assert scene.separation(q) == pytest.approx(min(c.distance for c in contacts), abs=1e-5)
+        else:
+            assert scene.separation(q) >= 0.1
+    assert near > 20
