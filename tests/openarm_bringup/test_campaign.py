@@ -127,6 +127,13 @@ def test_n03_n05_a_nudged_object_is_looked_for_again_and_placed(tmp_path) -> Non
     assert found["attempts"] == 2
 
 
+def test_n03_a_gap_of_joint_states_while_the_hand_is_read_is_waited_out(tmp_path) -> None:
+    task = make_task("faults", 10090)
+    assert task.kind == "joint_states_gap"
+    found = trials(task, tmp_path).run()
+    assert found["placed"], found["message"]
+
+
 def test_n02_n24_what_cannot_be_held_is_refused_and_everything_of_it_kept(tmp_path) -> None:
     task = replace(make_task("nominal", 10000), labels=("yellow",), codes=(Code.GRASP_MISSED, Code.GRASP_LOST))
     task = replace(task, fault=FaultPlan("friction_lowered", {"scale": 0.02}))
