@@ -100,9 +100,10 @@ class _Swings:
             body = self._parents[i]
         return out
 
-    def between(self, a: _Cluster, b: _Cluster) -> Array:
-        """(n,) for the points of one cluster as seen by another: joints that move both as one body do nothing."""
-        one, two = self.of(a), self.of(b)
+    def between(self, clusters: Sequence[_Cluster], groups: NDArray[np.int64]) -> Array:
+        """(g, n) for pairs of clusters, one as seen by the other: joints that move both as one body do nothing."""
+        each = np.array([self.of(cluster) for cluster in clusters])
+        one, two = each[groups[:, 0]], each[groups[:, 1]]
         return np.where((one > 0.0) & (two > 0.0), 0.0, one + two)
 
 
@@ -189,11 +190,11 @@ class _Packer:
                 Code.INVALID_ARGUMENT,
                 f"distances of the map are cut at {field.reach:.3f} m, expected {need:.3f} m or more",
             )
-        sways = [swings.between(clusters[a], clusters[b]) for a, b in groups[:, :2]]
-        sways += [
+        balls = [
             swings.of(_Cluster(int(body), ball[:3], ball[3]))
             for (body, _, _), ball in zip(sphere_groups, bounds, strict=True)
         ]
+        sways = np.concatenate([swings.between(clusters, groups), np.array(balls).reshape(-1, len(parents))])
         return Model(
             parents=np.array(parents, np.int64),
             placements=placements,
@@ -212,7 +213,7 @@ class _Packer:
             points=np.array([clusters[b].centre for b in groups[:, 1]], np.float64).reshape(-1, 3).T.copy(),
             reaches=reaches,
             spans=reaches + np.array([clusters[a].radius + clusters[b].radius for a, b in groups[:, :2]]),
-            swings=np.array(sways, np.float64).reshape(-1, len(parents)),
+            swings=sways,
             pairs=pairs,
             keep=keep,
             spheres=spheres,
@@ -220,7 +221,9 @@ class _Packer:
             sphere_bounds=bounds,
             sphere_shapes=covered[:, 0].astype(np.int64),
             sphere_keep=covered[:, 1].copy(),
-            field=np.full((1, 1, 1), np.inf, np.float32) if field is None else np.array(field.distances, np.float32),
+            field=np.full((1, 1, 1), np.inf, np.float32)
+            if field is None
+            else np.ascontiguousarray(field.distances, np.float32),
             corner=np.zeros(3) if field is None else np.array(field.corner, np.float64),
             edge=np.array([1.0 if field is None else field.resolution, slack]),
         )
@@ -233,6 +236,10 @@ class _Packer:
         out: list[_Cluster] = []
         of: dict[int, int] = {}
         for (body, _), shapes in sorted(members.items(), key=lambda item: item[0][0] == 0):
+            if len(shapes) == 1:
+                of[shapes[0]] = len(out)
+                out.append(_Cluster(body, self._poses[shapes[0]][:, 3], self._radii[shapes[0]]))
+                continue
             places = np.array([self._poses[k][:, 3] for k in shapes])
             centre = 0.5 * (places.min(axis=0) + places.max(axis=0))
             radii = np.array([self._radii[k] for k in shapes])
