@@ -154,6 +154,14 @@ def test_the_spline_passes_its_points_with_their_velocities(q, v, a, gaps, degre
             np.testing.assert_allclose(slope, a[i], atol=1e-2)
 
 
+def test_p21_the_curve_is_of_the_degree_that_the_points_give() -> None:
+    """As joint_trajectory_controller: straight, cubic, quintic; here from rest to rest, at a quarter of the time."""
+    t, q, rest = np.array([0.0, 1.0]), np.array([[0.0], [1.0]]), np.zeros((2, 1))
+    for derivatives, expected in (((), 0.25), ((rest,), 0.15625), ((rest, rest), 0.103515625)):
+        position, _ = JointSpline(t, q, *derivatives).sample(0.25)
+        np.testing.assert_allclose(position, expected)
+
+
 def test_the_spline_rests_before_and_after() -> None:
     spline = JointSpline(T2, Q2, np.ones((2, 2)))
     for t, q in ((0.0, Q2[0]), (5.0, Q2[1])):
