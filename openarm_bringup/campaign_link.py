@@ -282,13 +282,13 @@ class DirectLink:
         await self.pass_time(PLANNING_S)
         await self.follow(arm.name, trajectory, what)
 
-    async def grip(self, arm: str, joint: str, position: float, what: str) -> bool:
+    async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Move the fingers; whether they arrived or push against something."""
         robot = self.robot
         follower = robot.controller.grippers[arm]
         state, column = robot.world.read_joints(), robot.columns([joint])[0]
         ends: list[GripperOutcome] = []
-        goal = follower.check(GripperGoal(position))
+        goal = follower.check(GripperGoal(position, effort))
         follower.start(goal, float(state.position[column]), float(state.effort[column]), ends.append)
         try:
             await self.until(lambda: bool(ends), self._config.limits.gripper_timeout, what)

@@ -51,6 +51,12 @@ class HandConfig(Config):
     """The gripper's own measures, behind the tool centre point (TCP)."""
 
     opening: float = Field(default=0.044, gt=0.0, le=0.1, description="position of one finger when open, m")
+    close_effort: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=100.0,
+        description="largest closing force, N; 0: the driver's limit. Spares what is soft",
+    )
     open_tolerance: float = Field(
         default=0.004, gt=0.0, le=0.01, description="a finger this near to `opening` is open, m"
     )

@@ -155,14 +155,18 @@ def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
 
 
 def gripper_goal(
-    action: Literal["parallel", "classic"], joint: str, position: float
+    action: Literal["parallel", "classic"], joint: str, position: float, effort: float = 0.0
 ) -> ParallelGripperCommand.Goal | GripperCommand.Goal:
-    """Goal of either gripper action: the driving finger at a position, m, with the controller's own effort."""
+    """Goal of either gripper action: the driving finger at a position, m, with at most an effort, N.
+
+    An effort of 0 leaves it to the controller.
+    """
     if action == "classic":
         goal = GripperCommand.Goal()
-        goal.command.position = position
+        goal.command.position, goal.command.max_effort = position, effort
         return goal
-    return ParallelGripperCommand.Goal(command=JointState(name=[joint], position=[position]))
+    command = JointState(name=[joint], position=[position], effort=[effort] if effort > 0.0 else [])
+    return ParallelGripperCommand.Goal(command=command)
 
 
 def reach_request(arm: str, T_base_tcp: Array) -> ComputeIK.Request:

@@ -141,11 +141,16 @@ class MoveLinear:
 
 @dataclass(frozen=True)
 class MoveGripper:
-    """Move the fingers to `position` (m a finger) until they are there or push against something."""
+    """Move the fingers to `position` (m a finger) until they are there or push against something.
+
+    Attributes:
+        effort: Largest force, N; 0: the driver's limit.
+    """
 
     arm: str
     position: float
     what: str
+    effort: float = 0.0
 
 
 @dataclass(frozen=True)

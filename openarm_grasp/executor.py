@@ -209,9 +209,9 @@ class GraspExecutor:
             code = convert.code_from_text(result.code, Code.EXECUTION_FAILED)
             raise OpenArmError(code, f"{what}: {result.message or 'failed'}")
 
-    async def grip(self, arm: str, joint: str, position: float, what: str) -> bool:
+    async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Ask the gripper's controller."""
-        goal = convert.gripper_goal(self._config.gripper_action, joint, position)
+        goal = convert.gripper_goal(self._config.gripper_action, joint, position, effort)
         limit = self._config.limits.gripper_timeout
         result = await self._link.goal(self._grippers[arm], goal, limit, what, self._watched(None))
         return bool(result.stalled or result.reached_goal)

@@ -120,8 +120,8 @@ class Link(Protocol):
         """Move an arm on a free path to a posture."""
         ...
 
-    async def grip(self, arm: str, joint: str, position: float, what: str) -> bool:
-        """Move the fingers; whether they arrived or push against something."""
+    async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
+        """Move the fingers with at most `effort` N (0: any); whether they arrived or push against something."""
         ...
 
 
@@ -270,7 +270,7 @@ class Performer:
     # --- the hand
     async def _grip(self, effect: effects.MoveGripper) -> None:
         hand, link, what = self._hands[effect.arm], self._link, f"{effect.arm} hand: {effect.what}"
-        ended_well = await link.grip(effect.arm, hand.joint, effect.position, what)
+        ended_well = await link.grip(effect.arm, hand.joint, effect.position, what, effect.effort)
         if effect.position > 0.0:
             # The result may be here before the joint state that shows it.
             least, end_ns = effect.position - self._config.hand.open_tolerance, link.now_ns + SPEED_WINDOW_NS

@@ -96,7 +96,7 @@ def close_gripper(m: Memory, around: Surroundings) -> Effects:
     c, timing = m.need_candidate(), around.config.timing
     return (
         Wait(timing.pause_at_grasp),
-        MoveGripper(m.arm, 0.0, "close"),
+        MoveGripper(m.arm, 0.0, "close", around.config.hand.close_effort),
         Wait(timing.after_close),
         Measure(m.arm, c.width, c.T_base_tcp, settle=timing.settle_limit),
     )

@@ -13,7 +13,7 @@ from openarm_bringup.campaign_tasks import Task
 from openarm_bringup.campaign_trial import Trials
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Scene, SceneObject
-from openarm_grasp.config import GraspConfig
+from openarm_grasp.config import GraspConfig, HandConfig
 from openarm_grasp.effects import GraspOutcome, GraspRequest
 from openarm_grasp.performer import run_request
 
@@ -24,9 +24,10 @@ CUBE = SceneObject(name="red_cube", shape="box", size=(0.05, 0.05, 0.05), color=
 class Bench:
     """A robot, its grasp machine, and requests to it."""
 
-    def __init__(self, *objects: SceneObject) -> None:
+    def __init__(self, *objects: SceneObject, config: GraspConfig | None = None) -> None:
         scene = Scene(name="bench", objects=objects)
-        self.trials = Trials(Task("nominal", 1, scene, ()), SimulatedSenses(depth_noise=False), GraspConfig())
+        senses = SimulatedSenses(depth_noise=False)
+        self.trials = Trials(Task("nominal", 1, scene, ()), senses, config or GraspConfig())
         self.trials.robot.pass_time(0.3)
 
     def ask(self, label: str = "", **kwargs) -> GraspOutcome:
@@ -133,6 +134,15 @@ def test_p21_a_cancel_in_each_state_drops_nothing_and_the_next_request_works(sta
     holds = trials.machine.kept is not None and trials.performer.gap("right") < 0.08
     outcome = bench.ask("", phase="place") if holds else bench.ask("blue")
     assert outcome.success, outcome.message
+
+
+def test_n20_the_closing_force_can_be_limited() -> None:
+    bench = Bench(CUBE, config=GraspConfig(hand=HandConfig(close_effort=12.0)))
+    outcome = bench.ask("red", phase="pick")
+    assert outcome.success, outcome.message
+    column = bench.trials.robot.columns(["openarm_left_finger_joint1"])[0]
+    pressed = [abs(float(effort[column])) for _, _, effort in bench.trials.robot.trace]
+    assert 10.0 < max(pressed) <= 12.001
 
 
 def test_p02_the_five_outcomes() -> None:
