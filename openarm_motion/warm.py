@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from openarm_common.description import SIDES, RobotDescription
+from openarm_common.lattice import KEY_ZERO, Lattice
 from openarm_motion.cartesian import solve_line
 from openarm_motion.collision import CollisionScene, Surroundings
 from openarm_motion.collision_robot import CollisionRobot
@@ -13,6 +14,7 @@ from openarm_motion.fast import FastScene
 from openarm_motion.fast_planner import warm_search
 from openarm_motion.inverse import InverseKinematics
 from openarm_motion.kinematics import ArmKinematics
+from openarm_motion.seen import SeenMap
 
 
 def warm() -> None:
@@ -31,6 +33,7 @@ def warm() -> None:
     away[2, 3] += 0.01
     scene = CollisionScene(CollisionRobot(description, kinematics), Surroundings(home))
     warm_search(FastScene([scene]), q)
+    SeenMap(np.zeros((1, 3), np.int64), Lattice(0.02, (KEY_ZERO,) * 3, (4, 4, 4)), 1).distances  # noqa: B018
     solve_line(inverse, inverse.classify(q), pose, away, margin=0.0)
 
 
