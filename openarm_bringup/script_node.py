@@ -32,6 +32,7 @@ class ScriptConfig(Config):
     """What is asked for, and where the outcome is written."""
 
     labels: tuple[str, ...] = Field(default=("red",), description="objects to pick, one after the other")
+    dry_run: bool = Field(default=False, description="plan only, move nothing")
     begin: float = Field(default=1.0, ge=0.0, description="simulated time of the first request, s")
     rest: float = Field(default=1.0, ge=0.0, description="simulated time between a grasp and what follows, s")
     result: str = Field(default="lockstep.json", description="file that is written at the end")
@@ -95,7 +96,8 @@ class ScriptNode(BaseNode[ScriptConfig]):
             self._end()
             return
         self._asking = True
-        answer: Any = await self._client.call_async(Grasp.Request(label=self.config.labels[len(self._answers)]))
+        request = Grasp.Request(label=self.config.labels[len(self._answers)], dry_run=self.config.dry_run)
+        answer: Any = await self._client.call_async(request)
         self._answers.append({"success": answer.success, "code": answer.code, "message": answer.message})
         self._next_s = self._t_ns * 1e-9 + self.config.rest
         self._asking = False

@@ -93,7 +93,7 @@ class LeadExecutor(LockstepExecutor):
             text = "; ".join(f"{name}: {what}" for name, what in waiting.items())
             self.node.get_logger().warning(f"the lock-step waits for {text}")
         self._simulation.tell()
-        channels = channels_msg(self._sent | self._sent_here(), self._receivers) if self._receivers else []
+        channels = channels_msg(dict.fromkeys(self._receivers, 0), self._receivers)  # none until all are there
         self._ticks.publish(SimTick(stamp=ns_to_stamp(self._simulation.world.t_ns), channels=channels))
         until = time.monotonic() + _GATHER_S
         while (left := until - time.monotonic()) > 0.0:
