@@ -3,12 +3,19 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from openarm_motion import arm as arm_module
+from openarm_motion.arm import Arm, Situation
 from openarm_motion.blending import time_blended, time_quintic
+from openarm_motion.certificate import certify
+from openarm_motion.collision import box_from
+from openarm_motion.planner import PlannedPath
 from openarm_motion.trajectory import JointLimits, Trajectory, time_polyline
 
 NAMES = tuple(f"j{i}" for i in range(3))
@@ -37,8 +44,8 @@ def test_blends_hold_limits_and_stay_in_the_corners_triangles(points: list[list[
     assert trajectory.duration <= time_polyline(NAMES, waypoints, LIMITS).duration + 1e-6
     low, high = waypoints.min(axis=0), waypoints.max(axis=0)
     q = trajectory.at(np.linspace(0.0, trajectory.duration, 500))[0]
-    assert np.all(q >= low - 1e-6)
-    assert np.all(q <= high + 1e-6)
+    assert np.all(q >= low - 1e-5)
+    assert np.all(q <= high + 1e-5)
 
 
 def test_a_corner_is_faster_without_a_stop_and_moves_through_it() -> None:
@@ -72,3 +79,44 @@ def test_a67_quintic_begins_and_ends_at_rest_and_touches_one_limit(size: float) 
     assert max(used) == pytest.approx(1.0, abs=2e-3)
     np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], v[1:-1], atol=1e-3 * (1 + size))
     np.testing.assert_allclose(q[-1], waypoints[-1], atol=1e-12)
+
+
+def test_corners_of_plans_are_rounded_only_where_the_exact_layer_agrees(right: Arm, home: dict[str, float]) -> None:
+    boxes = [box_from(f"post{i}", (0.36, y, 0.65), (0.03, 0.03, 0.5)) for i, y in enumerate((-0.42, -0.2, 0.2))]
+    boxes.append(box_from("board", (0.40, 0.0, 0.85), (0.25, 1.0, 0.03)))
+    scene = right.scene(home, boxes)
+    rng = np.random.default_rng(31)
+    states = rng.uniform(right.kinematics.lower, right.kinematics.upper, (400, 7))
+    states = [q for q in states if not scene.collides(q)][:24]
+    corners = gained = 0
+    for start, goal in itertools.pairwise(states):
+        plan = right.plan_certified(scene, Situation(home, start), goal[None], 5.0)
+        if len(plan.path.waypoints) == 2:
+            continue
+        corners += 1
+        stops = time_polyline(right.names, plan.path.waypoints, right.limits(0.0))
+        gained += plan.trajectory.duration < 0.97 * stops.duration
+        assert plan.trajectory.duration <= stops.duration + 1e-6
+        certify(scene, plan.trajectory, travel=0.003)
+    assert corners >= 3
+    assert gained >= 2
+
+
+def test_a_rounded_corner_that_touches_is_done_with_a_stop(
+    right: Arm, home: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is rounded may not be what was planned: a timing that fails the dense look gives way to the next one."""
+    scene = right.scene(home)
+    start = np.array([home[name] for name in right.names])
+    path = PlannedPath(np.stack([start, start + 0.05, start]), 0, 2)
+    into = next(
+        q
+        for q in np.random.default_rng(5).uniform(right.kinematics.lower, right.kinematics.upper, (500, 7))
+        if scene.collides(q)
+    )
+    astray = time_polyline(right.names, np.stack([start, into]), right.limits(0.0))
+    monkeypatch.setattr(arm_module, "time_blended", lambda *_: astray)
+    monkeypatch.setattr(right, "plan", lambda *_: path)
+    plan = right.plan_certified(scene, Situation(home, start), start[None], 5.0)
+    np.testing.assert_allclose(plan.trajectory.q[-1], start)
+    assert not np.any(np.max(np.abs(plan.trajectory.q - start), axis=1) > 0.06)
