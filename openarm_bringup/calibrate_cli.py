@@ -119,6 +119,43 @@ def save(
 
 
 @app.command
+def together(
+    *sessions: Path, save: Annotated[bool, Parameter(negative=())] = False, store: Path | None = None
+) -> Outcome:
+    """Solve sessions of several cameras at once: they share the robot's errors, and the board where it is the same.
+
+    Args:
+        sessions: Files of samples (.npz), one for each camera.
+        save: Store the results, unless one fails.
+        store: Folder of stored calibrations.
+    """
+    from openarm_calibration.report import summary
+    from openarm_calibration.samples import load_session
+    from openarm_calibration.together import calibrate_together
+    from openarm_common.description import RobotDescription
+
+    if len(sessions) < 2:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{len(sessions)} sessions given, expected two or more; one: `solve`")
+    opened = [load_session(session, RobotDescription.load()) for session in sessions]
+    results = calibrate_together(
+        [samples for samples, _ in opened],
+        hashes=[digest for _, digest in opened],
+        created=_now(),
+        stored=[_stored(samples, store) for samples, _ in opened],
+    )
+    names = [samples.head.camera for samples, _ in opened]
+    data: dict[str, Any] = {"cameras": {n: result.as_json() for n, result in zip(names, results, strict=True)}}
+    text = "\n\n".join(summary(result) for result in results)
+    grades = ", ".join(f"{n} {result.verdict.grade}" for n, result in zip(names, results, strict=True))
+    if any(result.verdict.grade == "fail" for result in results):
+        return Outcome(False, f"{grades}; nothing was stored", Code.DEGENERATE, data, text)
+    if save:
+        paths = [str(_store(store).save(result.calibration)) for result in results]
+        return Outcome(True, f"{grades}. Stored in {', '.join(paths)}", data=data, text=text)
+    return Outcome(True, grades, data=data, text=text)
+
+
+@app.command
 def report(session: Path, out: Path, *, exclude: tuple[str, ...] = (), store: Path | None = None) -> Outcome:
     """Write a page with pictures on a session file: coverage, residuals, poses, samples, methods.
 
@@ -185,12 +222,20 @@ def _solved(session: Path, algorithm: str, exclude: tuple[str, ...], store: Path
     checked_algorithm(algorithm)
     samples, digest = load_session(session, RobotDescription.load())
     without_named(samples, exclude)
+    stored = _stored(samples, store)
+    return samples, calibrate(samples, algorithm=algorithm, session=digest, created=_now(), stored=stored)
+
+
+def _stored(samples: SampleSet, store: Path | None) -> StoredCalibration | None:
+    """What is stored of the camera; None also for one of other mounts, whose distance says nothing."""
     found = _store(store).find(samples.head.camera)
-    stored = found.calibration if found is not None else None
-    if stored is not None and stored.mount_seed != samples.head.mount_seed:
-        stored = None  # of other mounts: its distance says nothing
-    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    return samples, calibrate(samples, algorithm=algorithm, session=digest, created=now, stored=stored)
+    if found is None or found.calibration.mount_seed != samples.head.mount_seed:
+        return None
+    return found.calibration
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
 def _outcome(samples: SampleSet, result: Result, store: CalibrationStore | None, *, force: bool = False) -> Outcome:

@@ -90,6 +90,8 @@ def test_a43_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) ->
         (["rollback", "../wrist"], 2, "camera name"),
         (["rollback", "wrist"], 1, "has 0 stored"),
         (["frobnicate"], 2, "frobnicate"),
+        (["together", "SESSION"], 2, "1 sessions given"),
+        (["together", "SESSION", "SESSION"], 2, "one session for each camera"),
         (["auto", "--poses", "2"], 2, "at least 4"),
         (["auto", "--camera", "sideways"], 2, "cameras: overhead, wrist"),
         (["auto", "--camera", "spectator"], 2, "cameras: overhead, wrist"),
@@ -115,6 +117,17 @@ def test_a41_a_degenerate_session_is_exit_code_1_with_advice(capsys, session_fil
     code, _, err = run(capsys, "solve", str(session_file), *[word for n in names for word in ("--exclude", n)])
     assert code == 1
     assert "DEGENERATE: too few poses: 2" in err
+
+
+def test_b14_sessions_of_both_cameras_are_solved_together(capsys, session_file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "overhead.npz"
+    make_session("to_hand", 12).samples.save(other)
+    code, out, err = run(capsys, "together", str(session_file), str(other), "--save", "--json")
+    assert code == 0, err
+    assert list(json.loads(out)["cameras"]) == ["wrist", "overhead"]
+    listed = run(capsys, "list")[1]
+    assert "overhead: " in listed
+    assert "wrist: " in listed
 
 
 def result(camera: str, **more) -> AutoResult:
