@@ -258,10 +258,9 @@ class MotionNode(BaseNode[MotionConfig]):
     def _planner_of(self, arm: Arm, goal: MoveArm.Goal, around: moves.Around) -> Callable[[Situation], Trajectory]:
         """The plan that a goal asks for, to be made in a thread; poses are looked up here, in the executor's thread."""
         if goal.kind == MoveArm.Goal.JOINTS:
-            q = np.array(goal.joint_positions, dtype=np.float64)
             return lambda now: explained(
                 lambda: moves.to_joints(arm, now, goal.joint_positions, around),
-                lambda: near_joints(arm, now, around, q),
+                lambda: near_joints(arm, now, around, np.array(goal.joint_positions)),
             )
         if goal.kind == MoveArm.Goal.NAMED:
             return lambda now: explained(

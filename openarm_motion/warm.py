@@ -33,7 +33,7 @@ def warm() -> None:
     away[2, 3] += 0.01
     scene = CollisionScene(CollisionRobot(description, kinematics), Surroundings(home))
     warm_search(FastScene([scene]), q)
-    SeenMap(np.zeros((1, 3), np.int64), Lattice(0.02, (KEY_ZERO,) * 3, (4, 4, 4)), 1).distances  # noqa: B018
+    SeenMap(np.zeros((1, 3), np.int64), Lattice(0.02, (KEY_ZERO, KEY_ZERO, KEY_ZERO), (4, 4, 4)), 1).distances  # noqa: B018
     solve_line(inverse, inverse.classify(q), pose, away, margin=0.0)
 
 

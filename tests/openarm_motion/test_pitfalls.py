@@ -33,7 +33,7 @@ def test_a68_no_path_leads_through_the_chest(arms: dict[str, Arm], home: dict[st
         scene = arm.scene(home)
         own = scene.robot.arm.moving
         found = 0
-        while found < 5:
+        while found < 3:
             a, b = rng.uniform(arm.kinematics.lower, arm.kinematics.upper, (2, arm.kinematics.n))
             if scene.collides(a) or scene.collides(b):
                 continue
