@@ -39,8 +39,11 @@ def build_app() -> App:
         inspect_cli,
         model_cli,
         order_cli,
+        param_cli,
         pick_cli,
         record_cli,
+        ros_cli,
+        tf_cli,
         up_cli,
     )
 
@@ -67,6 +70,8 @@ def build_app() -> App:
     app.command(inspect_cli.logs)
     app.command(model_cli.model)
     app.command(graph_cli.app)
+    for group in (ros_cli.topic, ros_cli.service, ros_cli.action, ros_cli.node, param_cli.app, tf_cli.app):
+        app.command(group)
     app.command(grasp_cli.app)
     app.command(calibrate_cli.app)
     return app

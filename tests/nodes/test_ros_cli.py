@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands topic, service, action, node, param and tf against a node that runs."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import pytest
+from geometry_msgs.msg import TransformStamped
+from openarm_interfaces.action import Pick
+from openarm_interfaces.srv import SetPause
+from rclpy.action import ActionServer
+from std_msgs.msg import String
+from tf2_msgs.msg import TFMessage
+
+from openarm_bringup import param_cli, ros_cli, tf_cli
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF
+
+
+@pytest.fixture
+def heard(ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """A node with one of each kind, spinning beside the test; what is published to it."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # graphs that run on this machine are not met
+    heard: list[str] = []
+    node = ros.node
+    node.declare_parameter("height", 0.5)
+    node.create_publisher(String, "/status", QOS_LATCHED).publish(String(data="ready"))
+    ticks = node.create_publisher(String, "/ticks", QOS_COMMAND)
+    node.create_timer(0.02, lambda: ticks.publish(String(data="tick")))
+    node.create_subscription(String, "/talk", lambda message: heard.append(message.data), QOS_COMMAND)
+
+    def pause(request: SetPause.Request, response: SetPause.Response) -> SetPause.Response:
+        response.success, response.message = request.paused, "paused" if request.paused else "only true is taken"
+        return response
+
+    def pick(handle) -> Pick.Result:
+        handle.succeed()
+        return Pick.Result(success=True, code="OK", label=handle.request.label)
+
+    node.create_service(SetPause, "/pause", pause)
+    server = ActionServer(node, Pick, "/pick", pick)
+    frames = node.create_publisher(TFMessage, "/tf_static", QOS_STATIC_TF)
+    message = TFMessage()
+    for parent, child, x in (("world", "base", 1.0), ("base", "camera", 0.5)):
+        edge = TransformStamped(child_frame_id=child)
+        edge.header.frame_id = parent
+        edge.transform.translation.x = x
+        edge.transform.rotation.w = 1.0
+        message.transforms.append(edge)
+    frames.publish(message)
+    stop = threading.Event()
+
+    def spin() -> None:
+        while not stop.is_set():
+            ros.executor.spin_once(timeout_sec=0.05)
+
+    thread = threading.Thread(target=spin)
+    thread.start()
+    yield heard
+    stop.set()
+    thread.join()
+    server.destroy()
+
+
+def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    listed = ros_cli.topic_list()
+    assert listed.data["topics"]["/ticks"] == "std_msgs/msg/String"
+    echoed = ros_cli.echo("status", count=1)  # latched: it was published long before
+    assert echoed.data["messages"] == [{"data": "ready"}]
+    assert "data: ready" in capsys.readouterr().out
+    assert 20.0 < ros_cli.hz("/ticks", seconds=1.0).data["rate_hz"] < 80.0
+    assert ros_cli.pub("/talk", "{data: hello}", count=2, rate=20.0).success
+    assert heard == ["hello", "hello"]
+    alone = ros_cli.pub("/nobody", type_="std_msgs/msg/String")
+    assert (alone.success, alone.code) == (False, Code.NOT_READY)
+
+
+def test_services_and_actions_are_called_and_the_exit_code_follows_the_answer(heard: list[str]) -> None:
+    assert ros_cli.service_list().data["services"]["/pause"] == "openarm_interfaces/srv/SetPause"
+    assert ros_cli.call("/pause", "{paused: true}").exit_code == 0
+    refused = ros_cli.call("pause", "{paused: false}")
+    assert (refused.exit_code, refused.message) == (1, "only true is taken")
+    assert ros_cli.action_list().data["actions"] == {"/pick": "openarm_interfaces/action/Pick"}
+    assert ros_cli.send("/pick", "{label: red}").data["answer"]["label"] == "red"
+
+
+def test_mistakes_are_met_with_what_was_perhaps_meant(heard: list[str]) -> None:
+    for command, said in (
+        (lambda: ros_cli.echo("/statsu"), "did you mean /status"),
+        (lambda: ros_cli.call("/paus"), "did you mean /pause"),
+        (lambda: ros_cli.call("/pause", "{pause: true}"), "did you mean paused"),
+        (lambda: ros_cli.call("/pause", "{"), "is not YAML"),
+        (lambda: ros_cli.send("/pikc"), "did you mean /pick"),
+        (lambda: param_cli.get("prob", "height"), "did you mean /probe"),
+        (lambda: param_cli.get("probe", "heigth"), "did you mean height"),
+        (lambda: tf_cli.echo("world", "camra"), "did you mean camera"),
+    ):
+        with pytest.raises(OpenArmError) as refused:
+            command()
+        assert refused.value.code == Code.INVALID_ARGUMENT
+        assert said in refused.value.message
+
+
+def test_nodes_and_parameters(heard: list[str]) -> None:
+    assert "/probe" in ros_cli.node_list().data["nodes"]
+    info = ros_cli.info("probe")
+    assert info.data["publishes"]["/ticks"] == "std_msgs/msg/String"
+    assert info.data["offers"]["/pause"] == "openarm_interfaces/srv/SetPause"
+    assert "height" in param_cli.list_("probe").data["parameters"]
+    assert param_cli.set_("probe", "height", "0.7").success
+    assert param_cli.get("probe", "height").text == "0.7"
+    assert "ros__parameters:" in param_cli.dump("probe").text
+    wrong = param_cli.set_("probe", "height", "tall")
+    assert not wrong.success
+    assert "--set probe.height=tall" in wrong.message
+
+
+def test_b35_the_tree_of_frames_is_shown_and_drawn(heard: list[str], tmp_path: Path) -> None:
+    out = tmp_path / "tree.png"
+    tree = tf_cli.tree(out=out)
+    assert tree.text.splitlines() == ["world", "  base", "    camera"]
+    assert cv2.imread(str(out)).shape[0] > 60
+    assert tf_cli.echo("world", "camera").data["position"] == [1.5, 0.0, 0.0]
+    with pytest.raises(OpenArmError, match=r"ends in \.png"):
+        tf_cli.tree(out=tmp_path / "tree.pdf")
