@@ -5,7 +5,7 @@
 
 Synthetic (see openarm_calibration.synthetic): 5, 10, 20, 30 poses; camera in the hand and over it; 0.1, 0.3 and 1.0 px;
 an exact robot and one of 0.2 mm and 0.02° by axis. Each trial is solved with the noise known and with it estimated. A
-ratio is the rms error over the rms bound, for the position and for the rotation of the camera.
+ratio is the rms of the errors over their bounds, for the position and for the rotation of the camera.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Cell:
-    """Errors of one kind of problem, by method: squares of position (m²) and rotation (rad²)."""
+    """Errors of one kind of problem, by method: squares of position (m²) and rotation (rad²), and over the bound."""
 
     setup: Setup
     poses: int
@@ -47,13 +47,17 @@ class Cell:
     robot: str
     bound: list[tuple[float, float]] = field(default_factory=list)
     error: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    relative: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     failed: dict[str, int] = field(default_factory=dict)
     nees: dict[str, list[float]] = field(default_factory=dict)
     ms: dict[str, list[float]] = field(default_factory=dict)
 
     def add(self, method: str, away: Array) -> None:
-        """Count one error (6,), m and rad."""
-        self.error.setdefault(method, []).append((float(away[:3] @ away[:3]), float(away[3:] @ away[3:])))
+        """Count one error (6,), m and rad, of the trial whose bound came last."""
+        squares = float(away[:3] @ away[:3]), float(away[3:] @ away[3:])
+        self.error.setdefault(method, []).append(squares)
+        bound = self.bound[-1]
+        self.relative.setdefault(method, []).append((squares[0] / bound[0], squares[1] / bound[1]))
 
     def rms(self, method: str) -> tuple[float, float]:
         """Position in mm, rotation in degrees; NaN where the method never had an answer."""
@@ -63,11 +67,10 @@ class Cell:
         return float(t) * 1e3, math.degrees(float(r))
 
     def ratio(self, method: str) -> tuple[float, float]:
-        """Rms error over the rms bound, on the trials that the method had."""
-        count = len(self.error.get(method, ()))
-        if not count:
+        """Rms of each error over its own trial's bound, so that no single hard trial decides; on those it had."""
+        if not self.relative.get(method):
             return math.nan, math.nan
-        t, r = np.sqrt(np.mean(self.error[method], axis=0) / np.mean(self.bound[:count], axis=0))
+        t, r = np.sqrt(np.mean(self.relative[method], axis=0))
         return float(t), float(r)
 
 

@@ -44,7 +44,7 @@ from openarm_common.scene import load_scene
 from openarm_sim_bridge.model import build_spec
 
 Array = NDArray[np.float64]
-_PROMISING: dict[str, list[Array]] = {}
+_MIDDLE: dict[str, Array] = {}
 BOARD = CircleGrid()
 #: Of each joint around the middle of the postures, rad.
 SPREAD = 0.4
@@ -92,31 +92,28 @@ class Bench:
         return se3.inverse(hand @ self.camera.T_parent_optical) @ self.T_carrier_board
 
     def middle(self) -> Array:
-        """Joint positions around which most postures show the board, looked for with the board in sight."""
-        rng = np.random.default_rng(0)
-        best, most = np.zeros(len(self.samples.joint_names)), -1
-        for q in self._promising():
-            near = (self.near(q, rng) for _ in range(200))
-            seen = [j for j in near if self._seen(self.view(j))][:12]
-            count = sum(self.free(j) and self.photograph() is not None for j in seen)
-            if count > most:
-                best, most = q, count
-        return best
-
-    def _promising(self, tries: int = 6000, kept: int = 6) -> list[Array]:
-        """Postures around which the nominal mount promises the board, as if nothing could hide it."""
-        if self.camera.name not in _PROMISING:
+        """Joint positions around which most postures show the board; looked for once, with the board in sight."""
+        if self.camera.name not in _MIDDLE:
             rng = np.random.default_rng(0)
-            lower, upper = self.description.limits(self.samples.joint_names)
-            found: list[tuple[int, Array]] = []
-            for _ in range(tries):
-                q = rng.uniform(lower + 0.1, upper - 0.1)
-                if self._seen(self.view(self.joints(q))) and self.free(self.joints(q)):
-                    count = sum(self._seen(self.view(self.near(q, rng))) for _ in range(20))
-                    found.append((count, q))
-            found.sort(key=lambda item: -item[0])
-            _PROMISING[self.camera.name] = [q for _, q in found[:kept]]
-        return _PROMISING[self.camera.name]
+            counts: list[int] = []
+            promising = self._promising(rng)
+            for q in promising:
+                near = (self.near(q, rng) for _ in range(200))
+                seen = [j for j in near if self._seen(self.view(j))][:12]
+                counts.append(sum(self.free(j) and self.photograph() is not None for j in seen))
+            _MIDDLE[self.camera.name] = promising[int(np.argmax(counts))]
+        return _MIDDLE[self.camera.name]
+
+    def _promising(self, rng: np.random.Generator, tries: int = 6000, kept: int = 6) -> list[Array]:
+        """Postures around which the nominal mount promises the board, as if nothing could hide it."""
+        lower, upper = self.description.limits(self.samples.joint_names)
+        found: list[tuple[int, Array]] = []
+        for _ in range(tries):
+            q = rng.uniform(lower + 0.1, upper - 0.1)
+            if self._seen(self.view(self.joints(q))) and self.free(self.joints(q)):
+                found.append((sum(self._seen(self.view(self.near(q, rng))) for _ in range(20)), q))
+        found.sort(key=lambda item: -item[0])
+        return [q for _, q in found[:kept]]
 
     def near(self, q: Array, rng: np.random.Generator) -> dict[str, float]:
         """A random posture around one, within the limits."""
