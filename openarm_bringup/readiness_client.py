@@ -60,7 +60,7 @@ class ReadinessClient:
             self._executor.spin_once(timeout_sec=0.0)
         return tuple(str(condition) for condition in conditions if not self._met(condition, old))
 
-    def parameters(self, node: str, timeout_s: float = 5.0) -> frozenset[str]:
+    def parameters(self, node: str, timeout_s: float = 20.0) -> frozenset[str]:
         """Return the names of a node's parameters.
 
         Raises:
