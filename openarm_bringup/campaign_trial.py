@@ -25,6 +25,7 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import GraspOutcome, GraspRequest
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
+from openarm_grasp.orders import Order
 from openarm_grasp.performer import Performer, run_request
 from openarm_grasp.routing import ARMS
 from openarm_sim_bridge.faults import checked_fault
@@ -90,13 +91,24 @@ class Trials:
         began = time.monotonic()
         self.robot.pass_time(_SETTLE_S)
         self._begin_fault("")
-        trials = [self._grasp(label) for label in self._task.labels]
+        trials = self._all_in_turn()
         row = row_of(self._task, trials, time.monotonic() - began)
         row["again"] = self._again
         row["planning_ms_median"] = round(1e3 * float(np.median(self.link.planning_s or [math.nan])), 1)
         if self._keep is not None and not row["as_expected"]:
             self._keep.write(row, [step.__dict__ for step in self.steps])
         return row
+
+    def _all_in_turn(self) -> list[Trial]:
+        """Grasp what is asked for; what others block is asked for again when they have been placed."""
+        labels = self._task.labels
+        if len(set(labels)) < len(labels):  # the same object more than once
+            return [self._grasp(label) for label in labels]
+        order, last = Order(labels), dict[str, Trial]()
+        while ask := order.next():
+            last[ask.label] = self._grasp(ask.label)
+            order.done(ask, Code(last[ask.label].code), last[ask.label].message)
+        return list(last.values())
 
     def _grasp(self, label: str) -> Trial:
         robot, task = self.robot, self._task

@@ -18,8 +18,8 @@ from pydantic import Field, model_validator
 from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
 
-#: With these a place in a bin could not be had, and the next may be.
-_OTHER_SLOT = (Code.IN_COLLISION, Code.UNREACHABLE, Code.NO_PLAN)
+#: With these another place in a bin may be had, and an object may be reached when others have been taken away.
+_BLOCKED = (Code.IN_COLLISION, Code.UNREACHABLE, Code.NO_PLAN)
 #: There is no more of it in view.
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 
@@ -104,6 +104,7 @@ class Order:
     placed: list[str] = field(default_factory=list[str])
     failed: dict[str, str] = field(default_factory=dict[str, str])
     _used: dict[str, int] = field(default_factory=dict[str, int])
+    _blocked: dict[str, tuple[int, str]] = field(default_factory=dict[str, tuple[int, str]])
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -123,6 +124,8 @@ class Order:
         for label in dict.fromkeys(self.labels):
             if label in self.failed or self.placed.count(label) >= self.each:
                 continue
+            if label in self._blocked and self._blocked[label][0] == len(self.placed):
+                continue  # nothing has been taken away since
             if self.bins is None:
                 return Ask(label)
             name = self.bins.of(label)
@@ -131,19 +134,23 @@ class Order:
             if at < len(slots):
                 return Ask(label, slots[at])
             self.failed[label] = f"bin {name!r} is full: it has {len(slots)} places"
+        self.failed |= {label: why for label, (_, why) in self._blocked.items()}
         return None
 
     def done(self, ask: Ask, code: Code, message: str) -> None:
         """Note what came of a request."""
-        if self.bins is not None and (code is Code.OK or (code in _OTHER_SLOT and ask.place is not None)):
+        self._blocked.pop(ask.label, None)
+        if self.bins is not None and (code is Code.OK or (code in _BLOCKED and ask.place is not None)):
             name = self.bins.of(ask.label)
             self._used[name] = self._used.get(name, 0) + 1
         if code is Code.OK:
             self.placed.append(ask.label)
         elif code in _GONE and ask.label in self.placed:
             self.failed[ask.label] = ""  # there is no more of it, which is what was asked for
-        elif self.bins is None or code not in _OTHER_SLOT:
+        elif code not in _BLOCKED:
             self.failed[ask.label] = f"{code}: {message}"
+        elif self.bins is None:
+            self._blocked[ask.label] = (len(self.placed), f"{code}: {message}")
 
     @property
     def outcome(self) -> str:

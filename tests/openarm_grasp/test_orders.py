@@ -89,3 +89,22 @@ def test_orders_and_bins_that_make_no_sense_are_refused(tmp_path):
     path.write_text("bins: {a: {x: [0.1, 0.2], y: [0.0, 0.1]}}\nrest: b\n")
     with pytest.raises(OpenArmError, match="no bin 'b'; bins: a"):
         load_bins(path)
+
+
+def test_what_others_block_is_asked_for_again_when_they_are_gone():
+    order = Order(("red", "blue"))
+    assert order.next() == Ask("red")
+    order.done(Ask("red"), Code.IN_COLLISION, "blue is in the way")
+    assert order.next() == Ask("blue")
+    order.done(Ask("blue"), Code.OK, "")
+    assert order.next() == Ask("red")
+    order.done(Ask("red"), Code.OK, "")
+    assert order.next() is None
+    assert order.outcome == "SUCCESS"
+
+
+def test_what_stays_blocked_failed_with_its_reason():
+    order = Order(("red", "blue"))
+    carry_out(order, {Ask("red"): Code.NO_PLAN, Ask("blue"): Code.NO_PLAN})
+    assert order.faults() == {"red": "NO_PLAN: as told", "blue": "NO_PLAN: as told"}
+    assert order.outcome == "FAILED"
