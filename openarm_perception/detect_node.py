@@ -14,6 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from openarm_interfaces.srv import MeasureTable
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image
 from vision_msgs.msg import Detection2DArray, Detection3DArray
@@ -34,6 +35,10 @@ from openarm_perception.draw import annotate
 from openarm_perception.localize import Localizer
 from openarm_perception.matching import StampMatcher
 from openarm_perception.pipeline import Perceived, Pipeline
+from openarm_perception.table import TableMeasurement, measure_table, of_block
+
+#: A measurement is made of an image that is not older than this, s.
+_FRESH = 1.0
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,9 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(tuple(self._topics()), self._on_frame)
         self._inputs: list[Subscription] = []
         self._waiting: _Frame | None = None
+        #: The newest frame whose camera pose is known, that pose, and when it was there.
+        self._newest: tuple[_Frame, NDArray[np.float64], float] | None = None
+        self._asked_until = 0.0
         self._last_ns: int | None = None
         self._counts: dict[str, int] = dict.fromkeys(("frames", "skipped", "refused_frames", "refused_objects"), 0)
 
@@ -80,6 +88,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._retry.cancel()
         self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
         self.diagnose(True, "idle: nobody listens", **self._counts)
+        self.create_service(MeasureTable, "~/measure_table", self._on_measure_table)
         if self.lockstep:
             self._subscribe()
 
@@ -98,9 +107,15 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         """Stamp of the frame that waits for the pose of its camera."""
         return self._waiting.t_ns if self._waiting else None
 
+    @property
+    def measurable(self) -> bool:
+        """Whether there is an image that the table can be measured in."""
+        return self._newest is not None and self.monotonic() - self._newest[2] <= _FRESH
+
     def _follow_demand(self) -> None:
         outputs = (self._boxes, self._objects, self._picture, self._markers)
-        wanted = any(output.get_subscription_count() for output in outputs)
+        asked = self.monotonic() < self._asked_until
+        wanted = asked or any(output.get_subscription_count() for output in outputs)
         if wanted and not self._inputs:
             self._subscribe()
         elif not wanted and self._inputs:
@@ -178,6 +193,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             self._complain("skipped", f"frame skipped: pose of the camera at its stamp: {error.message}")
             return
         self._waiting = None
+        self._newest = (frame, T_base_camera, self.monotonic())
         try:
             started = time.perf_counter()
             perceived = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, T_base_camera)
@@ -204,6 +220,45 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         view = ", ".join(detection.label for detection in perceived.located) or "nothing"
         refused = f"; not located: {'; '.join(perceived.refused)}" if perceived.refused else ""
         self.diagnose(True, f"in view: {view}{refused}", processing_ms=f"{elapsed_ms:.1f}", **self._counts)
+
+    def _on_measure_table(
+        self, request: MeasureTable.Request, response: MeasureTable.Response
+    ) -> MeasureTable.Response:
+        try:
+            result = self._measure_table(request)
+        except OpenArmError as error:
+            response.code, response.message = error.code.value, error.message
+            return response
+        response.success, response.code = True, Code.OK.value
+        response.height, response.std, response.tilt = result.height, result.std, result.tilt
+        response.points = result.points
+        before = self._pipeline.localizer.table_height
+        response.message = f"the table is {result.height:.4f} m high; the detector took it for {before:.4f} m"
+        if request.apply:
+            self._pipeline.localizer.table_height = result.height
+            response.message += ", and takes what was measured now"
+        return response
+
+    def _measure_table(self, request: MeasureTable.Request) -> TableMeasurement:
+        self._asked_until = self.monotonic() + 5.0
+        newest = self._newest
+        if newest is None or not self.measurable:
+            raise OpenArmError(
+                Code.NOT_READY, f"no image of {self.config.camera} yet; it is listened to now: ask again in a second"
+            )
+        frame, T_base_camera, _ = newest
+        localizer = self._pipeline.localizer
+        if request.block_height == 0.0:
+            return measure_table(frame.depth, frame.intrinsics, T_base_camera, localizer.limits, localizer.table_height)
+        found = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, T_base_camera).located
+        blocks = [place for place in found if request.label in ("", place.label) and place.measured]
+        if len(blocks) != 1:
+            view = ", ".join(place.label for place in found) or "nothing"
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"expected one block {request.label!r} in view, which shows {view}; give its label",
+            )
+        return of_block(blocks[0], request.block_height)
 
     def _complain(self, count: str, message: str) -> None:
         self._counts[count] += 1

@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
+from openarm_interfaces.srv import MeasureTable
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from tf2_msgs.msg import TFMessage
@@ -180,6 +181,40 @@ def test_b31_b62_without_a_depth_topic_an_object_of_known_height_is_found_by_its
     np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.001)
     size = found.bbox.size
     np.testing.assert_allclose((size.x, size.y, size.z), (0.04, 0.06, 0.05), atol=0.0015)
+
+
+def test_b63_the_height_of_the_table_is_measured_from_its_surface_or_a_block_and_applied(ros, bench) -> None:
+    """The detector was told 0.41 m; the camera sees 0.40 m."""
+    camera = FakeCamera(ros)
+    camera.publish_mount()
+    node = ros.add(DetectNode(parameter_overrides=[Parameter("table_height", value=0.41)], namespace="other"))
+    client = ros.node.create_client(MeasureTable, "/other/detector/measure_table")
+
+    def ask(**fields) -> MeasureTable.Response:
+        """With an image that is fresh, however busy the machine is."""
+        for _ in range(5):
+            bench.pump(lambda: node.measurable, "an image")
+            answer = ros.call(client, MeasureTable.Request(**fields))
+            if answer.code != "NOT_READY":
+                return answer
+        raise AssertionError(answer.message)
+
+    early = ros.call(client, MeasureTable.Request())
+    assert (early.success, early.code) == (False, "NOT_READY")
+    ros.spin_until(lambda: camera.pubs["depth"].get_subscription_count() == 2, 10.0, "it listens because it was asked")
+    surface = ask()
+    assert surface.success, surface.message
+    assert surface.height == pytest.approx(TABLE, abs=0.0005)
+    assert surface.tilt < 0.002
+    assert surface.std < 0.001
+    assert surface.points > 10_000
+    block = ask(block_height=0.048, label="red", apply=True)  # the block is told 2 mm too low
+    assert block.success, block.message
+    assert block.height == pytest.approx(TOP - 0.048, abs=0.0005)
+    assert "takes what was measured now" in block.message
+    assert ask(block_height=0.048).message.count(f"{block.height:.4f}") == 2
+    for fields, text in (({"block_height": 3.0}, "0.005 .. 0.5"), ({"block_height": 0.05, "label": "blue"}, "'blue'")):
+        assert text in ask(**fields).message
 
 
 def test_b04_a61_boxes_in_the_image_by_their_centre(ros, bench) -> None:
