@@ -18,6 +18,8 @@ Ints = NDArray[np.int64]
 
 #: Two configurations nearer than this are one, rad.
 _SAME = 1e-6
+#: Attempts in a row without success after which a path counts as short.
+_IDLE = 20
 
 
 @njit(cache=True, nogil=True)
@@ -180,10 +182,11 @@ def shorten(
     np.random.seed(seed)
     n = points.shape[1]
     count = _skip(points, count, resolution, levers, model, work)
-    fresh = np.empty((4, n))
+    fresh, idle = np.empty((4, n)), 0
     for _ in range(attempts):
-        if count < 3:
+        if count < 3 or idle > _IDLE:
             break
+        idle += 1
         if np.random.random() < 0.5:
             at = 1 + int(np.random.random() * (count - 2))
             first, last, size = at - 1, at + 1, 3
@@ -230,4 +233,5 @@ def shorten(
         for k in range(size):
             points[first + k] = fresh[k]
         count += longer
+        idle = 0
     return _skip(points, count, resolution, levers, model, work)
