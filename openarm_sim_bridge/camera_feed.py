@@ -35,16 +35,23 @@ class CameraFeed:
         environ: Its environment.
         first: A state to warm up with.
         told: Called (from `poll`) with a sentence when it died or can't draw.
+        speed: Simulated seconds a wall second. Above 1 the cameras keep their rates on the wall clock: drawing is not
+            faster because time is.
     """
 
     def __init__(
-        self, setup: CameraSetup, environ: Mapping[str, str], first: Snapshot, told: Callable[[str], None]
+        self,
+        setup: CameraSetup,
+        environ: Mapping[str, str],
+        first: Snapshot,
+        told: Callable[[str], None],
+        speed: float = 1.0,
     ) -> None:
         self._setup = setup
         self._environ = dict(environ)
         self._first = first
         self._told = told
-        self._ticks = {camera.name: RateDivider(camera.rate) for camera in setup.cameras}
+        self._ticks = {camera.name: RateDivider(camera.rate / max(1.0, speed)) for camera in setup.cameras}
         self._lock = threading.Lock()  # of the sender, which is exchanged when the process is started again
         self._earlier: dict[str, int] = {camera.name: 0 for camera in setup.cameras}
         self._drawn: dict[str, int] = dict(self._earlier)

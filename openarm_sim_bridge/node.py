@@ -181,7 +181,8 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         environ = {**os.environ, "ROS_DOMAIN_ID": str(self.context.get_domain_id())}
         if LARGE_PROFILE in environ:
             environ[PROFILE] = environ[LARGE_PROFILE]
-        return CameraFeed(setup, environ, first, self._on_no_images)
+        speed = 1.0 if self.lockstep else self.config.speed
+        return CameraFeed(setup, environ, first, self._on_no_images, speed)
 
     def _on_no_images(self, fault: str) -> None:
         if fault:
