@@ -8,16 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_sim_bridge.actuation import End, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
-from openarm_sim_bridge.gripper import GripperConfig, GripperFollower, GripperGoal, GripperOutcome
 from openarm_sim_bridge.tracker import Tracker
 from openarm_sim_bridge.trajectory import JointGroup, JointTolerance, Trajectory, TrajectoryError, TrajectoryResult
 
 MS = 1_000_000
 GROUP = JointGroup(("j1", "j2"), np.array([-2.0, -2.0]), np.array([2.0, 2.0]), np.array([4.0, 4.0]))
 CONFIG = TrajectoryConfig()
-FINGER = JointGroup(("finger",), np.array([0.0]), np.array([0.044]), np.array([10.0]))
 START = 1_000 * MS
 
 
@@ -220,6 +218,18 @@ def test_a_refused_trajectory_leaves_the_running_one_alone() -> None:
     assert arm.run().end is End.SUCCEEDED
 
 
+def test_p21_a_busy_arm_refuses_new_goals_where_that_is_configured() -> None:
+    arm = Arm(config=TrajectoryConfig(new_goal="refuse"))
+    arm.start(**CUBIC)
+    arm.tick(30)
+    with pytest.raises(TrajectoryError, match=r"another 0\.70 s.*trajectory\.new_goal") as caught:
+        arm.start(**CUBIC)
+    assert (caught.value.code, caught.value.result) == (Code.BUSY, TrajectoryResult.INVALID_GOAL)
+    assert arm.run().end is End.SUCCEEDED
+    arm.start(t=np.array([1.0]), q=np.zeros((1, 2)))
+    assert arm.follower.busy
+
+
 def test_reset_aborts_and_holds_the_new_position() -> None:
     arm = Arm()
     arm.start(**CUBIC)
@@ -261,126 +271,3 @@ def test_the_tracker_arrives_without_overshoot(target: float, v: float, a: float
         furthest = max(furthest, abs(tracker.position[0]))
     assert tracker.position[0] == target
     assert furthest <= abs(target) + 1e-12
-
-
-class Finger:
-    """A gripper follower and a finger that an object may stop at `width`; pressing on it costs `effort`."""
-
-    def __init__(self, position: float = 0.044, stop: float = -1.0) -> None:
-        self.follower = GripperFollower(FINGER, GripperConfig(), position, 30.0)
-        self.x, self.v, self.stop, self.t_ns = position, 0.0, stop, START
-        self.targets: list[float] = []
-        self.outcomes: list[GripperOutcome] = []
-
-    def start(self, position: float, **kwargs) -> None:
-        goal = self.follower.check(GripperGoal(position, **kwargs))
-        self.follower.start(goal, self.x, self.effort, self.outcomes.append)
-
-    @property
-    def effort(self) -> float:
-        command = self.targets[-1] if self.targets else self.x
-        return float(np.clip(2000.0 * (command - self.x), -30.0, 30.0))
-
-    def run(self, limit: int = 400) -> GripperOutcome:
-        n = len(self.outcomes)
-        while len(self.outcomes) == n:
-            assert limit > 0, "the goal did not end"
-            self.tick()
-            limit -= 1
-        return self.outcomes[-1]
-
-    def tick(self, n: int = 1) -> None:
-        for _ in range(n):
-            self.targets.append(self.follower.update(self.t_ns, 10 * MS, self.x, self.v, self.effort))
-            x = max(self.targets[-1], self.stop)
-            self.v, self.x = (x - self.x) / 0.01, x
-            self.t_ns += 10 * MS
-
-
-@pytest.mark.parametrize("position", [0.005, 0.035, 0.025, 0.0, 0.044])
-def test_p22_the_finger_reaches_its_goal(position: float) -> None:
-    finger = Finger(position=0.02)
-    finger.start(position)
-    outcome = finger.run()
-    assert (outcome.end, outcome.reached_goal, outcome.stalled) == (End.SUCCEEDED, True, False)
-    assert outcome.position == pytest.approx(position, abs=0.001)
-
-
-def test_b53_closing_takes_six_tenths_of_a_second() -> None:
-    finger = Finger()
-    finger.start(0.0)
-    finger.run()
-    assert (finger.t_ns - START) / 1e9 == pytest.approx(0.66, abs=0.06)
-
-
-def test_an_object_stalls_the_finger_and_is_pressed_on() -> None:
-    finger = Finger(stop=0.025)
-    finger.start(0.0)
-    outcome = finger.run()
-    assert (outcome.end, outcome.reached_goal, outcome.stalled) == (End.SUCCEEDED, False, True)
-    assert outcome.position == 0.025
-    assert outcome.effort == -30.0
-    finger.tick(100)
-    assert finger.targets[-1] == 0.0
-
-
-def test_effort_is_limited_as_asked_and_by_the_gripper() -> None:
-    finger = Finger()
-    for asked, limit in ((10.0, 10.0), (100.0, 30.0), (0.0, 30.0), (-5.0, 30.0)):
-        finger.start(0.0, max_effort=asked)
-        assert finger.follower.effort_limit == limit
-
-
-def test_velocity_is_limited_as_asked() -> None:
-    finger = Finger()
-    finger.start(0.0, max_velocity=0.022)
-    finger.run()
-    assert (finger.t_ns - START) / 1e9 == pytest.approx(2.05, abs=0.1)
-
-
-def test_cancel_stops_the_ramp() -> None:
-    finger = Finger()
-    finger.start(0.0)
-    finger.tick(20)
-    finger.follower.cancel()
-    assert finger.run(limit=2).end is End.CANCELLED
-    held = finger.targets[-1]
-    finger.tick(50)
-    assert finger.targets[-1] == pytest.approx(held, abs=0.002)
-
-
-def test_a_new_gripper_goal_takes_over() -> None:
-    finger = Finger()
-    finger.start(0.0)
-    finger.tick(5)
-    finger.start(0.044)
-    assert finger.outcomes[0].end is End.ABORTED
-    assert finger.run().reached_goal
-
-
-def test_a_finger_that_never_rests_times_out() -> None:
-    finger = Finger()
-    finger.start(0.02)
-    for i in range(600):
-        finger.follower.update(finger.t_ns, 10 * MS, 0.03, 0.01 * (-1) ** i, 0.0)
-        finger.t_ns += 10 * MS
-    assert [o.end for o in finger.outcomes] == [End.ABORTED]
-    assert "still moves at" in finger.outcomes[0].text
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "code", "message"),
-    [
-        (
-            {"position": 0.1},
-            Code.LIMITS,
-            r"position of finger is 0\.1000 m, out of its limits 0\.000 \(closed\) to 0\.044",
-        ),
-        ({"position": float("nan")}, Code.INVALID_ARGUMENT, "position of finger is nan"),
-        ({"position": 0.01, "max_effort": float("inf")}, Code.INVALID_ARGUMENT, "effort of finger is inf"),
-    ],
-)
-def test_bad_gripper_goals_are_refused_with_joint_and_value(kwargs: dict, code: Code, message: str) -> None:
-    with pytest.raises(OpenArmError, match=message) as caught:
-        Finger().follower.check(GripperGoal(**kwargs))
-    assert caught.value.code is code
