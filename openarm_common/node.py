@@ -209,6 +209,8 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
     code = 0
     try:
         node = factory()
+        if not rclpy.ok():  # the signal came while the node was being made
+            raise ExternalShutdownException
         executor = node.make_executor()
         signals.node = node
         executor.spin()
@@ -217,7 +219,7 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
         code = 1
     except ExternalShutdownException:
         pass  # the normal end
-    except rclpy_implementation.RCLError:
+    except (rclpy_implementation.RCLError, TypeError):  # the latter from an executor in a context that has ended
         if rclpy.ok():
             raise
         # The signal came while something of rcl was being made.
