@@ -25,6 +25,8 @@ node = App(name="node", help="List nodes and what each offers and uses.")
 
 #: Longer arrays are shown as their size.
 _LONGEST = 32
+#: A subscriber knows of a publisher a little later than the publisher of it, s.
+_SETTLE_S = 0.3
 
 
 def _listing(names: dict[str, str], key: str) -> Outcome:
@@ -164,6 +166,7 @@ def pub(
         filled = fill(interface(kind)(), _parse(message))
         publisher = peer.node.create_publisher(interface(kind), found, QOS_COMMAND)
         heard = peer.spin_until(publisher.get_subscription_count, 2.0)
+        peer.spin_until(lambda: False, _SETTLE_S if heard else 0.0)
         for i in range(count):
             publisher.publish(filled)
             peer.spin_until(lambda: False, 1.0 / rate if rate > 0.0 and i + 1 < count else 0.0)

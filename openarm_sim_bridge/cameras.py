@@ -100,6 +100,7 @@ class SnapshotRenderer:
         Raises:
             OpenArmError: CONFIG_INVALID, when the model lacks a camera or its image is too large for the model.
         """
+        self._gl.make_current()  # another renderer of this thread may have been closed, which leaves none current
         if self._drawn is None or self._drawn.model is not snapshot.model:
             if self._drawn is not None:
                 self._drawn.context.free()
