@@ -29,7 +29,8 @@ CAMERA = CameraConfig(
 )
 #: A camera 1 m above a plane, tilted by 30 degrees about its image's horizontal axis; MuJoCo looks along -z with y up.
 MODEL = """
-<mujoco><compiler angle="radian"/><statistic extent="1"/><visual><map znear="0.02" zfar="20"/><quality offsamples="0" numslices="64" numstacks="64"/>
+<mujoco><compiler angle="radian"/><statistic extent="1"/><visual><map znear="0.02" zfar="20"/>
+<quality offsamples="0" numslices="64" numstacks="64"/>
 <global offwidth="640" offheight="480"/></visual><worldbody><light pos="0 0 3" castshadow="false"/>
 <geom type="plane" size="5 5 .1" rgba=".5 .5 .5 1"/>
 <body name="ball" pos="{x} {y} {z}"><freejoint/><geom type="sphere" size="{r}" rgba="1 0 0 1"/></body>
