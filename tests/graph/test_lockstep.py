@@ -57,10 +57,10 @@ def test_a_node_that_does_not_answer_ends_the_run_with_its_name(
     pid = up.wait_ready()["nodes"]["calibration_publisher"]["pid"]
     os.kill(pid, signal.SIGSTOP)
     try:
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 60.0
         while "failed" not in up.output.read_text() and time.monotonic() < deadline:
             time.sleep(0.05)
     finally:
         os.kill(pid, signal.SIGCONT)
-    assert up.process.wait(30.0) == 1
+    assert up.process.wait(60.0) == 1
     assert "calibration_publisher did not answer tick" in up.output.read_text()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -74,6 +75,9 @@ def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsy
     assert "data: ready" in capsys.readouterr().out
     assert 20.0 < ros_cli.hz("/ticks", seconds=1.0).data["rate_hz"] < 80.0
     assert ros_cli.pub("/talk", "{data: hello}", count=2, rate=20.0).success
+    deadline = time.monotonic() + 5.0
+    while len(heard) < 2 and time.monotonic() < deadline:
+        time.sleep(0.01)  # the node takes them in a thread of its own
     assert heard == ["hello", "hello"]
     alone = ros_cli.pub("/nobody", type_="std_msgs/msg/String")
     assert (alone.success, alone.code) == (False, Code.NOT_READY)
