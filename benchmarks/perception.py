@@ -39,13 +39,13 @@ from benchmarks.map_scene import MapScene
 from benchmarks.report import Row, write_report
 from openarm_common.octomap_codec import read_file
 from openarm_common.scene import load_scene, random_scene
+from openarm_common.self_filter import SelfFilter
 from openarm_octomap.accuracy import compare
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import DepthScan, OccupancyGrid
 from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN
 from openarm_octomap.mapper import Frame, Mapper
-from openarm_octomap.self_filter import SelfFilter
 from openarm_perception.depth import Deprojector, DepthLimits
 
 PERIOD_NS = 500_000_000

@@ -17,10 +17,12 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamp
 from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
 from openarm_common.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.held import HeldBox
 
 Array = NDArray[np.float64]
 
@@ -301,3 +303,23 @@ def trajectory_from_msg(message: JointTrajectory) -> tuple[list[str], Array, Arr
     t = np.array([stamp_to_ns(p.time_from_start) * 1e-9 for p in points])
     q = np.array([p.positions for p in points], dtype=np.float64).reshape(len(points), len(names))
     return names, t, q, stack("velocities"), stack("accelerations")
+
+
+def held_from_msg(message: MarkerArray) -> tuple[HeldBox, ...]:
+    """Boxes that hang on links; a message replaces what was held before.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for a marker that is no box with edges and a pose.
+    """
+    boxes: list[HeldBox] = []
+    for marker in message.markers:
+        if marker.action in (Marker.DELETEALL, Marker.DELETE):
+            boxes = [] if marker.action == Marker.DELETEALL else [box for box in boxes if box.name != marker.ns]
+            continue
+        size = (marker.scale.x, marker.scale.y, marker.scale.z)
+        if marker.type != Marker.CUBE or not all(0.0 < edge < 2.0 for edge in size):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"held {marker.ns!r}: expected a cube with edges of 0 .. 2 m, got {size}"
+            )
+        boxes.append(HeldBox(marker.ns, marker.header.frame_id, pose_to_matrix(marker.pose), size))
+    return tuple(boxes)

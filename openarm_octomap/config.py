@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from openarm_common.config import Config
+from openarm_common.self_filter import SelfFilterConfig
 
 Vector3 = tuple[float, float, float]
 
@@ -65,35 +66,12 @@ class GridConfig(Config):
         return self.miss or -self.clamp_max / (self.frames_to_clear - 0.5)
 
 
-class FilterConfig(Config):
-    """How the robot is cut out of what its cameras see."""
+class FilterConfig(SelfFilterConfig):
+    """How the robot is cut out of what its cameras see, and out of the map."""
 
-    enabled: bool = Field(default=True, description="cut the robot and what it holds out of the images")
-    padding: float = Field(default=0.02, ge=0.0, le=0.2, description="around every link, m")
-    link_padding: tuple[str, ...] = Field(default=(), description="other paddings, as `link=metres`")
-    held_padding: float = Field(default=0.02, ge=0.0, le=0.2, description="around what a hand holds, m")
     reset_padding: float = Field(
         default=0.01, ge=0.0, le=0.2, description="cells this near to the robot are made unknown, m"
     )
-
-    @model_validator(mode="after")
-    def _pairs(self) -> FilterConfig:
-        self.paddings()
-        return self
-
-    def paddings(self) -> dict[str, float]:
-        """The paddings that differ, by link."""
-        out: dict[str, float] = {}
-        for item in self.link_padding:
-            link, _, metres = item.partition("=")
-            try:
-                out[link.strip()] = float(metres)
-            except ValueError:
-                example = "openarm_left_hand=0.03"
-                raise ValueError(f"link_padding {item!r}: expected `link=metres`, such as {example}") from None
-            if not 0.0 <= out[link.strip()] <= 0.2:
-                raise ValueError(f"link_padding {item!r}: expected 0 .. 0.2 m")
-        return out
 
 
 UnknownPolicy = Literal["free", "occupied"]

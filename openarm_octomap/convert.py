@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map as messages, and what hands hold from them."""
+"""The map as messages."""
 
 from __future__ import annotations
 
@@ -14,13 +14,11 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from openarm_common.convert import byte_array, cloud_from_points, ns_to_stamp, pose_to_matrix
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.convert import byte_array, cloud_from_points, ns_to_stamp
 from openarm_common.lattice import Lattice
 from openarm_common.node import BASE_FRAME
 from openarm_common.octomap_codec import TREE_ID, Payload
 from openarm_octomap.kernels import FREE, OCCUPIED
-from openarm_octomap.self_filter import HeldBox
 
 #: Colours of cells from the bottom of the workspace to its top.
 _BOTTOM, _TOP = np.array([0.12, 0.35, 0.75]), np.array([0.95, 0.65, 0.20])
@@ -92,23 +90,3 @@ def projected_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> Occ
     message.info.origin.orientation.w = 1.0
     message.data = array.array("b", np.ascontiguousarray(cells.T).tobytes())  # rows run along x
     return message
-
-
-def held_from_msg(message: MarkerArray) -> tuple[HeldBox, ...]:
-    """Boxes that hang on links; a message replaces what was held before.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, for a marker that is no box with edges and a pose.
-    """
-    boxes: list[HeldBox] = []
-    for marker in message.markers:
-        if marker.action in (Marker.DELETEALL, Marker.DELETE):
-            boxes = [] if marker.action == Marker.DELETEALL else [box for box in boxes if box.name != marker.ns]
-            continue
-        size = (marker.scale.x, marker.scale.y, marker.scale.z)
-        if marker.type != Marker.CUBE or not all(0.0 < edge < 2.0 for edge in size):
-            raise OpenArmError(
-                Code.INVALID_ARGUMENT, f"held {marker.ns!r}: expected a cube with edges of 0 .. 2 m, got {size}"
-            )
-        boxes.append(HeldBox(marker.ns, marker.header.frame_id, pose_to_matrix(marker.pose), size))
-    return tuple(boxes)

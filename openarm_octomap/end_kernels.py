@@ -11,8 +11,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.filter_kernels import Depth, Whole
 from openarm_common.lattice import KEY_ZERO
-from openarm_octomap.kernels import HIT_BIT, Depth, Whole, cell_distance
+from openarm_octomap.kernels import HIT_BIT, cell_distance
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]

@@ -14,12 +14,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.cameras import Intrinsics
+from openarm_common.depth_view import DepthView
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.lattice import DEPTH, Lattice
 from openarm_common.octomap_codec import Leaves, OctreeEncoder, Payload
+from openarm_common.self_filter import Shapes
 from openarm_octomap import end_kernels, kernels
 from openarm_octomap.config import GridConfig, UnknownPolicy
-from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN, Depth
+from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN
+from openarm_octomap.reset_kernels import reset_cells
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -30,61 +33,14 @@ _TABLE = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
-class DepthScan:
+class DepthScan(DepthView):
     """A depth image and where it was taken.
 
     Attributes:
-        depth: (h, w) planar depth, uint16 mm or float32 m.
-        intrinsics: Of the camera.
-        T_base_camera: Optical frame in the base frame, (4, 4).
-        near: Nearest valid depth, m.
-        far: Farthest valid depth, m.
         label: (h, w): 0 surroundings, 1 robot, 2 not known; None is all surroundings.
     """
 
-    depth: Depth
-    intrinsics: Intrinsics
-    T_base_camera: Array
-    near: float
-    far: float
     label: Bytes | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse what does not fit together.
-
-        Raises:
-            OpenArmError: BAD_IMAGE, naming what does not.
-        """
-        if self.depth.ndim != 2 or self.depth.dtype.name not in ("uint16", "float32"):
-            raise OpenArmError(
-                Code.BAD_IMAGE,
-                f"depth image is {self.depth.dtype} {self.depth.shape}; expected (h, w) of uint16 mm or float32 m",
-            )
-        size = (self.intrinsics.height, self.intrinsics.width)
-        if self.depth.shape != size:
-            raise OpenArmError(
-                Code.BAD_IMAGE,
-                f"depth image is {self.depth.shape[1]}x{self.depth.shape[0]} pixels, but its CameraInfo says"
-                f" {size[1]}x{size[0]}",
-            )
-        if not (self.intrinsics.fx > 0.0 and self.intrinsics.fy > 0.0):
-            raise OpenArmError(
-                Code.BAD_IMAGE, f"focal lengths are {self.intrinsics.fx}, {self.intrinsics.fy}; expected > 0"
-            )
-        if not np.isfinite(self.T_base_camera).all():
-            raise OpenArmError(Code.NO_TRANSFORM, "the pose of the camera is not finite")
-
-    @property
-    def rays(self) -> tuple[Floats, Floats]:
-        """Directions of columns (x over z) and of rows (y over z)."""
-        k = self.intrinsics
-        x = ((np.arange(k.width) - k.cx) / k.fx).astype(np.float32)
-        return x, ((np.arange(k.height) - k.cy) / k.fy).astype(np.float32)
-
-    @property
-    def scale(self) -> np.float32:
-        """Metres of one count."""
-        return np.float32(1e-3 if self.depth.dtype == np.uint16 else 1.0)
 
     def points(self) -> Floats:
         """Points (n, 3) float32 of the valid pixels in the base frame, m: exactly those that are put into the map."""
@@ -168,6 +124,20 @@ class OccupancyGrid:
         n = kernels.forget_before(
             limit, self.log_odds.reshape(-1), self.states.reshape(-1), self.seen.reshape(-1), self._changed
         )
+        return self._changed[:n].copy()
+
+    def forget(self, shapes: Shapes, padding: float) -> NDArray[np.int32]:
+        """Make the occupied cells unknown that padded shapes fill; flat indices of those.
+
+        Args:
+            shapes: The robot, base frame.
+            padding: In place of that of the shapes, m.
+        """
+        n = reset_cells(
+            shapes.kinds, shapes.halves + padding, shapes.seen_from(np.eye(4)),
+            self.lattice.resolution, np.array(self.lattice.key_min, np.int64), self.log_odds, self.states,
+            self._changed,
+        )  # fmt: skip
         return self._changed[:n].copy()
 
     def oldest_s(self, t_ns: int) -> float:

@@ -9,21 +9,17 @@ is released.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.filter_kernels import Whole
 from openarm_common.lattice import KEY_ZERO
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
-Depth = NDArray[np.uint16] | NDArray[np.float32]
-Real = float | np.floating[Any]
-Whole = int | np.integer[Any]
 
 FREE_BIT, HIT_BIT = 1, 2
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2

@@ -17,12 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.held import HeldBox
 from openarm_common.lattice import DEPTH, Lattice
 from openarm_common.octomap_codec import Payload, encode_states, read_file, write_file
+from openarm_common.self_filter import SelfFilter, Shapes
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig, UnknownPolicy
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
-from openarm_octomap.self_filter import HeldBox, SelfFilter, Shapes
 
 Floats = NDArray[np.float32]
 
@@ -118,6 +119,7 @@ class Mapper:
         self._grid = OccupancyGrid(grid)
         self._filter = SelfFilter(description, robot)
         self._filtering = robot.enabled
+        self._reset_padding = robot.reset_padding
         self._transform = DistanceTransform(self._grid.lattice, distances.reach, distances.unknown)
         self._lock = threading.Lock()
 
@@ -155,15 +157,17 @@ class Mapper:
             if self._filtering:
                 body = self._filter.shapes(frame.joints or {}, held)
                 shapes = body if frame is newest else shapes
-                find = self._filter.label_depth if isinstance(scan, DepthScan) else self._filter.label_cloud
-                label, removed[frame.source] = find(scan, body)  # type: ignore[arg-type]
+                if isinstance(scan, DepthScan):
+                    label, removed[frame.source] = self._filter.label_depth(scan, body)
+                else:
+                    label, removed[frame.source] = self._filter.label_points(scan.points, body)
                 scan = replace(scan, label=label)
             scans.append(scan)
         with self._lock:
             update = self._grid.integrate(scans, newest.t_ns)
             changes = [update.changed, self._grid.decay(newest.t_ns)]
             if shapes is not None:
-                changes.append(self._filter.reset(self._grid, shapes))
+                changes.append(self._grid.forget(shapes, self._reset_padding))
             if distances is not None:
                 self._transform.compute(self._grid.states, distances)
             return Report(

@@ -15,17 +15,17 @@ from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common.cameras import load_cameras
+from openarm_common.convert import held_from_msg
 from openarm_common.distance_field import CameraMoment, DistanceFieldWriter, field_path
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.held import HeldBox
 from openarm_common.housings import with_housings
 from openarm_common.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
 from openarm_common.tf import RobotStateListener
-from openarm_octomap import convert
 from openarm_octomap.camera_client import CloudSource, DepthSource, Source
 from openarm_octomap.config import OctomapNodeConfig
 from openarm_octomap.map_publisher import MapPublisher
 from openarm_octomap.mapper import Frame, Mapper, Report
-from openarm_octomap.self_filter import HeldBox
 from openarm_octomap.service_executor import MapServices
 
 
@@ -123,7 +123,7 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
 
     def _on_held(self, message: MarkerArray) -> None:
         try:
-            self._held = convert.held_from_msg(message)
+            self._held = held_from_msg(message)
         except OpenArmError as error:
             self.get_logger().warning(f"{self.config.held_topic}: {error.message}")
 

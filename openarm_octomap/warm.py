@@ -10,16 +10,16 @@ from openarm_common.cameras import Intrinsics
 from openarm_common.description import RobotDescription
 from openarm_common.distance_field import sphere_clearance
 from openarm_common.octomap_codec import decode
-from openarm_octomap.config import FilterConfig, GridConfig
+from openarm_common.self_filter import SelfFilter, SelfFilterConfig
+from openarm_octomap.config import GridConfig
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
-from openarm_octomap.self_filter import SelfFilter
 
 
 def warm() -> None:
     """Run each kernel once with the types that the package uses; the compiled code is cached beside the sources."""
     description = RobotDescription.load()
-    robot = SelfFilter(description, FilterConfig())
+    robot = SelfFilter(description, SelfFilterConfig())
     joints = {name: 0.0 for name, joint in description.joints.items() if joint.type != "fixed"}
     shapes = robot.shapes(joints)
     grid = OccupancyGrid(GridConfig(lower=(0.0, 0.0, 0.0), upper=(0.3, 0.3, 0.3), decay_s=1.0))
@@ -29,10 +29,10 @@ def warm() -> None:
         robot.label_depth(scan, shapes)
         grid.integrate([scan], 0)
     cloud = CloudScan(scan.points(), T[:3, 3])
-    robot.label_cloud(cloud, shapes)
+    robot.label_points(cloud.points, shapes)
     grid.integrate([cloud], 0)
     grid.decay(0)
-    robot.reset(grid, shapes)
+    grid.forget(shapes, 0.01)
     for payload in (grid.binary(), grid.full()):
         decode(payload.data, grid.lattice.resolution, binary=payload.binary).on(grid.lattice)
     distances = np.empty(grid.lattice.shape, np.float32)

@@ -11,13 +11,13 @@ from scipy.ndimage import binary_dilation
 
 from benchmarks.map_scene import MapScene, Visible
 from openarm_common import se3
+from openarm_common.held import HeldBox
 from openarm_common.scene import load_scene
+from openarm_common.self_filter import SelfFilter
 from openarm_octomap.accuracy import compare
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
-from openarm_octomap.grid import CloudScan
 from openarm_octomap.kernels import OCCUPIED
 from openarm_octomap.mapper import Mapper
-from openarm_octomap.self_filter import HeldBox, SelfFilter
 
 PERIOD_NS = 500_000_000
 DEMO = load_scene("demo")
@@ -79,7 +79,7 @@ def test_a46_the_clouds_of_both_cameras_meet_in_the_base_frame(scene: MapScene) 
     frames = scene.frames(0)
     wrist = frames[1].scan.points()
     body = SelfFilter(scene.body, FilterConfig())
-    label, _ = body.label_cloud(CloudScan(wrist, np.zeros(3)), body.shapes(scene.joints))
+    label, _ = body.label_points(wrist, body.shapes(scene.joints))
     scene.joints = home
     view = frames[0].scan
     local = se3.apply(se3.inverse(view.T_base_camera), wrist[label == 0])

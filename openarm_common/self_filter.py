@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot and what it holds, cut out of depth images, clouds and the map.
+"""The robot and what it holds, found in depth images and clouds.
 
 Shapes are the collision primitives of the robot description with a padding per link, and boxes that hang on links. All
 poses are in the base frame, m, of the moment of the image.
@@ -9,36 +9,50 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
+from openarm_common import filter_kernels as kernels
+from openarm_common.config import Config
+from openarm_common.depth_view import DepthView
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_octomap import filter_kernels as kernels
-from openarm_octomap.config import FilterConfig
-from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
+from openarm_common.held import HeldBox
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class HeldBox:
-    """A box that hangs on a link.
+class SelfFilterConfig(Config):
+    """How the robot is cut out of what its cameras see."""
 
-    Attributes:
-        name: For people.
-        link: Link that carries it.
-        T_link_box: Its middle in the link, (4, 4).
-        size: Edges (3,), m.
-    """
+    enabled: bool = Field(default=True, description="cut the robot and what it holds out of the images")
+    padding: float = Field(default=0.02, ge=0.0, le=0.2, description="around every link, m")
+    link_padding: tuple[str, ...] = Field(default=(), description="other paddings, as `link=metres`")
+    held_padding: float = Field(default=0.02, ge=0.0, le=0.2, description="around what a hand holds, m")
 
-    name: str
-    link: str
-    T_link_box: Array
-    size: tuple[float, float, float]
+    @model_validator(mode="after")
+    def _pairs(self) -> Self:
+        self.paddings()
+        return self
+
+    def paddings(self) -> dict[str, float]:
+        """The paddings that differ, by link."""
+        out: dict[str, float] = {}
+        for item in self.link_padding:
+            link, _, metres = item.partition("=")
+            try:
+                out[link.strip()] = float(metres)
+            except ValueError:
+                example = "openarm_left_hand=0.03"
+                raise ValueError(f"link_padding {item!r}: expected `link=metres`, such as {example}") from None
+            if not 0.0 <= out[link.strip()] <= 0.2:
+                raise ValueError(f"link_padding {item!r}: expected 0 .. 0.2 m")
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +95,13 @@ class SelfFilter:
         OpenArmError: CONFIG_INVALID, when a padding is given for a link that the robot does not have.
     """
 
-    def __init__(self, description: RobotDescription, config: FilterConfig) -> None:
+    def __init__(self, description: RobotDescription, config: SelfFilterConfig) -> None:
         special = config.paddings()
         for link in special:
             if link not in description.links:
                 raise OpenArmError(
                     Code.CONFIG_INVALID,
-                    f"filter.link_padding names link {link!r}; links: {', '.join(description.links)}",
+                    f"link_padding names link {link!r}; links: {', '.join(description.links)}",
                 )
         self._config = config
         self._description = description
@@ -129,7 +143,7 @@ class SelfFilter:
             T_base_shape=np.concatenate([T, [poses[box.link] @ box.T_link_box for box in held]]),
         )
 
-    def label_depth(self, scan: DepthScan, shapes: Shapes) -> tuple[Bytes, dict[str, int]]:
+    def label_depth(self, scan: DepthView, shapes: Shapes) -> tuple[Bytes, dict[str, int]]:
         """Find the robot in a depth image.
 
         Returns:
@@ -146,24 +160,15 @@ class SelfFilter:
         )  # fmt: skip
         return label, _named(shapes, counts)
 
-    def label_cloud(self, scan: CloudScan, shapes: Shapes) -> tuple[Bytes, dict[str, int]]:
-        """Find the robot in a cloud: labels (n,), and the points that each link took."""
-        label = np.zeros(scan.points.shape[0], np.uint8)
+    def label_points(self, points: NDArray[np.float32], shapes: Shapes) -> tuple[Bytes, dict[str, int]]:
+        """Find the robot in points (n, 3) of the base frame: labels (n,), and the points that each link took."""
+        label = np.zeros(points.shape[0], np.uint8)
         counts = np.zeros(len(shapes.names), np.int64)
         kernels.label_points(
-            scan.points, shapes.kinds, shapes.halves + shapes.padding[:, None], shapes.seen_from(np.eye(4)),
+            points, shapes.kinds, shapes.halves + shapes.padding[:, None], shapes.seen_from(np.eye(4)),
             shapes.owners, label, counts,
         )  # fmt: skip
         return label, _named(shapes, counts)
-
-    def reset(self, grid: OccupancyGrid, shapes: Shapes) -> NDArray[np.int32]:
-        """Make what the robot itself fills unknown in the map; flat indices of the cells."""
-        changed = np.empty(grid.lattice.cells, np.int32)
-        n = kernels.reset_cells(
-            shapes.kinds, shapes.halves + self._config.reset_padding, shapes.seen_from(np.eye(4)),
-            grid.lattice.resolution, np.array(grid.lattice.key_min, np.int64), grid.log_odds, grid.states, changed,
-        )  # fmt: skip
-        return changed[:n].copy()
 
 
 _KINDS = {"box": kernels.BOX, "cylinder": kernels.CYLINDER, "sphere": kernels.SPHERE}

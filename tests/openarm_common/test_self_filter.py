@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot and what it holds in images, clouds and the map."""
+"""The robot and what it holds in images and clouds."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.cameras import Intrinsics, load_cameras
+from openarm_common.depth_view import DepthView
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_octomap.config import FilterConfig, GridConfig
-from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
-from openarm_octomap.kernels import OCCUPIED, UNKNOWN
-from openarm_octomap.self_filter import HeldBox, SelfFilter
+from openarm_common.held import HeldBox
+from openarm_common.self_filter import SelfFilter, SelfFilterConfig
 
 ROBOT = RobotDescription.load()
 JOINTS = {name: 0.0 for name, joint in ROBOT.joints.items() if joint.type != "fixed"}
@@ -52,29 +51,29 @@ def test_p05_pixels_in_the_padded_shape_and_no_others_are_labelled(kind: str, se
     """Any pose of the camera, also inside the shape or beside it."""
     rng = np.random.default_rng(seed)
     description = RobotDescription.from_urdf(ONE_LINK.format(geometry=GEOMETRY[kind]))
-    robot = SelfFilter(description, FilterConfig(padding=0.03))
+    robot = SelfFilter(description, SelfFilterConfig(padding=0.03))
     T = se3.make(se3.exp_so3(rng.normal(size=3) * 1.5), np.array([0.1, -0.05, 1.0]) + rng.normal(size=3) * 0.3)
     depth = rng.uniform(0.05, 0.8, (120, 160)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = np.nan
-    scan = DepthScan(depth, K, T, 0.05, 3.0)
+    scan = DepthView(depth, K, T, 0.05, 3.0)
     label, counts = robot.label_depth(scan, robot.shapes({}))
     points = se3.apply(T, K.deproject(np.stack(np.meshgrid(np.arange(160), np.arange(120)), axis=-1), depth))
     inside, surely = truth(kind, points, 0.03 + 1e-5), truth(kind, points, 0.03 - 1e-5)
     assert (label[surely] == 1).all()
     assert not (label[~inside] == 1).any()
     assert counts.get("arm", 0) == np.count_nonzero(label == 1)
-    cloud = CloudScan(points[np.isfinite(depth)].astype(np.float32), T[:3, 3])
-    of_cloud, counts_of_cloud = robot.label_cloud(cloud, robot.shapes({}))
+    cloud = points[np.isfinite(depth)].astype(np.float32)
+    of_cloud, counts_of_cloud = robot.label_points(cloud, robot.shapes({}))
     assert abs(counts_of_cloud.get("arm", 0) - counts.get("arm", 0)) <= 2
     assert abs(np.count_nonzero(of_cloud) - np.count_nonzero(label == 1)) <= 2
 
 
 def test_views_without_a_return_through_the_robot_say_nothing() -> None:
     """A finger too near for the camera must not clear what is behind it."""
-    robot = SelfFilter(RobotDescription.from_urdf(ONE_LINK.format(geometry=GEOMETRY["box"])), FilterConfig())
+    robot = SelfFilter(RobotDescription.from_urdf(ONE_LINK.format(geometry=GEOMETRY["box"])), SelfFilterConfig())
     T = se3.make(None, (0.1, -0.05, 0.0))
     depth = np.zeros((120, 160), np.uint16)
-    label, counts = robot.label_depth(DepthScan(depth, K, T, 0.05, 3.0), robot.shapes({}))
+    label, counts = robot.label_depth(DepthView(depth, K, T, 0.05, 3.0), robot.shapes({}))
     assert label[60, 80] == 2
     assert label[5, 5] == 0
     assert counts == {}
@@ -84,53 +83,37 @@ def test_each_link_has_a_padding_of_its_own() -> None:
     """And says how many pixels it took."""
     camera = load_cameras()["overhead"]
     depth = np.full((480, 640), 0.62, np.float32)  # a sheet across the hands of the arms at zero
-    scan = DepthScan(depth, camera.intrinsics, camera.T_parent_optical, 0.2, 3.0)
+    scan = DepthView(depth, camera.intrinsics, camera.T_parent_optical, 0.2, 3.0)
     plain, wide = (
-        SelfFilter(ROBOT, FilterConfig(padding=0.0, link_padding=extra)) for extra in ((), ("openarm_left_link1=0.05",))
+        SelfFilter(ROBOT, SelfFilterConfig(padding=0.0, link_padding=extra))
+        for extra in ((), ("openarm_left_link1=0.05",))
     )
     a, b = (f.label_depth(scan, f.shapes(JOINTS))[1] for f in (plain, wide))
     assert b["openarm_left_link1"] > a["openarm_left_link1"] > 0
     assert b["openarm_right_link1"] == a["openarm_right_link1"] > 0
     with pytest.raises(OpenArmError, match="names link 'elbow'; links: world, "):
-        SelfFilter(ROBOT, FilterConfig(link_padding=("elbow=0.1",)))
+        SelfFilter(ROBOT, SelfFilterConfig(link_padding=("elbow=0.1",)))
     for wrong in ("openarm_left_hand", "openarm_left_hand=wide", "openarm_left_hand=3"):
         with pytest.raises(ValueError, match="link_padding"):
-            FilterConfig(link_padding=(wrong,))
+            SelfFilterConfig(link_padding=(wrong,))
 
 
 def test_p04_p05_a_held_box_follows_its_link() -> None:
-    robot = SelfFilter(ROBOT, FilterConfig(padding=0.0, held_padding=0.0))
+    robot = SelfFilter(ROBOT, SelfFilterConfig(padding=0.0, held_padding=0.0))
     held = HeldBox("left/cube", "openarm_left_hand_tcp", se3.make(None, (0.0, 0.0, 0.03)), (0.05, 0.05, 0.05))
     for q in (0.0, 0.9):
         joints = JOINTS | {"openarm_left_joint4": q}
         middle = se3.apply(ROBOT.link_pose("openarm_left_hand_tcp", joints), (0.0, 0.0, 0.05))
-        cloud = CloudScan(middle[None].astype(np.float32), np.zeros(3))
-        label, counts = robot.label_cloud(cloud, robot.shapes(joints, [held]))
+        cloud = middle[None].astype(np.float32)
+        label, counts = robot.label_points(cloud, robot.shapes(joints, [held]))
         assert label.tolist() == [1]
         assert counts == {"held/left/cube": 1}
-        assert robot.label_cloud(cloud, robot.shapes(joints))[1] == {}
+        assert robot.label_points(cloud, robot.shapes(joints))[1] == {}
     with pytest.raises(OpenArmError) as error:
         robot.shapes(JOINTS, [HeldBox("x", "tray", np.eye(4), (1, 1, 1))])
     assert error.value.code == Code.NO_TRANSFORM
 
 
-def test_cells_that_the_robot_fills_are_made_unknown() -> None:
-    """What was marked there before, such as an object that the hand took."""
-    robot = SelfFilter(ROBOT, FilterConfig(padding=0.0, reset_padding=0.0))
-    grid = OccupancyGrid(GridConfig())
-    grid.log_odds[...], grid.states[...] = 1.0, OCCUPIED
-    shapes = robot.shapes(JOINTS)
-    changed = robot.reset(grid, shapes)
-    gone = np.flatnonzero(grid.states.reshape(-1) == UNKNOWN)
-    np.testing.assert_array_equal(np.sort(changed), gone)
-    centres = grid.lattice.centres(np.argwhere(np.ones(grid.lattice.shape, bool)))
-    label, _ = robot.label_cloud(CloudScan(centres.astype(np.float32), np.zeros(3)), shapes)
-    assert np.count_nonzero(label) > 500
-    assert np.count_nonzero((label == 1) != (grid.states.reshape(-1) == UNKNOWN)) <= 3
-    assert np.isnan(grid.log_odds.reshape(-1)[gone]).all()
-    assert grid.counts()["unknown"] == gone.size
-
-
 def test_a_joint_without_a_position_is_named() -> None:
     with pytest.raises(OpenArmError, match="no position of joint"):
-        SelfFilter(ROBOT, FilterConfig()).shapes({})
+        SelfFilter(ROBOT, SelfFilterConfig()).shapes({})

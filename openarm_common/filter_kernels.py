@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numba kernels of the self-filter: which pixels, points and cells belong to a set of simple shapes.
+"""Numba kernels of the self-filter: which pixels and points belong to a set of simple shapes.
 
 A shape is a box, cylinder (axis z) or sphere: `kinds` (n,) 0, 1, 2; `halves` (n, 3) half edges, where a cylinder has
 its radius twice and half its length, a sphere its radius three times; all with padding. Poses are given as
@@ -8,17 +8,19 @@ its radius twice and half its length, a sphere its radius three times; all with 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-
-from openarm_common.lattice import KEY_ZERO
-from openarm_octomap.kernels import OCCUPIED, UNKNOWN, Depth, Real, Whole
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
+Depth = NDArray[np.uint16] | NDArray[np.float32]
+Real = float | np.floating[Any]
+Whole = int | np.integer[Any]
 
 BOX, CYLINDER, SPHERE = 0, 1, 2
 #: What is nearer to the camera's plane than this is not projected, m.
@@ -26,7 +28,8 @@ _PLANE = 0.02
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _inside(kind: Whole, x: Real, y: Real, z: Real, hx: Real, hy: Real, hz: Real) -> bool | np.bool_:
+def inside(kind: Whole, x: Real, y: Real, z: Real, hx: Real, hy: Real, hz: Real) -> bool | np.bool_:
+    """Whether a point lies in a shape of half edges (hx, hy, hz), both in the frame of the shape."""
     if kind == 0:
         return abs(x) <= hx and abs(y) <= hy and abs(z) <= hz
     if kind == 1:
@@ -120,7 +123,7 @@ def label_image(
                 dx, dy, dz = m00 * a + p0, m10 * a + p1, m20 * a + p2
                 z = np.float32(depth[v, u]) * scale
                 if near <= z <= far:
-                    if _inside(kind, dx * z + t0, dy * z + t1, dz * z + t2, hx, hy, hz):
+                    if inside(kind, dx * z + t0, dy * z + t1, dz * z + t2, hx, hy, hz):
                         label[v, u] = 1
                         n += 1
                 elif label[v, u] == 0 and _meets(dx, dy, dz, t0, t1, t2, hx, hy, hz):
@@ -157,56 +160,7 @@ def label_points(
             px = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
             py = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
             pz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            if _inside(kinds[k], px, py, pz, halves[k, 0], halves[k, 1], halves[k, 2]):
+            if inside(kinds[k], px, py, pz, halves[k, 0], halves[k, 1], halves[k, 2]):
                 label[i] = 1
                 counts[owners[k]] += 1
                 break
-
-
-@njit(cache=True, nogil=True)
-def reset_cells(
-    kinds: Ints, halves: Array, T_shape_base: Array,
-    resolution: float, key_min: Ints, log_odds: Floats, states: Bytes, changed: NDArray[np.int32],
-) -> int:  # fmt: skip
-    """Make the occupied cells unknown whose centre lies in a shape.
-
-    Args:
-        kinds: (n,).
-        halves: (n, 3).
-        T_shape_base: (n, 3, 4).
-        resolution: Edge of a cell, m.
-        key_min: (3,) key of states[0, 0, 0].
-        log_odds: (nx, ny, nz), changed.
-        states: (nx, ny, nz), changed.
-        changed: Filled with the flat indices of the cells.
-
-    Returns:
-        How many cells there were.
-    """
-    count = 0
-    _, ny, nz = states.shape
-    for i in range(kinds.size):
-        T, half = T_shape_base[i], halves[i]
-        lo, hi = np.empty(3, np.int64), np.empty(3, np.int64)
-        for k in range(3):
-            centre = -(T[0, k] * T[0, 3] + T[1, k] * T[1, 3] + T[2, k] * T[2, 3])
-            reach = abs(T[0, k]) * half[0] + abs(T[1, k]) * half[1] + abs(T[2, k]) * half[2]
-            lo[k] = max(int(np.floor((centre - reach) / resolution)) + KEY_ZERO - key_min[k], 0)
-            hi[k] = min(int(np.floor((centre + reach) / resolution)) + KEY_ZERO - key_min[k] + 1, states.shape[k])
-        for a in range(lo[0], hi[0]):
-            x = (a + key_min[0] - KEY_ZERO + 0.5) * resolution
-            for b in range(lo[1], hi[1]):
-                y = (b + key_min[1] - KEY_ZERO + 0.5) * resolution
-                for c in range(lo[2], hi[2]):
-                    if states[a, b, c] != OCCUPIED:
-                        continue
-                    z = (c + key_min[2] - KEY_ZERO + 0.5) * resolution
-                    px = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-                    py = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-                    pz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-                    if _inside(kinds[i], px, py, pz, half[0], half[1], half[2]):
-                        states[a, b, c] = UNKNOWN
-                        log_odds[a, b, c] = np.float32(np.nan)
-                        changed[count] = (a * ny + b) * nz + c
-                        count += 1
-    return count

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What hands hold: boxes that hang on links; m."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class HeldBox:
+    """A box that hangs on a link.
+
+    Attributes:
+        name: For people.
+        link: Link that carries it.
+        T_link_box: Its middle in the link, (4, 4).
+        size: Edges (3,), m.
+    """
+
+    name: str
+    link: str
+    T_link_box: NDArray[np.float64]
+    size: tuple[float, float, float]
