@@ -13,6 +13,8 @@ from openarm_common.errors import Code, OpenArmError
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
+#: Planar depth (h, w): millimetres (16UC1) or metres (32FC1).
+DepthImage = NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.uint16 | np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +29,7 @@ class DepthView:
         far: Farthest valid depth, m.
     """
 
-    depth: NDArray[np.uint16] | NDArray[np.float32]
+    depth: DepthImage
     intrinsics: Intrinsics
     T_base_camera: Array
     near: float

@@ -14,11 +14,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.depth_view import DepthImage
+
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
-Depth = NDArray[np.uint16] | NDArray[np.float32]
 Real = float | np.floating[Any]
 Whole = int | np.integer[Any]
 
@@ -79,7 +80,7 @@ def _window(
 
 @njit(cache=True, nogil=True)
 def label_image(
-    depth: Depth, scale: np.float32, near: np.float32, far: np.float32,
+    depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32,
     ray_x: Floats, ray_y: Floats, fx: float, fy: float, cx: float, cy: float,
     kinds: Ints, halves: Array, T_shape_camera: Array, owners: Ints, label: Bytes, counts: Ints,
 ) -> None:  # fmt: skip

@@ -11,7 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from openarm_common.filter_kernels import Depth, Whole
+from openarm_common.depth_view import DepthImage
+from openarm_common.filter_kernels import Whole
 from openarm_common.lattice import KEY_ZERO
 from openarm_octomap.kernels import HIT_BIT, cell_distance
 
@@ -28,7 +29,7 @@ def _hash(key: Whole, mask: int) -> Whole:
 
 @njit(cache=True, nogil=True)
 def image_points(
-    depth: Depth, scale: np.float32, near: np.float32, far: np.float32,
+    depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32,
     ray_x: Floats, ray_y: Floats, T: Floats, out: Floats,
 ) -> int:  # fmt: skip
     """Points of the valid pixels in the frame of the map, as `image_ends` computes them.
@@ -62,7 +63,7 @@ def image_points(
 
 @njit(cache=True, nogil=True)
 def image_ends(
-    depth: Depth, scale: np.float32, near: np.float32, far: np.float32,
+    depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32,
     block: int, stride: int, reach: np.float32,
     ray_x: Floats, ray_y: Floats, T: Floats, label: Bytes,
     resolution: float, key_min: Ints, origin: Floats, max_range: float,
@@ -162,7 +163,7 @@ def image_ends(
 
 @njit(cache=True, nogil=True)
 def _find_empty(
-    depth: Depth, scale: np.float32, near: np.float32, far: np.float32, label: Bytes,
+    depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32, label: Bytes,
     v0: int, block: int, empty: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     """Which blocks of the rows from v0 have no return at all: a dropout in a surface is no view into the distance."""

@@ -12,13 +12,16 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from openarm_common.convert import cloud_from_points, image_to_array, intrinsics_from_info, stamp_to_ns
+from openarm_common.depth_view import DepthView
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import QOS_NEWEST, QOS_SENSOR, BaseNode, run
+from openarm_common.node import BASE_FRAME, QOS_NEWEST, QOS_SENSOR, BaseNode, run
+from openarm_common.tf import RobotStateListener
 from openarm_perception.config import CloudNodeConfig, camera_of
 from openarm_perception.convert import check_frames
 from openarm_perception.depth import Deprojector, DepthImage, DepthLimits
 from openarm_perception.filters import CloudFilter
 from openarm_perception.matching import StampMatcher
+from openarm_perception.robot_client import RobotInView
 
 
 class _Camera:
@@ -30,6 +33,9 @@ class _Camera:
         self._name = name
         self._frame_id = camera.optical_frame
         self._deprojector = Deprojector(DepthLimits(near=camera.near, far=camera.far))
+        self._robot = RobotInView(node, node.config.self_filter, node.config.held_topic) if node.states else None
+        #: A frame that waits for the robot's posture at its stamp, and until when.
+        self._waiting: tuple[int, dict[str, Image | CameraInfo], float] | None = None
         self._filter = CloudFilter(node.config.filter)
         streams = ("depth", "info", "color") if node.config.color else ("depth", "info")
         self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(streams, self._on_frame)
@@ -57,6 +63,7 @@ class _Camera:
                 self._node.destroy_subscription(subscription)
             self._inputs.clear()
             self._matcher.clear()
+            self._waiting = None
             self.fault = ""
 
     def _subscribe(self, stream: str, kind: type[Image | CameraInfo], topic: str) -> None:
@@ -67,22 +74,70 @@ class _Camera:
         self._inputs.append(self._node.create_subscription(kind, name, add, QOS_NEWEST))
 
     def _on_frame(self, t_ns: int, messages: dict[str, Image | CameraInfo]) -> None:
+        if self._robot is None:
+            self._publish(t_ns, messages, None)
+        elif self._waiting is None:
+            self._waiting = (t_ns, messages, self._node.monotonic() + self._node.config.transform_wait)
+            self.try_waiting()
+
+    def try_waiting(self) -> bool:
+        """Publish the frame that waits, if the robot's posture at its stamp is known; whether it waits on.
+
+        A cloud with the robot in it is not published for one without.
+        """
+        if self._waiting is None or self._node.states is None:
+            return False
+        t_ns, messages, deadline = self._waiting
+        try:
+            buffer = self._node.states.buffer
+            posture = buffer.lookup(BASE_FRAME, self._frame_id, t_ns), buffer.joints_at(t_ns)
+        except OpenArmError as error:
+            if self._node.monotonic() < deadline:
+                self._node.retry.reset()
+                return True
+            self._waiting = None
+            self._refuse(f"the robot cannot be cut out: {error.message}")
+            return False
+        self._waiting = None
+        self._publish(t_ns, messages, posture)
+        return False
+
+    def _refuse(self, reason: str) -> None:
+        self.fault = f"{self._name}: frame refused: {reason}"
+        self._node.get_logger().warning(self.fault, throttle_duration_sec=5.0)
+
+    def _publish(
+        self,
+        t_ns: int,
+        messages: dict[str, Image | CameraInfo],
+        posture: tuple[NDArray[np.float64], dict[str, float]] | None,
+    ) -> None:
+        """Publish the cloud of a frame; `posture` is the pose of the camera and the joints of a robot to cut out."""
         depth, info = cast(Image, messages["depth"]), cast(CameraInfo, messages["info"])
         try:
             check_frames(messages, self._frame_id)
             started = time.perf_counter()
             deproject = self._deprojector.organised if self._node.config.organised else self._deprojector.valid_points
             pixels = self._filter.depth(cast(DepthImage, image_to_array(depth)))
-            points = self._filter.points(deproject(pixels, intrinsics_from_info(info)))
+            intrinsics = intrinsics_from_info(info)
+            if self._robot is not None and posture is not None:
+                limits = self._deprojector.limits
+                robot = self._robot.find(DepthView(pixels, intrinsics, posture[0], limits.near, limits.far), posture[1])
+                pixels = np.where(robot, pixels.dtype.type(0), pixels)
+            points = self._filter.points(deproject(pixels, intrinsics))
             rgb = self._colors(cast(Image, messages["color"]), points.shape) if "color" in messages else None
             self.elapsed_ms = (time.perf_counter() - started) * 1e3
         except OpenArmError as error:
-            self.fault = f"{self._name}: frame refused: {error.message}"
-            self._node.get_logger().warning(self.fault, throttle_duration_sec=5.0)
+            self._refuse(error.message)
             return
         self._points.publish(cloud_from_points(points, self._frame_id, t_ns, rgb))
         self.fault = ""
         self.frames += 1
+
+    def values(self) -> dict[str, object]:
+        """What /diagnostics says of the camera."""
+        removed = self._robot.values(f"{self._name}_") if self._robot else {}
+        return {f"{self._name}_frames": self.frames, f"{self._name}_ms": f"{self.elapsed_ms:.2f}", **removed}
 
     @staticmethod
     def _colors(message: Image, shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -101,8 +156,18 @@ class CloudNode(BaseNode[CloudNodeConfig]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("cloud", CloudNodeConfig, **kwargs)
+        #: Where the robot is; None when it is left in the clouds.
+        self.states: RobotStateListener | None = None
+        if self.config.self_filter.enabled:
+            self.states = RobotStateListener(self, self.description, joints=False)
+        self.retry = self.create_timer(0.01, self._try_waiting, clock=self.wall_clock)
+        self.retry.cancel()
         self._cameras = {name: _Camera(self, name) for name in self.config.cameras}
         self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
+
+    def _try_waiting(self) -> None:
+        if not any([camera.try_waiting() for camera in self._cameras.values()]):
+            self.retry.cancel()
 
     def _follow_demand(self) -> None:
         for camera in self._cameras.values():
@@ -110,9 +175,10 @@ class CloudNode(BaseNode[CloudNodeConfig]):
         faults = [camera.fault for camera in self._cameras.values() if camera.fault]
         active = [name for name, camera in self._cameras.items() if camera.active]
         message = "; ".join(faults) or (f"clouds of {', '.join(active)}" if active else "idle: nobody listens")
-        values = {f"{name}_frames": camera.frames for name, camera in self._cameras.items()}
-        times = {f"{name}_ms": f"{camera.elapsed_ms:.2f}" for name, camera in self._cameras.items()}
-        self.diagnose(not faults, message, **values, **times)
+        if self.states is not None:
+            self.states.enable(bool(active))
+        values = {key: value for camera in self._cameras.values() for key, value in camera.values().items()}
+        self.diagnose(not faults, message, **values)
 
 
 def main() -> None:

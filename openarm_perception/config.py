@@ -12,6 +12,7 @@ from openarm_common.scene import load_scene
 from openarm_perception.detector import Policy
 from openarm_perception.filters import FilterConfig
 from openarm_perception.localize import LocalizerConfig
+from openarm_perception.robot import CloudRobotConfig, RobotConfig
 
 
 class DetectNodeConfig(Config):
@@ -39,7 +40,9 @@ class DetectNodeConfig(Config):
         default=10.0, gt=0.0, le=60.0, description="most frames processed a second of the stamps, Hz"
     )
     transform_wait: float = Field(default=0.5, ge=0.0, le=5.0, description="longest wait for the camera's pose, s")
+    held_topic: str = Field(default="/motion/attached_objects", description="what the hands hold, as markers on links")
     localizer: LocalizerConfig = Field(default_factory=LocalizerConfig)
+    self_filter: RobotConfig = RobotConfig()
 
     def table_top_z(self) -> float:
         """Height of the table in the base frame, m.
@@ -62,7 +65,12 @@ class CloudNodeConfig(Config):
     )
     color: bool = Field(default=False, description="a field `rgb` beside x, y, z; organised clouds only")
     color_topic: str = Field(default="/{camera}/color/image_raw", description="aligned colour; {camera} is filled in")
+    held_topic: str = Field(default="/motion/attached_objects", description="what the hands hold, as markers on links")
+    transform_wait: float = Field(
+        default=0.2, ge=0.0, le=5.0, description="longest wait for the robot's posture at a stamp, with self_filter, s"
+    )
     filter: FilterConfig = FilterConfig()
+    self_filter: CloudRobotConfig = CloudRobotConfig()
 
     @model_validator(mode="after")
     def _fits(self) -> CloudNodeConfig:

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 from geometry_msgs.msg import Pose, PoseWithCovariance
+from numpy.typing import NDArray
 from rclpy.duration import Duration
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import ColorRGBA, Header
@@ -25,6 +27,7 @@ from openarm_common.convert import matrix_to_pose, ns_to_stamp, vector
 from openarm_common.errors import Code, OpenArmError
 from openarm_perception.detector import Detection2D
 from openarm_perception.localize import Detection3D
+from openarm_perception.pipeline import Perceived
 
 #: Markers of objects vanish this long after the last frame that showed them, s.
 MARKER_LIFETIME = 2.0
@@ -73,6 +76,22 @@ def detections_3d(located: Sequence[Detection3D], frame_id: str, t_ns: int) -> D
         box = BoundingBox3D(center=pose, size=vector(detection.size))
         message.detections.append(Detection3DMsg(header=message.header, results=results, bbox=box, id=name))
     return message
+
+
+def mask_image(perceived: Perceived, shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Which pixel (h, w) belongs to which object.
+
+    Returns:
+        0: to none, also where the robot is; i: to the i-th of `perceived.found`, which is the i-th of /detections_2d,
+        counted from 1; those from the 256th on are left out.
+    """
+    image = np.zeros(shape, np.uint8)
+    for i, detection in enumerate(perceived.found[:255], 1):
+        (u, v), (w, h) = detection.origin, detection.size
+        image[v : v + h, u : u + w][detection.mask] = i
+    if perceived.robot is not None:
+        image[perceived.robot] = 0
+    return image
 
 
 def markers(located: Sequence[Detection3D], frame_id: str, t_ns: int) -> MarkerArray:

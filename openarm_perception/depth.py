@@ -15,10 +15,10 @@ from pydantic import Field, model_validator
 
 from openarm_common.cameras import Intrinsics
 from openarm_common.config import Config
+from openarm_common.depth_view import DepthImage
 from openarm_common.errors import Code, OpenArmError
 
 Points = NDArray[np.float32]
-DepthImage = NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.uint16 | np.float32]
 
 
 class DepthLimits(Config):

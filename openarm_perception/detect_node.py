@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node `detector`: colour and depth images to objects in the image and in the base frame.
 
-It listens to the camera only while somebody listens to it, and to /joint_states only while the camera rides on an arm.
+It listens to the camera, and to /joint_states for the robot in view, only while somebody listens to it.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -23,6 +24,7 @@ from visualization_msgs.msg import MarkerArray
 from openarm_common.cameras import Intrinsics
 from openarm_common.config import load_config
 from openarm_common.convert import array_to_image, image_to_array, intrinsics_from_info, stamp_to_ns
+from openarm_common.depth_view import DepthView
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import BASE_FRAME, QOS_NEWEST, QOS_SENSOR, BaseNode, reliable, run
 from openarm_common.resources import config_dir
@@ -30,11 +32,12 @@ from openarm_common.tf import RobotStateListener
 from openarm_perception import convert
 from openarm_perception.config import DetectNodeConfig, camera_of
 from openarm_perception.depth import DepthImage, DepthLimits
-from openarm_perception.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.draw import annotate
 from openarm_perception.localize import Localizer
 from openarm_perception.matching import StampMatcher
 from openarm_perception.pipeline import Perceived, Pipeline
+from openarm_perception.robot_client import RobotInView
 from openarm_perception.table import TableMeasurement, measure_table, of_block
 
 #: A measurement is made of an image that is not older than this, s.
@@ -50,6 +53,16 @@ class _Frame:
     depth: DepthImage
     intrinsics: Intrinsics
     deadline: float  # wall clock, s
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A frame, where its camera was, where the robot is in it (None: not known), and when it was there."""
+
+    frame: _Frame
+    T_base_camera: NDArray[np.float64]
+    robot: Mask | None
+    at: float
 
 
 class DetectNode(BaseNode[DetectNodeConfig]):
@@ -74,15 +87,25 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(tuple(self._topics()), self._on_frame)
         self._inputs: list[Subscription] = []
         self._waiting: _Frame | None = None
-        #: The newest frame whose camera pose is known, that pose, and when it was there.
-        self._newest: tuple[_Frame, NDArray[np.float64], float] | None = None
+        #: The newest frame whose camera pose is known.
+        self._newest: _Placed | None = None
+        #: Without depth nothing says which pixels are the robot.
+        self._robot: RobotInView | None = None
+        if config.self_filter.enabled and config.depth_topic:
+            self._robot = RobotInView(self, config.self_filter, config.held_topic)
+        #: Why the robot could not be told from objects in the last frame.
+        self._uncut = ""
+        self._listening_since = 0.0
         self._asked_until = 0.0
         self._last_ns: int | None = None
-        self._counts: dict[str, int] = dict.fromkeys(("frames", "skipped", "refused_frames", "refused_objects"), 0)
+        self._counts: dict[str, int] = dict.fromkeys(
+            ("frames", "skipped", "uncut", "refused_frames", "refused_objects"), 0
+        )
 
         self._boxes = self.create_publisher(Detection2DArray, "/detections_2d", reliable(5))
         self._objects = self.create_publisher(Detection3DArray, "/detections_3d", reliable(5))
         self._picture = self.create_publisher(Image, "/detection_image", QOS_SENSOR)
+        self._mask = self.create_publisher(Image, "/detection_mask", QOS_SENSOR)
         self._markers = self.create_publisher(MarkerArray, "/detection_markers", reliable(5))
         self._retry = self.create_timer(0.02, self._try_waiting, clock=self.wall_clock)
         self._retry.cancel()
@@ -110,10 +133,10 @@ class DetectNode(BaseNode[DetectNodeConfig]):
     @property
     def measurable(self) -> bool:
         """Whether there is an image that the table can be measured in."""
-        return self._newest is not None and self.monotonic() - self._newest[2] <= _FRESH
+        return self._newest is not None and self.monotonic() - self._newest.at <= _FRESH
 
     def _follow_demand(self) -> None:
-        outputs = (self._boxes, self._objects, self._picture, self._markers)
+        outputs = (self._boxes, self._objects, self._picture, self._mask, self._markers)
         asked = self.monotonic() < self._asked_until
         wanted = asked or any(output.get_subscription_count() for output in outputs)
         if wanted and not self._inputs:
@@ -137,7 +160,8 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         return topics | ({"depth": (Image, config.depth_topic)} if config.depth_topic else {})
 
     def _subscribe(self) -> None:
-        self._poses.enable(self._rides)
+        self._poses.enable(self._rides or self._robot is not None)
+        self._listening_since = self.monotonic()
         for stream, (kind, topic) in self._topics().items():
 
             def add(message: Image | CameraInfo, stream: str = stream) -> None:
@@ -185,22 +209,59 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             return
         try:
             T_base_camera = self._poses.buffer.lookup(BASE_FRAME, self._optical_frame, frame.t_ns)
+            joints = self._posture(frame)
         except OpenArmError as error:
             if self.monotonic() < frame.deadline and not self._too_old(frame, error):
                 self._retry.reset()
                 return
             self._waiting = None
+            if error.code is Code.STALE_DATA and self._starting():
+                self._counts["skipped"] += 1
+                return
             self._complain("skipped", f"frame skipped: pose of the camera at its stamp: {error.message}")
             return
         self._waiting = None
-        self._newest = (frame, T_base_camera, self.monotonic())
         try:
             started = time.perf_counter()
-            perceived = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, T_base_camera)
+            robot = self._find_robot(frame, T_base_camera, joints)
+            self._newest = _Placed(frame, T_base_camera, robot, self.monotonic())
+            perceived = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, T_base_camera, robot)
         except OpenArmError as error:
             self._complain("refused_frames", f"frame refused: {error.message}")
             return
         self._publish(frame, perceived, (time.perf_counter() - started) * 1e3)
+
+    def _posture(self, frame: _Frame) -> Mapping[str, float] | None:
+        """Joints at the stamp, as long as they may still come; None when nobody tells them: objects are seen still."""
+        if self._robot is None:
+            return None
+        try:
+            return self._poses.buffer.joints_at(frame.t_ns)
+        except OpenArmError as error:
+            heard = self._poses.age_s() <= _FRESH
+            if self._starting() or (heard and self.monotonic() < frame.deadline and not self._too_old(frame, error)):
+                raise
+            self._uncut = error.message
+            return None
+
+    def _starting(self) -> bool:
+        """Whether the first joint states may still be on their way."""
+        return self.monotonic() < self._listening_since + self.config.transform_wait
+
+    def _find_robot(
+        self, frame: _Frame, T_base_camera: NDArray[np.float64], joints: Mapping[str, float] | None
+    ) -> Mask | None:
+        if self._robot is None or joints is None:
+            return None
+        limits = self._pipeline.localizer.limits
+        view = DepthView(frame.depth, frame.intrinsics, T_base_camera, limits.near, limits.far)
+        try:
+            robot = self._robot.find(view, joints)
+        except OpenArmError as error:
+            self._uncut = error.message
+            return None
+        self._uncut = ""
+        return robot
 
     def _too_old(self, frame: _Frame, error: OpenArmError) -> bool:
         """Whether waiting is in vain: joint states have passed the stamp without one that answers for it."""
@@ -215,11 +276,20 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         if self._picture.get_subscription_count():
             picture = annotate(frame.rgb, perceived)
             self._picture.publish(array_to_image(picture, "rgb8", self._optical_frame, frame.t_ns))
+        if self._mask.get_subscription_count():
+            mask = convert.mask_image(perceived, frame.rgb.shape[:2])
+            self._mask.publish(array_to_image(mask, "mono8", self._optical_frame, frame.t_ns))
         self._counts["frames"] += 1
         self._counts["refused_objects"] += len(perceived.refused)
         view = ", ".join(detection.label for detection in perceived.located) or "nothing"
         refused = f"; not located: {'; '.join(perceived.refused)}" if perceived.refused else ""
-        self.diagnose(True, f"in view: {view}{refused}", processing_ms=f"{elapsed_ms:.1f}", **self._counts)
+        values: dict[str, object] = {"processing_ms": f"{elapsed_ms:.1f}", **self._counts}
+        if self._robot is not None and perceived.robot is None:
+            self._counts["uncut"] += 1
+            refused += f"; the robot is taken for surroundings: {self._uncut}"
+        elif self._robot is not None:
+            values |= self._robot.values()
+        self.diagnose(True, f"in view: {view}{refused}", **values)
 
     def _on_measure_table(
         self, request: MeasureTable.Request, response: MeasureTable.Response
@@ -246,11 +316,12 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             raise OpenArmError(
                 Code.NOT_READY, f"no image of {self.config.camera} yet; it is listened to now: ask again in a second"
             )
-        frame, T_base_camera, _ = newest
+        frame, T_base_camera, robot = newest.frame, newest.T_base_camera, newest.robot
         localizer = self._pipeline.localizer
         if request.block_height == 0.0:
-            return measure_table(frame.depth, frame.intrinsics, T_base_camera, localizer.limits, localizer.table_height)
-        found = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, T_base_camera).located
+            depth = frame.depth if robot is None else np.where(robot, frame.depth.dtype.type(0), frame.depth)
+            return measure_table(depth, frame.intrinsics, T_base_camera, localizer.limits, localizer.table_height)
+        found = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, T_base_camera, robot).located
         blocks = [place for place in found if request.label in ("", place.label) and place.measured]
         if len(blocks) != 1:
             view = ", ".join(place.label for place in found) or "nothing"

@@ -26,21 +26,16 @@ from openarm_common.cameras import Intrinsics
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_perception import footprint, plane
-from openarm_perception.depth import DepthImage, DepthLimits, check_size, unit_scale
+from openarm_perception.depth import DepthImage, DepthLimits
 from openarm_perception.detector import Detection2D, Mask
+from openarm_perception.patch import Patch, cut
 
 Array = NDArray[np.float64]
 
-#: Depth with less noise than this is used as it is, m; 16UC1 alone rounds by 0.3 mm (1 sigma).
-_CLEAN = 0.0006
-#: More pixels without depth than this share, and it is used as it is no more.
-_FEW_HOLES = 0.001
-#: Stands for no depth among depths, m.
-_FAR = 100.0
 #: As many points of the sides as this are enough; tall objects show thousands.
 _SIDE_POINTS = 150
-#: Pixels around a detection that are looked at.
-_MARGIN = 4
+#: What is robot to a larger share is no object on the table.
+_MOSTLY = 0.5
 
 
 class LocalizerConfig(Config):
@@ -122,17 +117,6 @@ class Detection3D:
         return float(np.arctan2(self.T_base_object[1, 0], self.T_base_object[0, 0]))
 
 
-@dataclass(frozen=True)
-class _Patch:
-    """The surroundings of a detection: pixel rays and points, all (h, w, ...)."""
-
-    rays: Array  # directions in the base frame, of unit depth
-    z: Array  # planar depth, m, NaN where invalid
-    points: Array  # base frame, m
-    mask: Mask  # the object by colour
-    band: float  # heights within this of the top are top, m
-
-
 class Localizer:
     """Finds where detections are.
 
@@ -159,13 +143,18 @@ class Localizer:
         Raises:
             OpenArmError: BAD_IMAGE, when there are too few valid depths, or image and intrinsics disagree.
         """
-        patch = self._patch(found, depth, intrinsics, T_base_camera)
+        patch = cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band)
         v, u = np.nonzero(self._on_object(found, patch))
         ray = patch.rays[int(np.median(v)), int(np.median(u))]
         return T_base_camera[:3, 3] + ray * float(np.median(patch.z[v, u]))
 
     def locate(
-        self, found: Detection2D, depth: DepthImage, intrinsics: Intrinsics, T_base_camera: Array
+        self,
+        found: Detection2D,
+        depth: DepthImage,
+        intrinsics: Intrinsics,
+        T_base_camera: Array,
+        robot: Mask | None = None,
     ) -> Detection3D:
         """The object of a detection.
 
@@ -174,17 +163,26 @@ class Localizer:
             depth: (h, w) uint16 millimetres or float32 metres, planar.
             intrinsics: Of the camera, from its CameraInfo.
             T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image.
+            robot: (h, w) pixels that show the robot or what it holds: no part of the object, but they may hide it.
 
         Raises:
             OpenArmError: BAD_IMAGE, when the image border cuts the object, depths are missing, or image and intrinsics
-                disagree; NOTHING_DETECTED, when nothing stands above the table there, or too much of it is hidden.
+                disagree; NOTHING_DETECTED, when nothing stands above the table there, too much of it is hidden,
+                or most of it is the robot.
         """
         if found.truncated:
             raise OpenArmError(
                 Code.BAD_IMAGE,
                 f"{found.label} at pixel {_pixel(found)} is cut by the border of the image; its size is unknown",
             )
-        patch = self._patch(found, depth, intrinsics, T_base_camera)
+        patch = cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
+        share = float(np.count_nonzero(patch.robot & patch.coloured)) / found.area
+        if share > _MOSTLY:
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"{found.label} at pixel {_pixel(found)} is to {share:.0%} the robot or what it holds; it does not"
+                " stand on the table",
+            )
         if found.label in self._heights and self._valid(patch).sum() < self.config.min_points:
             return self.locate_on_plane(found, self._heights[found.label], intrinsics, T_base_camera)
         solid = self._on_object(found, patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
@@ -245,30 +243,11 @@ class Localizer:
         located.covariance[2, 2] = (0.5 * self.config.height_std) ** 2
         return replace(located, measured=False)
 
-    def _patch(self, found: Detection2D, depth: DepthImage, intrinsics: Intrinsics, T_base_camera: Array) -> _Patch:
-        scale = unit_scale(depth)
-        check_size("depth image", depth.shape, intrinsics)
-        # some surroundings: edges are found between a pixel of the object and one that is not
-        (u, v), (w, h) = found.origin, found.size
-        u0, u1 = max(u - _MARGIN, 0), min(u + w + _MARGIN, intrinsics.width)
-        v0, v1 = max(v - _MARGIN, 0), min(v + h + _MARGIN, intrinsics.height)
-        z = depth[v0:v1, u0:u1] * scale
-        z = np.where((z >= self.limits.near) & (z <= self.limits.far), z, np.nan)
-        z, noise = _denoise(z)
-        x = (np.arange(u0, u1) - intrinsics.cx) / intrinsics.fx
-        y = (np.arange(v0, v1) - intrinsics.cy) / intrinsics.fy
-        in_camera = np.stack([*np.meshgrid(x, y), np.ones(z.shape)], axis=-1)
-        rays = in_camera @ T_base_camera[:3, :3].T
-        mask = np.zeros(z.shape, np.bool_)
-        mask[v - v0 : v - v0 + h, u - u0 : u - u0 + w] = found.mask
-        band = max(self.config.top_band, 3.0 * noise)
-        return _Patch(rays, z, rays * z[..., None] + T_base_camera[:3, 3], mask, band)
-
     @staticmethod
-    def _valid(patch: _Patch) -> Mask:
+    def _valid(patch: Patch) -> Mask:
         return np.asarray(patch.mask & np.isfinite(patch.z))
 
-    def _on_object(self, found: Detection2D, patch: _Patch) -> Mask:
+    def _on_object(self, found: Detection2D, patch: Patch) -> Mask:
         valid = self._valid(patch)
         count = int(np.count_nonzero(valid))
         if count < self.config.min_points:
@@ -287,14 +266,14 @@ class Localizer:
         return float(np.median(heights[np.abs(heights - near_top) <= band]))
 
     @staticmethod
-    def _top_face(patch: _Patch, top: float) -> Mask:
+    def _top_face(patch: Patch, top: float) -> Mask:
         """The largest patch at the height of the top; depth, not colour, says where it ends."""
         grown = cv2.dilate(patch.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-        level = grown & (np.abs(patch.points[..., 2] - top) <= patch.band)
+        level = grown & ~patch.robot & (np.abs(patch.points[..., 2] - top) <= patch.band)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(level.astype(np.uint8), connectivity=4)
         return labels == 1 + int(np.argmax(stats[1:count, cv2.CC_STAT_AREA]))
 
-    def _edges(self, patch: _Patch, face: Mask, flank: Mask, top: float, camera: Array) -> tuple[Array, float]:
+    def _edges(self, patch: Patch, face: Mask, flank: Mask, top: float, camera: Array) -> tuple[Array, float]:
         """Points (n, 2) on the edges of the top, base frame, m, and the share of its outline that is in view.
 
         An edge lies between the face and what is far from it, or what belongs to the `flank`.
@@ -312,7 +291,7 @@ class Localizer:
             v, u = v[parted], u[parted]
             near, far = (v, u), (v + dv, u + du)
             step = patch.z[far] - patch.z[near]
-            hides = step < -self.config.hidden_step
+            hides = (step < -self.config.hidden_step) | patch.robot[far]
             hidden += int(np.count_nonzero(hides))
             distance = np.linalg.norm(patch.points[far] - patch.points[near], axis=1)
             # a near neighbour is a hole in the mask, another colour or a side of the object: no silhouette
@@ -342,19 +321,3 @@ class Localizer:
 
 def _pixel(found: Detection2D) -> str:
     return f"({found.centre[0]:.0f}, {found.centre[1]:.0f})"
-
-
-def _denoise(z: Array) -> tuple[Array, float]:
-    """Depth without the noise and dropouts of a real sensor, and the noise that is left, m; clean depth stays."""
-    holes = np.isnan(z)
-    # the median keeps edges where they are; a hole counts as far away, as what lies behind the object
-    smooth = cv2.medianBlur(np.where(holes, np.float32(_FAR), z).astype(np.float32), 5).astype(np.float64)
-    residual = np.sort(np.abs(smooth - z)[~holes])
-    # without the tenth that lies on edges; the median alone would be 0 where whole millimetres hide the noise
-    inner = residual[: len(residual) * 9 // 10]
-    noise = 1.25 * float(np.sqrt(np.mean(inner**2))) if len(inner) else 0.0
-    if noise < _CLEAN and np.count_nonzero(holes) < _FEW_HOLES * z.size:
-        return z, noise
-    smooth[smooth > 0.99 * _FAR] = np.nan
-    # a median of 25 leaves a quarter of the noise (sqrt(pi / 2 / 25))
-    return smooth, 0.25 * noise

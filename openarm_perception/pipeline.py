@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from openarm_common.cameras import Intrinsics
 from openarm_common.errors import OpenArmError
 from openarm_perception.depth import DepthImage, check_size, unit_scale
-from openarm_perception.detector import Detection2D, Detector, Policy, rank
+from openarm_perception.detector import Detection2D, Detector, Mask, Policy, rank
 from openarm_perception.localize import Detection3D, Localizer
 
 
@@ -23,11 +23,13 @@ class Perceived:
         found: In the image.
         located: In the base frame; those of `found` that could be.
         refused: Why the others could not be, one sentence each.
+        robot: (h, w) pixels that show the robot or what it holds; None when nobody looked for them.
     """
 
     found: tuple[Detection2D, ...]
     located: tuple[Detection3D, ...]
     refused: tuple[str, ...]
+    robot: Mask | None = None
 
 
 class Pipeline:
@@ -52,6 +54,7 @@ class Pipeline:
         depth: DepthImage,
         intrinsics: Intrinsics,
         T_base_camera: NDArray[np.float64],
+        robot: Mask | None = None,
     ) -> Perceived:
         """The objects of a frame.
 
@@ -60,6 +63,7 @@ class Pipeline:
             depth: (h, w) uint16 millimetres or float32 metres, aligned with `rgb`.
             intrinsics: Of both, from the CameraInfo.
             T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image.
+            robot: (h, w) pixels that show the robot or what it holds; they belong to no object.
 
         Raises:
             OpenArmError: BAD_IMAGE, when colour, depth and intrinsics do not belong together.
@@ -73,7 +77,7 @@ class Pipeline:
         refused: list[str] = []
         for detection in found:
             try:
-                located.append(self.localizer.locate(detection, depth, intrinsics, T_base_camera))
+                located.append(self.localizer.locate(detection, depth, intrinsics, T_base_camera, robot))
             except OpenArmError as error:
                 refused.append(error.message)
-        return Perceived(found, tuple(located), tuple(refused))
+        return Perceived(found, tuple(located), tuple(refused), robot)

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the nodes know of the robot in view: its posture from /joint_states, and what motion says that it holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from visualization_msgs.msg import MarkerArray
+
+from openarm_common.convert import held_from_msg
+from openarm_common.depth_view import DepthView
+from openarm_common.errors import OpenArmError
+from openarm_common.held import HeldBox
+from openarm_common.node import QOS_LATCHED, BaseNode
+from openarm_common.self_filter import SelfFilterConfig
+from openarm_perception.detector import Mask
+from openarm_perception.robot import RobotFinder
+
+
+class RobotInView:
+    """Finds the robot of a node, and what it holds, in depth images.
+
+    Args:
+        node: The node; it listens to what is held from now on (a message a grasp).
+        config: Paddings.
+        held_topic: Markers on links.
+    """
+
+    def __init__(self, node: BaseNode[Any], config: SelfFilterConfig, held_topic: str) -> None:
+        self._finder = RobotFinder(node.description, config)
+        self._held: tuple[HeldBox, ...] = ()
+        #: Pixels of the last image by link or `held/NAME`.
+        self.removed: Mapping[str, int] = {}
+
+        def on_held(message: MarkerArray) -> None:
+            try:
+                self._held = held_from_msg(message)
+            except OpenArmError as error:
+                node.get_logger().warning(f"{held_topic}: {error.message}")
+
+        node.create_subscription(MarkerArray, held_topic, on_held, QOS_LATCHED)
+
+    def find(self, view: DepthView, joints: Mapping[str, float]) -> Mask:
+        """Pixels (h, w) of the robot; arguments and errors as for `RobotFinder.find`."""
+        robot, self.removed = self._finder.find(view, joints, self._held)
+        return robot
+
+    def values(self, prefix: str = "") -> dict[str, object]:
+        """What /diagnostics says of the last image."""
+        return {f"{prefix}removed/{name}": n for name, n in self.removed.items()}
