@@ -28,8 +28,8 @@ from openarm_common.errors import Code, OpenArmError
 
 _CLOCK = "/clock"
 #: Subscribers of what a graph publishes come within this time after the publishers are there, s.
-_MEET_S = 2.0
-_SETTLE_S = 0.3
+_MEET_S = 4.0
+_SETTLE_S = 1.0
 
 
 class Player:

@@ -54,7 +54,12 @@ def test_a_node_that_does_not_answer_ends_the_run_with_its_name(
         "    params: {images: false, speed: 1.0, barrier.timeout: 1.0}\n"
     )
     up = start_graph(str(graph))
-    pid = up.wait_ready()["nodes"]["calibration_publisher"]["pid"]
+    nodes = up.wait_ready()["nodes"]
+    pid, log = nodes["calibration_publisher"]["pid"], Path(nodes["mujoco_bridge"]["log"])
+    deadline = time.monotonic() + 30.0
+    while "begins" not in log.read_text():  # before, the bridge waits for whoever has not come yet
+        assert time.monotonic() < deadline, "the lock-step does not begin"
+        time.sleep(0.05)
     os.kill(pid, signal.SIGSTOP)
     try:
         deadline = time.monotonic() + 60.0

@@ -56,6 +56,7 @@ def test_what_is_recorded_is_replayed(ros, tmp_path: Path) -> None:
     with open_bag(tmp_path / "bag") as bag:
         assert bag.counts["/robot_description"] == 1
         with Player(bag, ["/chatter", "/robot_description"], {"/chatter": "/talk"}, clock=True) as player:
+            ros.spin_until(lambda: ros.node.count_publishers("/talk") == 1, what="the subscriber knows the player")
             work = threading.Thread(target=player.play, args=(0.0, 0.0, 0.0, threading.Event()))
             work.start()
             ros.spin_until(lambda: len(heard) == 40, what="all 40 messages are replayed")
