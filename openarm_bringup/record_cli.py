@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -50,9 +51,10 @@ def record(
     before = {n: signal.signal(n, lambda *_: stop.set()) for n in (signal.SIGINT, signal.SIGTERM)}
     try:
         with Recorder(number, path, topics or PROFILES[profile], _custom(number), image_rate) as recorder:
-            left = duration or float("inf")
-            while left > 0.0 and not stop.is_set() and recorder.wait(min(0.2, left)):
-                left -= 0.2
+            deadline = time.monotonic() + (duration or float("inf"))
+            while (left := deadline - time.monotonic()) > 0.0 and not stop.is_set():
+                if not recorder.wait(min(0.2, left)):
+                    break
     finally:
         for n, handler in before.items():
             signal.signal(n, handler)

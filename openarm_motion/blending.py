@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_motion.trajectory import SPACING, JointLimits, Profile, Trajectory, joined, profile
+from openarm_motion.trajectory import SPACING, JointLimits, Profile, Trajectory, joined, straight_profile
 
 Array = NDArray[np.float64]
 
@@ -61,11 +61,9 @@ def time_blended(names: Sequence[str], waypoints: Array, limits: JointLimits, pe
     segments: list[_Segment] = []
     for start, end in itertools.pairwise(waypoints):
         difference = end - start
-        size = np.maximum(np.abs(difference), 1e-12)
-        if float(size.max()) < 1e-9:
+        if float(np.abs(difference).max()) < 1e-9:
             continue
-        v, a, j = (float(np.min(x / size)) for x in (limits.velocity, limits.acceleration, limits.jerk))
-        way = profile(1.0, v, a, j)
+        way = straight_profile(difference, limits)
         begin = 0.0
         if segments:
             last = segments[-1]

@@ -142,6 +142,13 @@ def profile(length: float, velocity: float, acceleration: float, jerk: float) ->
     return Profile(t[:-1][real], s[real], v[real], a[real], j[real], float(t[-1]))
 
 
+def straight_profile(difference: Array, limits: JointLimits) -> Profile:
+    """Fastest way from 0 to 1 of a straight segment (n,), from rest to rest, on which no joint exceeds a limit."""
+    size = np.maximum(np.abs(difference), 1e-12)
+    v, a, j = (float(np.min(x / size)) for x in (limits.velocity, limits.acceleration, limits.jerk))
+    return profile(1.0, v, a, j)
+
+
 def time_polyline(names: Sequence[str], waypoints: Array, limits: JointLimits, period: float = 0.02) -> Trajectory:
     """Time straight joint segments, each from rest to rest.
 
@@ -154,12 +161,9 @@ def time_polyline(names: Sequence[str], waypoints: Array, limits: JointLimits, p
     parts: list[Trajectory] = []
     for start, end in itertools.pairwise(waypoints):
         difference = end - start
-        size = np.abs(difference)
-        if float(size.max()) < _NOTHING:
+        if float(np.abs(difference).max()) < _NOTHING:
             continue
-        with np.errstate(divide="ignore"):
-            v, a, j = (float(np.min(x / size)) for x in (limits.velocity, limits.acceleration, limits.jerk))
-        way = profile(1.0, v, a, j)
+        way = straight_profile(difference, limits)
         t = _sample_times(way, period)
         s, ds, dds, _ = way.at(t)
         q = start + s[:, None] * difference
