@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The client of the grasp node, in a thread of its own beside the node."""
+
+from __future__ import annotations
+
+from threading import Thread
+
+import pytest
+from rclpy.task import Future
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.client import GraspClient
+
+
+def test_the_client_picks_from_plain_python(bench):
+    heard: list[str] = []
+    results = []
+
+    def script() -> None:
+        with GraspClient() as grasp:
+            results.append(grasp.pick("red", on_feedback=lambda status: heard.append(status.state)))
+            results.append(grasp.pick("mug"))
+
+    thread = Thread(target=script)
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    thread.join()
+    assert results[0].success, results[0].message
+    assert results[0].raise_for_code() is results[0]
+    assert "LIFT" in heard
+    assert results[1].code is Code.UNKNOWN_OBJECT
+    with pytest.raises(OpenArmError, match="no 'mug' in view"):
+        results[1].raise_for_code()
+
+
+def test_p01_p02_the_client_picks_and_places_in_two_requests(bench):
+    results = []
+
+    def script() -> None:
+        with GraspClient() as grasp:
+            results.append(grasp.pick("red", phase="pick"))
+            results.append(grasp.pick("blue"))
+            results.append(grasp.pick("red", phase="place", place=(0.3, -0.3)))
+
+    thread = Thread(target=script)
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    thread.join()
+    picked, other, placed = results
+    assert (picked.outcome, picked.code) == ("SUCCESS", Code.OK), picked.message
+    assert (other.outcome, other.code) == ("REFUSED", Code.NOT_READY)
+    assert "still holds 'red'" in other.message
+    assert (placed.outcome, placed.label) == ("SUCCESS", "red"), placed.message
+    assert bench.world.objects["red"][:2] == pytest.approx((0.3, -0.3), abs=0.005)
+
+
+def test_the_client_can_cancel_from_its_feedback(bench):
+    results = []
+
+    def script() -> None:
+        with GraspClient() as grasp:
+            results.append(grasp.pick("red", on_feedback=lambda s: grasp.cancel() if s.state == "PLAN" else None))
+
+    thread = Thread(target=script)
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    thread.join()
+    assert results[0].code is Code.CANCELLED
+
+
+def test_the_client_notices_that_the_node_is_gone(bench):
+    bench.world.during = lambda what: Future()
+    errors: list[OpenArmError] = []
+
+    def script() -> None:
+        with GraspClient() as grasp:
+            try:
+                grasp.pick("red")
+            except OpenArmError as error:
+                errors.append(error)
+
+    thread = Thread(target=script)
+    thread.start()
+    bench.until(lambda: "execute" in bench.world.log, what="the arm moves")
+    bench.ros.executor.remove_node(bench.node)
+    bench.ros.nodes.remove(bench.node)
+    bench.node.close()
+    bench.node.destroy_node()
+    bench.until(lambda: not thread.is_alive(), 20.0, "the script ends")
+    thread.join()
+    assert errors[0].code is Code.NOT_READY
+
+
+def test_the_client_says_when_nobody_answers(ros):
+    with GraspClient(timeout=0.2) as grasp, pytest.raises(OpenArmError, match="is the graph up") as error:
+        grasp.pick("red")
+    assert error.value.code is Code.NOT_READY

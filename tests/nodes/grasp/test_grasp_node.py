@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The grasp node by service and action."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from action_msgs.msg import GoalStatus
+from openarm_interfaces.action import Pick
+from openarm_interfaces.srv import Grasp
+from rclpy.parameter import Parameter
+from rclpy.task import Future
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.node import GraspNode
+
+OPEN = 0.044
+
+
+def test_a_grasp_by_service_places_the_object_and_tells_its_states(bench):
+    answer = bench.ask()
+    assert answer.success, answer.message
+    assert (answer.code, answer.label, answer.arm, answer.attempts) == ("OK", "red", "right", 1)
+    target = answer.place_position
+    assert bench.world.objects["red"][:2] == pytest.approx((target.x, target.y), abs=0.005)
+    bench.until(lambda: bench.states()[-1] == "IDLE" and len(bench.status) > 5)
+    seen = bench.states()
+    order = [s for i, s in enumerate(seen) if i == 0 or s != seen[i - 1]]
+    names = "IDLE DETECT TRANSFORM PLAN MOVE_TO_PREGRASP MOVE_TO_GRASP CLOSE_GRIPPER LIFT PLACE RESET IDLE"
+    assert " ".join(order) == names
+    assert all(s.reason for s in bench.status)
+    stamps = [s.header.stamp.sec + s.header.stamp.nanosec * 1e-9 for s in bench.status[1:]]
+    assert stamps == sorted(stamps)
+    assert stamps[0] >= 5.0
+    assert answer.duration == pytest.approx(stamps[-1] - stamps[0], abs=0.2)
+
+
+def test_b51_b53_b71_order_of_hand_and_arm(bench):
+    assert bench.ask().success
+    log = [entry for entry in bench.world.log if not entry.startswith("plan")]
+    assert sorted(log[:2]) == ["execute", "gripper 0.044"]  # at the same time
+    assert log[2:] == [
+        "execute",  # to the grasp
+        "gripper 0",
+        "execute",  # lift
+        "execute",  # carry
+        "execute",  # down
+        "gripper 0.044",
+        "execute",  # leave
+        "move home",
+    ]
+
+
+def test_p01_the_action_gives_feedback_and_the_same_answer(bench):
+    heard: list[str] = []
+    goal = Pick.Goal(label="blue", has_place_position=True)
+    goal.place_position.x, goal.place_position.y = 0.3, 0.3
+    _, result = bench.ros.send_goal(
+        bench.action, goal, feedback_callback=lambda m: heard.append(m.feedback.status.state)
+    )
+    answer = bench.ros.result(result, 30.0).result
+    assert answer.success, answer.message
+    assert answer.arm == "left"
+    assert (answer.place_position.x, answer.place_position.y) == (0.3, 0.3)
+    assert bench.world.objects["blue"][:2] == pytest.approx((0.3, 0.3), abs=0.005)
+    assert {"DETECT", "PLAN", "LIFT", "PLACE"} <= set(heard)
+
+
+def test_a71_an_empty_hand_is_tried_again_and_then_named(bench):
+    bench.world.slips = 99
+    answer = bench.ask()
+    assert (answer.code, answer.attempts) == ("GRASP_MISSED", 3)
+    assert "closed on nothing" in answer.message
+    assert bench.world.q[bench.world.robot.finger_joint("right")] == OPEN
+    assert bench.world.log[-1] == "move home"
+
+
+def test_a70_a_slip_is_made_good_by_the_next_attempt(bench):
+    bench.world.slips = 1
+    answer = bench.ask()
+    assert answer.success, answer.message
+    assert answer.attempts == 2
+
+
+def test_a_second_request_is_refused_at_once(bench):
+    held_up = Future()
+    bench.world.during = lambda what: held_up if what == "execute" else None
+    first = bench.service.call_async(Grasp.Request(label="red"))
+    bench.until(lambda: "execute" in bench.world.log, what="the arm moves")
+    begin = time.monotonic()
+    second = bench.ask("blue")
+    assert time.monotonic() - begin < 0.5
+    assert (second.success, second.code) == (False, "BUSY")
+    _, result = bench.ros.send_goal(bench.action, Pick.Goal(label="blue"))
+    assert bench.ros.result(result).result.code == "BUSY"
+    held_up.set_result(None)
+    assert bench.ros.result(first, 30.0).success
+
+
+def test_an_unknown_object_is_refused_with_what_is_in_view(bench):
+    answer = bench.ask("mug")
+    assert (answer.code, answer.message) == ("UNKNOWN_OBJECT", "no 'mug' in view; in view: blue, red")
+    assert not [entry for entry in bench.world.log if entry.startswith(("plan", "execute"))]
+
+
+def test_out_of_reach_names_the_nearest_arm_distance(bench):
+    bench.world.unreachable = True
+    answer = bench.ask()
+    assert answer.code == "UNREACHABLE"
+    assert "right arm gets within 250 mm" in answer.message
+    assert "too far" in answer.message
+    assert "execute" not in bench.world.log
+
+
+def test_an_unknown_arm_and_a_place_off_the_table_are_refused(bench):
+    answer = bench.ask(arm="middle")
+    assert answer.code == "INVALID_ARGUMENT"
+    assert "auto, left, right" in answer.message
+    request = Grasp.Request(label="red", has_place_position=True)
+    request.place_position.x = 3.0
+    answer = bench.ros.call(bench.service, request, 20.0)
+    assert answer.code == "INVALID_ARGUMENT"
+    assert "not on the table" in answer.message
+
+
+def test_a_dry_run_moves_nothing(bench):
+    answer = bench.ask(dry_run=True)
+    assert answer.success, answer.message
+    assert bench.world.log == ["plan right", "plan right"]
+    bench.until(lambda: bench.markers, what="markers of the candidates")
+    assert len(bench.markers[-1].markers) > 20
+
+
+def test_p01_p21_a_cancel_stops_the_arm_and_keeps_the_hand_closed(bench):
+    never = Future()
+    bench.world.during = lambda what: never if bench.world.held else None
+    handle, result = bench.ros.send_goal(bench.action, Pick.Goal(label="red"))
+    bench.until(lambda: bench.world.held and bench.world.log[-1] == "execute", what="the lift")
+    bench.ros.result(handle.cancel_goal_async())
+    answer = bench.ros.result(result, 5.0)
+    assert answer.status == GoalStatus.STATUS_CANCELED
+    assert answer.result.code == "CANCELLED"
+    assert bench.world.cancelled == ["execute"]
+    assert bench.world.held == "red"
+    assert bench.world.log[-1] == "execute"
+    assert bench.world.log.count("gripper 0.044") == 1
+    # The next grasp would drop what is held: refused until the hand is open.
+    bench.world.during = lambda what: None
+    refused = bench.ask()
+    assert refused.code == "NOT_READY"
+    assert "still holds" in refused.message
+
+
+def test_a_robot_that_goes_silent_ends_the_grasp_within_two_seconds(bench):
+    never = Future()
+    bench.world.during = lambda what: never if what == "execute" else None
+    asked = bench.service.call_async(Grasp.Request(label="red"))
+    bench.until(lambda: "execute" in bench.world.log, what="the arm moves")
+    bench.world.silent = True
+    begin = time.monotonic()
+    answer = bench.ros.result(asked, 5.0)
+    assert answer.code == "ROBOT_LOST"
+    assert time.monotonic() - begin < 2.0
+    never.set_result(None)
+    # And it works again when the robot is back.
+    bench.world.silent, bench.world.during = False, lambda what: None
+    assert bench.ask().success
+
+
+def test_without_motion_or_detector_the_answer_names_what_is_missing(benches):
+    bench = benches(motion=False, detector=False)
+    answer = bench.ask()
+    assert answer.code == "NOT_READY"
+    assert "/motion/plan_approach (motion node)" in answer.message
+    assert "/detections_3d (detector)" in answer.message
+    assert "joint_states" not in answer.message
+
+
+def test_b69_nothing_is_subscribed_while_idle_and_detections_only_while_looking(bench):
+    probe = bench.ros.node
+    assert probe.count_subscribers("/joint_states") == 0
+    assert probe.count_subscribers("/detections_3d") == 0
+    held_up = Future()
+    bench.world.during = lambda what: held_up if what == "execute" else None
+    asked = bench.service.call_async(Grasp.Request(label="red"))
+    bench.until(lambda: "execute" in bench.world.log, what="the arm moves")
+    bench.until(lambda: probe.count_subscribers("/detections_3d") == 0, what="detections are left")
+    assert probe.count_subscribers("/joint_states") == 1
+    held_up.set_result(None)
+    assert bench.ros.result(asked, 30.0).success
+    bench.until(lambda: probe.count_subscribers("/joint_states") == 0, what="joint states are left")
+    assert probe.count_subscribers("/detections_3d") == 0
+
+
+def test_b48_a_pregrasp_within_the_path_tolerance_is_refused_at_start(ros):
+    wrong = [Parameter("approach.pregrasp_distance", value=0.05), Parameter("approach.path_tolerance", value=0.04)]
+    with pytest.raises(OpenArmError, match="at least twice path_tolerance") as error:
+        GraspNode(parameter_overrides=wrong)
+    assert error.value.code is Code.CONFIG_INVALID
