@@ -125,7 +125,7 @@ class BagWriter:
         if compress:
             self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         for key, value in custom.items():
-            self._writer.set_custom_data(key, value)
+            self.remember(key, value)
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> BagWriter:
@@ -140,6 +140,10 @@ class BagWriter:
             self._writer.abort()  # a full disk takes no index either; `open_bag` mends the file
         else:
             self._writer.close()
+
+    def remember(self, key: str, value: str) -> None:
+        """Keep something in the metadata, which are written at the end."""
+        self._writer.set_custom_data(key, value)
 
     def add_topic(self, topic: str, kind: str, qos: Qos) -> None:
         """Say what a topic is, before its first message."""

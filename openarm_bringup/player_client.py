@@ -8,7 +8,8 @@ import re
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import rclpy
@@ -54,10 +55,10 @@ class Player:
         self._folder = tempfile.TemporaryDirectory()
         spec = NodeSpec(module="openarm_bringup", large_messages=True, segment_mib=24)
         profile = write_profile(spec, Path(self._folder.name) / "fastdds.xml")
-        os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(profile)  # read when the participant is made
         self._context = Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("openarm_player", context=self._context, use_global_arguments=False)
+        with _variable("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile)):  # read when the participant is made
+            rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+            self._node = rclpy.create_node("openarm_player", context=self._context, use_global_arguments=False)
         self._publishers: dict[str, Publisher] = {}
         missing: set[str] = set()
         for topic, (kind, qos) in bag.topics.items():
@@ -175,6 +176,20 @@ class Player:
             pass  # the context was shut down by the end of the process
         finally:
             executor.remove_node(self._node)
+
+
+@contextmanager
+def _variable(name: str, value: str) -> Iterator[None]:
+    """Set a variable of the environment; what is started later gets the one from before."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
 
 
 def to_profile(qos: Qos | None) -> QoSProfile:

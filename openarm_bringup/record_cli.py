@@ -64,20 +64,25 @@ def record(
         "messages": sum(recorded.counts.values()),
         "lost": sum(recorded.lost.values()),
         "topics": dict(sorted(recorded.counts.items())),
+        "lost_topics": dict(recorded.lost.most_common()),
         "bytes": sum(file.stat().st_size for file in path.glob("*")),
     }
-    text = "\n".join(f"{count:8d}  {topic}" for topic, count in data["topics"].items())
+    rows = [f"{recorded.counts[t]:8d}  {recorded.lost[t]:8d}  {t}" for t in sorted({*recorded.counts, *recorded.lost})]
+    text = "\n".join([f"{'recorded':>8}  {'lost':>8}  topic", *rows])
     if recorded.ended:
         said = f"recording ended early: {recorded.ended}; {data['messages']} messages are in {path}"
         return Outcome(False, said, Code.ENVIRONMENT, data, text)
     if not recorded.counts:
         said = f"no message came; topics that match: {', '.join(recorder.topics) or 'none'}. Is a graph running?"
         return Outcome(False, said, Code.NOTHING_DETECTED, data)
+    said = f"{data['messages']} messages, {data['bytes'] / 1e6:.1f} MB in {path}, {data['lost']} lost"
     if data["lost"]:
-        return Outcome(
-            False, f"{data['lost']} messages came faster than they could be written", Code.LIMITS, data, text
+        worst = ", ".join(f"{count} of {topic}" for topic, count in recorded.lost.most_common(3))
+        advice = (
+            "record fewer topics (--profile, --topics) or fewer frames (--image-rate), or leave the machine more time"
         )
-    return Outcome(True, f"{data['messages']} messages, {data['bytes'] / 1e6:.1f} MB in {path}", data=data, text=text)
+        return Outcome(False, f"{said} ({worst}); {advice}", Code.LIMITS, data, text)
+    return Outcome(True, said, data=data, text=text)
 
 
 def replay(

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records topics of a running graph into a bag, as raw CDR.
 
-Messages are taken in one thread and written in another, with a bounded queue between them: what does not fit is
-counted as lost, and never silently.
+Messages are taken in one thread and written in another, with a bounded queue between them. What does not fit is
+counted as lost, and so is what never came: the numbers of the publishers tell.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from rclpy.signals import SignalHandlerOptions
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from openarm_bringup.bag import BagWriter, message_class
+from openarm_bringup.losses import Arrivals
 from openarm_common.errors import Code, OpenArmError
 
 #: What the profiles record: regular expressions of whole topic names.
@@ -57,7 +58,7 @@ class Recorded:
 
     Attributes:
         counts: Messages written, by topic.
-        lost: Messages that came but were not written, by topic.
+        lost: Messages that were published but are not in the bag, by topic: they never came, or were not written.
         bytes: Written, before compression.
         ended: Why it ended; empty while it runs.
     """
@@ -133,6 +134,7 @@ class Recorder:
         self._threads[1].join()
         self._node.destroy_node()
         full = OSError(self.recorded.ended) if self.recorded.ended else None
+        self._bag.remember("lost", str(self.recorded.lost.total()))
         self._bag.__exit__(type(full) if full else None, full, None)
 
     @property
@@ -187,7 +189,14 @@ class Recorder:
             self._node.create_subscription(kind, topic, take, profile, raw=True)
 
     def _taker(self, topic: str) -> Callable[[bytes, Mapping[str, Any]], None]:
+        arrivals = Arrivals()
+
+        def publishers() -> int:
+            return self._node.count_publishers(topic)
+
         def take(data: bytes, info: Mapping[str, Any]) -> None:
+            if missing := arrivals.missing(info["publication_sequence_number"], publishers):
+                self.recorded.lost[topic] += missing
             if not self._thinner.keeps(topic, data):
                 return
             if self._queued + len(data) > _QUEUE_BYTES or self.recorded.ended:

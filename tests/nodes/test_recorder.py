@@ -100,6 +100,32 @@ def test_a_full_disk_ends_the_recording_and_leaves_a_bag(ros, tmp_path: Path, mo
         assert sum(bag.counts.values()) >= 3
 
 
+def test_what_never_came_is_counted_as_lost(ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recorder that is held up while more is published than its reader keeps."""
+    held, go_on = threading.Event(), threading.Event()
+
+    def hold(self: Thinner, topic: str, data: bytes) -> bool:
+        held.set()
+        return go_on.wait(20.0)
+
+    monkeypatch.setattr(Thinner, "keeps", hold)
+    chatter = ros.node.create_publisher(String, "/chatter", QOS_COMMAND)
+    with Recorder(int(os.environ["ROS_DOMAIN_ID"]), tmp_path / "bag", ("/chatter",), {}) as recorder:
+        ros.spin_until(chatter.get_subscription_count, what="the recorder subscribes")
+        chatter.publish(String(data="0"))
+        ros.spin_until(held.is_set, what="the recorder takes the first")
+        for i in range(1, 500):
+            chatter.publish(String(data=str(i)))
+            chatter.wait_for_all_acked()
+        go_on.set()
+        recorded = recorder.recorded
+        ros.spin_until(lambda: recorded.counts.total() + recorded.lost.total() == 500, what="all is accounted for")
+    assert 0 < recorded.lost["/chatter"] < 500
+    with open_bag(tmp_path / "bag") as bag:
+        assert bag.custom["lost"] == str(recorded.lost["/chatter"])
+        assert bag.counts["/chatter"] == 500 - recorded.lost["/chatter"]
+
+
 def test_frames_are_thinned_as_a_whole() -> None:
     thin = Thinner(2.0)
     stamps = [round(i * 1e9 / 30) for i in range(300)]

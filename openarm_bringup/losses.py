@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which messages of a topic were published and never came, told from the sequence numbers of its publishers.
+
+A publisher numbers its messages 1, 2, 3, …; a subscriber sees the numbers, but not whose they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+
+class Arrivals:
+    """The messages of one topic, as they arrive.
+
+    What was sent before the first message of a publisher came is not counted: nobody says since when it is heard.
+    """
+
+    def __init__(self) -> None:
+        #: Last number of each publisher, the one that was silent longest first.
+        self._last: list[int] = []
+
+    def missing(self, sequence: int, publishers: Callable[[], int]) -> int:
+        """Note a message; return how many of the same publisher are missing right before it.
+
+        Args:
+            sequence: Number that its publisher gave it.
+            publishers: How many the topic has now; asked only when the number continues none that was seen.
+        """
+        earlier = [number for number in self._last if number < sequence]
+        before = sequence - 1
+        if before not in earlier:
+            room = publishers() - len(self._last)
+            if room > 0 or not earlier:  # a new publisher, or in the place of one that has ended
+                if room <= 0:
+                    self._last.pop(0)
+                self._last.append(sequence)
+                return 0
+            before = max(earlier)
+        self._last.remove(before)
+        self._last.append(sequence)
+        return sequence - before - 1

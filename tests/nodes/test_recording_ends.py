@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""However the process of a recording ends, what it leaves can be read: Ctrl-C, SIGKILL, a file that can't grow."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import Image
+
+from openarm_bringup.bag import open_bag
+from openarm_common.convert import array_to_image
+from openarm_common.node import QOS_COMMAND
+
+TOPIC = "/overhead/color/image_raw"
+
+
+def small_files() -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5_000_000, 5_000_000))
+
+
+@pytest.mark.parametrize(
+    ("ending", "limit", "exit_code"),
+    [
+        pytest.param(signal.SIGINT, None, 0, id="ctrl_c"),
+        pytest.param(signal.SIGKILL, None, -9, id="killed"),
+        pytest.param(None, small_files, 1, id="no_room"),
+    ],
+)
+def test_what_was_recorded_can_be_read(
+    ros, tmp_path: Path, ending: signal.Signals | None, limit: Callable[[], None] | None, exit_code: int
+) -> None:
+    images = ros.node.create_publisher(Image, TOPIC, QOS_COMMAND)
+    noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)  # does not get smaller
+    command = [sys.executable, "-m", "openarm_bringup.cli", "record", "bag", "--topics", TOPIC, "--json"]
+    env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    process = subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True, preexec_fn=limit)
+    try:
+        ros.spin_until(images.get_subscription_count, 30.0, "the recorder subscribes")
+        file = tmp_path / "bag" / "bag.mcap"
+        for i in range(1000):
+            images.publish(array_to_image(noise, "rgb8", "optical", i))
+            images.wait_for_all_acked()
+            if process.poll() is not None or (ending and file.stat().st_size > 4_000_000):
+                break
+        if ending:
+            process.send_signal(ending)
+        out, _ = process.communicate(timeout=20.0)
+        assert process.returncode == exit_code
+    finally:
+        process.kill()
+        process.communicate()
+    if ending != signal.SIGKILL:
+        answer = json.loads(out)
+        assert answer["success"] == (exit_code == 0), answer["message"]
+        assert ("File too large" in answer["message"]) == (ending is None)
+    with open_bag(tmp_path / "bag") as bag:
+        assert (bag.mended is None) == (ending == signal.SIGINT)
+        assert bag.counts[TOPIC] >= 3
+        assert all(len(record.data) > noise.nbytes for record in bag.records())
