@@ -79,7 +79,7 @@ def record(
     if data["lost"]:
         worst = ", ".join(f"{count} of {topic}" for topic, count in recorded.lost.most_common(3))
         advice = (
-            "record fewer topics (--profile, --topics) or fewer frames (--image-rate), or leave the machine more time"
+            "record fewer topics (--profile, --topics) or fewer frames (--image-rate), or give it a quieter machine"
         )
         return Outcome(False, f"{said} ({worst}); {advice}", Code.LIMITS, data, text)
     return Outcome(True, said, data=data, text=text)
