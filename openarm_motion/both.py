@@ -69,18 +69,16 @@ class BothScene:
         return None
 
     @contextmanager
-    def lenient(self, share: float) -> Iterator[None]:
-        """Ask for only a share of each positive distance meanwhile."""
-        with self.first.lenient(share), self.second.lenient(share):
+    def lenient(self, share: float, arms: float | None = None) -> Iterator[None]:
+        """Ask for only a share of each positive distance meanwhile, `arms` of that between the arms."""
+        with self.first.lenient(share, arms), self.second.lenient(share, arms):
             yield
 
     def separation(self, q: ArrayLike) -> float:
         """Distance of the arms from each other at a configuration (n1 + n2,), what they hold included, m."""
-        a, b = self._put(q)
-        first, second = self.first.robot.arm.moving, self.second.robot.arm.moving
-        nearest = self.first.gap(a, second)
-        # links have been looked at from one side; what the second arm holds has not
-        return min(nearest, self.second.gap(b, first)) if self.second.around.held else nearest
+        a, _ = self._put(q)
+        # what the second arm holds goes with it as the first one sees it
+        return self.first.gap(a, self.second.robot.arm.moving | self.first.carried)
 
     def placed(self, q: ArrayLike) -> tuple[CollisionScene, CollisionScene]:
         """Both scenes with the other arm where a configuration (n1 + n2,) has it."""
@@ -90,8 +88,8 @@ class BothScene:
     def _put(self, q: ArrayLike) -> tuple[Array, Array]:
         values = np.asarray(q, dtype=np.float64)
         a, b = values[: self._split], values[self._split :]
-        self.first.put_other(self.second, b)
-        self.second.put_other(self.first, a)
+        self.first.put_other(self.second.robot, b)
+        self.second.put_other(self.first.robot, a)
         return a, b
 
 
@@ -128,10 +126,10 @@ class BothArms:
             state: The robot's joints.
             boxes: Obstacles, base frame.
             separation: Distance that the arms keep from each other, m.
-            held: Boxes held by each arm, its tool frame. Two held boxes are not looked at against each other.
+            held: Boxes held by each arm, its tool frame.
             known: Bodies of the planning scene and the map.
         """
-        scenes = [self.scene_of(i, state, boxes, separation, held[i], known) for i in range(2)]
+        scenes = [self.scene_of(i, state, boxes, separation, held, known) for i in range(2)]
         return BothScene(scenes[0], scenes[1], self.split)
 
     def scene_of(
@@ -140,7 +138,7 @@ class BothArms:
         state: Mapping[str, float],
         boxes: Sequence[Box] = (),
         separation: float = SEPARATION,
-        held: Sequence[Box] = (),
+        held: tuple[Sequence[Box], Sequence[Box]] = ((), ()),
         known: Known = NOTHING,
     ) -> CollisionScene:
         """Surroundings of one of the arms, the other one in them where `state` says; arguments as `scene`."""
@@ -149,7 +147,14 @@ class BothArms:
         certain = (*arm.static, *known.solids)
         fixed = frozenset(body.id for body in certain)
         around = Surroundings(
-            state, [*certain, *boxes], held=held, supports=fixed, fixed=fixed, clearance=keep, map=known.map
+            state,
+            [*certain, *boxes],
+            held=held[index],
+            carried=self.arms[1 - index].robot.on_tool(held[1 - index]),
+            supports=fixed,
+            fixed=fixed,
+            clearance=keep,
+            map=known.map,
         )
         return CollisionScene(arm.robot, around)
 
@@ -158,10 +163,17 @@ class BothArms:
     ) -> BothScene:
         """Nothing but the arms and what they hold; arguments as `scene`."""
         first, second = (
-            CollisionScene(arm.robot, Surroundings(state, held=mine, clearance=Clearance(arms=separation), own=False))
-            for arm, mine in zip(self.arms, held, strict=True)
+            Surroundings(
+                state,
+                held=held[i],
+                carried=self.arms[1 - i].robot.on_tool(held[1 - i]),
+                clearance=Clearance(arms=separation),
+                own=False,
+            )
+            for i in range(2)
         )
-        return BothScene(first, second, self.split)
+        a, b = self.arms
+        return BothScene(CollisionScene(a.robot, first), CollisionScene(b.robot, second), self.split)
 
     def limits(self, scale: float) -> JointLimits:
         """Limits of all joints at a velocity scale."""

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 #: Share of the clearance that must be left between the looks of the search.
 _SHARE = 0.5
+#: The same to the other arm: 20 mm of 25.
+_ARMS = 0.8
 #: No point of the arm moves further between two looks, m.
 _TRAVEL = 0.004
 
@@ -56,8 +58,8 @@ class Checked(Protocol):
         """All pairs that are nearer than they may be, the deepest first."""
         ...
 
-    def lenient(self, share: float) -> AbstractContextManager[None]:
-        """Ask for only a share of each positive distance meanwhile."""
+    def lenient(self, share: float, arms: float | None = None) -> AbstractContextManager[None]:
+        """Ask for only a share of each positive distance meanwhile, `arms` of that to the other arm."""
         ...
 
 
@@ -75,8 +77,8 @@ def certify(scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL, sha
     """
     times = dense_times(trajectory, scene.levers, travel)
     states = trajectory.at(times)[0]
-    with scene.lenient(share):
-        for k in _ends_first(len(states)):
+    with scene.lenient(share, max(share, _ARMS)):
+        for k in ends_first(len(states)):
             if scene.collides(states[k]):
                 contact = scene.contacts(states[k])[0]
                 text = f"after {times[k]:.2f} s of the trajectory {contact}"
@@ -87,13 +89,17 @@ def certify(scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL, sha
 def dense_times(trajectory: Trajectory, levers: Array, travel: float = _TRAVEL) -> Array:
     """Moments between which no point moves further than `travel`, by the way that each joint turns."""
     way = np.abs(np.diff(trajectory.q, axis=0)) @ levers
+    return subdivided(trajectory.t, way, travel)
+
+
+def subdivided(times: Array, way: Array, travel: float) -> Array:
+    """Times (m,), and as many between them as make each of the ways (m - 1,) from one to the next `travel` or less."""
     parts = [
-        np.linspace(trajectory.t[i], trajectory.t[i + 1], max(1, int(np.ceil(w / travel))), endpoint=False)
-        for i, w in enumerate(way)
+        np.linspace(times[i], times[i + 1], max(1, int(np.ceil(w / travel))), endpoint=False) for i, w in enumerate(way)
     ]
-    return np.concatenate([*parts, trajectory.t[-1:]])
+    return np.concatenate([*parts, times[-1:]])
 
 
-def _ends_first(n: int) -> list[int]:
+def ends_first(n: int) -> list[int]:
     """All indices, each tenth first: a collision is found early."""
     return [*range(0, n, 10), *(k for k in range(n) if k % 10)]

@@ -7,14 +7,16 @@ s, rad, rad/s.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.arm import Arm
 from openarm_motion.collision import Clearance, CollisionScene, Surroundings
+from openarm_motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
@@ -29,11 +31,21 @@ _PAIR_CLEARANCE = 0.005
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Positions (m, n) of the joints `names` at times (m,), linear in between."""
+    """Positions (m, n) of the joints `names` at times (m,), in between as a controller interpolates.
+
+    With velocities and accelerations (m, n) that is quintic, with velocities alone cubic, without either linear.
+    """
 
     names: tuple[str, ...]
     t: Array
     q: Array
+    v: Array | None = None
+    a: Array | None = None
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Motion:
+        """A planned one."""
+        return cls(trajectory.names, trajectory.t, trajectory.q, trajectory.v, trajectory.a)
 
     @property
     def duration(self) -> float:
@@ -42,11 +54,31 @@ class Motion:
 
     def at(self, t: float) -> dict[str, float]:
         """Positions by joint name; held beyond the ends."""
-        return {name: float(np.interp(t, self.t, self.q[:, i])) for i, name in enumerate(self.names)}
+        return dict(zip(self.names, self.states(np.array([t]))[0].tolist(), strict=True))
+
+    def states(self, times: Array) -> Array:
+        """Positions (k, n) at times (k,); held beyond the ends."""
+        if self.t.size == 1:
+            return np.repeat(self.q, times.size, axis=0)
+        if self.v is not None and self.a is not None:
+            return Trajectory(self.names, self.t, self.q, self.v, self.a).at(times)[0]
+        if self.v is not None:
+            return np.asarray(CubicHermiteSpline(self.t, self.q, self.v)(np.clip(times, self.t[0], self.t[-1])))
+        return np.stack([np.interp(times, self.t, column) for column in self.q.T], axis=1)
+
+    def later(self, seconds: float) -> Motion:
+        """The same, begun later; the arm rests before."""
+        return replace(self, t=self.t + seconds)
 
 
 def check_trajectory(
-    arm: Arm, names: Sequence[str], t: Array, q: Array, v: Array | None, state: Mapping[str, float]
+    arm: Arm,
+    names: Sequence[str],
+    t: Array,
+    q: Array,
+    v: Array | None,
+    state: Mapping[str, float],
+    a: Array | None = None,
 ) -> Motion:
     """Refuse a trajectory that the arm should not be told to follow.
 
@@ -57,6 +89,7 @@ def check_trajectory(
         q: (m, n) positions.
         v: (m, n) velocities, or None.
         state: Present positions by joint name.
+        a: (m, n) accelerations, or None.
 
     Returns:
         The motion, columns in the arm's order.
@@ -71,7 +104,7 @@ def check_trajectory(
         raise _invalid(arm, f"{fault}; expected {', '.join(arm.names)}")
     if t.size == 0:
         raise _invalid(arm, "no points")
-    for values, what in ((q, "position"), (v, "velocity")):
+    for values, what in ((q, "position"), (v, "velocity"), (a, "acceleration")):
         if values is not None and not np.all(np.isfinite(values)):
             k, i = (int(x) for x in np.argwhere(~np.isfinite(values))[0])
             raise _invalid(arm, f"{what} of {names[i]} at point {k} is {values[k, i]}, expected a finite number")
@@ -106,7 +139,7 @@ def check_trajectory(
             f"it starts with {arm.names[i]} at {q[0, i]:.3f} rad, the arm is at {now[i]:.3f}, expected within"
             f" {arm.config.execution.start_tolerance:g} rad; plan again from where the arm is",
         )
-    return Motion(arm.names, t, q)
+    return Motion(arm.names, t, q, None if v is None else v[:, order], None if a is None else a[:, order])
 
 
 def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float], others: Sequence[Motion]) -> None:

@@ -65,6 +65,8 @@ class CollisionScene:
             self._geometry.addCollisionPair(pin.CollisionPair(i, j))
         self._pair_index = pairs
         self._required = np.array(required)
+        own, others = robot.arm.fixed | robot.arm.moving, {*robot.links, *self.carried}
+        self._arms = np.array([self._names[j] in others and self._names[j] not in own for _, j in pairs])
         self._data = robot.model.createData()
         self._geometry_data = pin.GeometryData(self._geometry)
         self._set_margins()
@@ -95,6 +97,11 @@ class CollisionScene:
                 shape = coal.Box(*solid.extents.tolist())
             found.append((o.parentJoint, T, shape))
         return found
+
+    @property
+    def carried(self) -> frozenset[str]:
+        """Names of what goes with the other arm."""
+        return frozenset(box.id for _, box in self._around.carried)
 
     def joint_poses(self) -> list[Array]:
         """Poses (4, 4) of the model's joints with the arm wherever it was last put."""
@@ -188,10 +195,11 @@ class CollisionScene:
         return None
 
     @contextmanager
-    def lenient(self, share: float) -> Iterator[None]:
-        """Ask for only a share of each positive distance meanwhile."""
+    def lenient(self, share: float, arms: float | None = None) -> Iterator[None]:
+        """Ask for only a share of each positive distance meanwhile, `arms` of that to the other arm."""
         asked = self._required
-        self._required = np.where(asked > 0.0, share * asked, asked)
+        shares = np.where(self._arms, share if arms is None else arms, share)
+        self._required = np.where(asked > 0.0, shares * asked, asked)
         self._set_margins()
         try:
             yield
@@ -241,9 +249,9 @@ class CollisionScene:
         centre, radius = self._balls[i]
         return np.asarray(self._geometry_data.oMg[i].act(centre)), radius
 
-    def put_other(self, other: CollisionScene, q: ArrayLike) -> None:
-        """Move the arm of another scene of the same robot to its configuration (n,)."""
-        other._robot.put(self._q, q)
+    def put_other(self, other: CollisionRobot, q: ArrayLike) -> None:
+        """Move another arm of the same robot to its configuration (n,)."""
+        other.put(self._q, q)
 
     def _colliding(self, q: ArrayLike) -> list[int]:
         self._robot.put(self._q, q)
@@ -303,6 +311,10 @@ class CollisionScene:
                     required.append(
                         keep.own if link in robot.arm.moving else keep.arms if link not in own else keep.world
                     )
+        for joint, box in around.carried:
+            b = self._add(box.id, joint, box.T, box)
+            pairs += [(i, b) for i in (*robot.moving, *held)]
+            required += [keep.arms] * (len(robot.moving) + len(held))
         for box in around.boxes:
             b = self._add(box.id, 0, box.T, box)
             touchable = box.id in around.touchable

@@ -6,7 +6,8 @@ Shapes are the primitives of the URDF; pairs that may touch come from the SRDF. 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import coal
 import numpy as np
@@ -17,6 +18,7 @@ from openarm_common.description import Primitive, RobotDescription
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.arm_links import ArmLinks
 from openarm_motion.kinematics import ArmKinematics
+from openarm_motion.solids import Box
 
 Array = NDArray[np.float64]
 
@@ -65,6 +67,11 @@ class CollisionRobot:
             return
         for name, value in zip(self.kinematics.names, np.asarray(q, dtype=np.float64), strict=True):
             self._set(full, name, float(value))
+
+    def on_tool(self, boxes: Sequence[Box]) -> list[tuple[int, Box]]:
+        """Boxes in the tool frame as `Surroundings.carried` of the other arm."""
+        name = self.kinematics.tool_link
+        return [(self.joints[-1], replace(b, id=f"{b.id} at {name}", T=self.kinematics.tip @ b.T)) for b in boxes]
 
     def _set(self, full: Array, name: str, value: float) -> None:
         joint = self._joint_of[name]

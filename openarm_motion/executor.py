@@ -53,7 +53,7 @@ class Running:
 
     def rest(self, now_ns: int) -> Motion:
         """What is left of it, beginning now."""
-        return Motion(self.motion.names, self.motion.t - (now_ns - self.since_ns) * 1e-9, self.motion.q)
+        return self.motion.later((self.since_ns - now_ns) * 1e-9)
 
 
 class Follower:

@@ -15,8 +15,8 @@ from openarm_motion.surroundings import Contact
 Array = NDArray[np.float64]
 
 #: How far planning got: the request itself, the start, the goal, the straight line, the search, the dense look at the
-#: timed plan, the planning scene.
-Stage = Literal["request", "start", "goal", "line", "search", "certificate", "scene"]
+#: timed plan, the planning scene, beside another arm under way.
+Stage = Literal["request", "start", "goal", "line", "search", "certificate", "scene", "execution"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ class Clearance(Config):
         default=0.003, ge=0.0, le=0.05, description="between links of the arm, and to the robot's body, m"
     )
     world: float = Field(default=0.010, ge=0.0, le=0.1, description="arm to boxes, m")
-    arms: float = Field(default=0.010, ge=0.0, le=0.1, description="arm to the other arm, m")
+    arms: float = Field(default=0.025, ge=0.0, le=0.1, description="arm to the other arm, m")
     hand: float = Field(default=0.010, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
     touch: float = Field(
         default=0.002, ge=0.0, le=0.05, description="arm and palm to a box that the fingers may touch, m"
@@ -38,6 +38,7 @@ class Surroundings:
         state: Positions of (at least) the robot's other movable joints; missing ones are taken as 0.
         boxes: Obstacles, base frame; boxes or other bodies.
         held: Boxes held by this arm, pose in the tool frame.
+        carried: Boxes that go with the other arm: the joint that each hangs on, pose in that joint's frame.
         touchable: Ids of boxes that the fingers may touch.
         supports: Ids of boxes that a held box may stand on.
         fixed: Ids of boxes that are where they are said to be; the others are estimates.
@@ -49,6 +50,7 @@ class Surroundings:
     state: Mapping[str, float]
     boxes: Sequence[Solid] = ()
     held: Sequence[Box] = ()
+    carried: Sequence[tuple[int, Box]] = ()
     touchable: frozenset[str] = frozenset()
     supports: frozenset[str] = frozenset()
     fixed: frozenset[str] = frozenset()

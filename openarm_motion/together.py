@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.arm import Situation
+from openarm_motion.beside import Course, least_wait
 from openarm_motion.both import SEPARATION, BothArms, BothScene
 from openarm_motion.certificate import certify, dense_times
+from openarm_motion.checks import Motion
 from openarm_motion.collision import Box
 from openarm_motion.failure import PlanFailedError
 from openarm_motion.fast_planner import FastPlanner
@@ -33,8 +35,6 @@ _TRAVEL = 0.004
 _SEEN = SEPARATION - 0.25 * _TRAVEL
 #: Looks from one coarse look to the next.
 _STRIDE = 8
-#: Waits of the later arm that are tried are this far apart, s.
-_WAIT_STEP = 0.1
 #: Steps of the searches, how many times finer.
 _FINENESS = (1.0, 4.0)
 
@@ -184,23 +184,11 @@ def _in_order(both: BothArms, now: Situation, wanted: BothGoals, first: int, tim
     early = _alone(both, first, now, now.state, wanted, time_limit)
     there = {**now.state, **dict(zip(both.arms[first].names, early.q[-1].tolist(), strict=True))}
     late = _alone(both, second, now, there, wanted, time_limit)
-    least = _least(both.scene(now.state, held=wanted.held), now.start)
-    pair = both.pair_scene(now.state, least, wanted.held)
-    for wait in np.append(np.arange(0.0, early.duration, _WAIT_STEP), early.duration):
-        if now.stopped():
-            raise OpenArmError(Code.CANCELLED, "planning was stopped")
-        waits = (0.0, float(wait)) if first == 0 else (float(wait), 0.0)
-        one, other = (early, late) if first == 0 else (late, early)
-        parts = (delayed(one, waits[0]), delayed(other, waits[1]))
-        whole = joined(both, parts)
-        states = whole.at(dense_times(whole, pair.levers, _TRAVEL))[0]
-        if not any(pair.collides(q) for q in states):
-            return _Staggered(parts, waits)
-    raise OpenArmError(
-        Code.IN_COLLISION,
-        f"the {both.arms[second].name} arm would come within {least * 1e3:.0f} mm of the {both.arms[first].name} arm"
-        " however long it waits",
-    )
+    one, other = (Course(both.arms[i], Motion.of(part), wanted.held[i]) for i, part in ((first, early), (second, late)))
+    wait = least_wait(other, [one], now.state, stopped=now.stopped)
+    if first == 0:
+        return _Staggered((early, delayed(late, wait)), (0.0, wait))
+    return _Staggered((delayed(late, wait), early), (wait, 0.0))
 
 
 def joined(both: BothArms, parts: tuple[Trajectory, Trajectory]) -> Trajectory:
@@ -215,7 +203,7 @@ def _alone(
 ) -> Trajectory:
     """The path of one arm with the other one where `state` says."""
     arm, start = both.arms[index], both.parts(now.start)[index]
-    scene = both.scene_of(index, state, wanted.obstacles, held=wanted.held[index], known=now.known)
+    scene = both.scene_of(index, state, wanted.obstacles, held=wanted.held, known=now.known)
     arm.relax(scene, start)
     goals = [q for q in wanted.goals[index] if not scene.collides(q)][:_GOALS]
     if not goals:

@@ -107,10 +107,14 @@ def test_separation_is_that_of_every_look(both, home) -> None:
 
 
 def test_what_an_arm_holds_keeps_away_from_the_other_arm(both, home) -> None:
-    plate = box_from("plate", (0.0, 0.0, 0.06), (0.05, 0.30, 0.02))
-    scene = both.scene(home, held=((), [plate]))
+    long = box_from("tray", (0.0, 0.0, 0.06), (0.8, 0.8, 0.02))
     start = np.array([home[name] for name in both.names])
-    assert scene.separation(start) < both.scene(home).separation(start)
+    bare = both.scene(home).separation(start)
+    one, other = (both.scene(home, held=held).separation(start) for held in (((), [long]), ([long], ())))
+    assert max(one, other) < bare - 0.05
+    assert one == pytest.approx(other, abs=2e-3)  # the arms mirror each other
+    # what both hold is looked at against each other
+    assert both.scene(home, held=([long], [long])).separation(start) < min(one, other) - 0.05
 
 
 def test_separation_is_the_least_of_all_pairs(both, home) -> None:

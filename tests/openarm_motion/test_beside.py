@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An arm sets out while another is under way."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion import moves
+from openarm_motion.arm import Arm
+from openarm_motion.beside import Course, first_to_arrive, least_wait
+from openarm_motion.both import BothArms
+from openarm_motion.checks import Motion
+from openarm_motion.collision import box_from
+from openarm_motion.moves import Around
+from openarm_motion.trajectory import Trajectory
+
+DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
+
+
+def to_the_middle(arm: Arm, state: dict[str, float], y: float = 0.0) -> Trajectory:
+    return moves.to_pose(arm, arm.situation(state), se3.make(DOWN, (0.28, y, 0.60)), Around())
+
+
+def back(plan: Trajectory, slow: float = 3.0) -> Motion:
+    t = slow * (plan.t[-1] - plan.t[::-1])
+    return Motion(plan.names, t, plan.q[::-1], -plan.v[::-1] / slow, plan.a[::-1] / slow**2)
+
+
+def standing(state: dict[str, float], arm: Arm, q: np.ndarray) -> dict[str, float]:
+    return {**state, **dict(zip(arm.names, q.tolist(), strict=True))}
+
+
+def nearest(arms: dict[str, Arm], state: dict[str, float], left: Motion, right: Motion, held=((), ())) -> float:
+    """Least distance of the arms at looks 5 ms apart, from nothing but the motions."""
+    both = BothArms(arms["left"], arms["right"])
+    scene = both.pair_scene(state, 0.1, held)
+    times = np.arange(0.0, max(left.t[-1], right.t[-1]) + 0.005, 0.005)
+    return min(scene.separation(q) for q in np.hstack([left.states(times), right.states(times)]))
+
+
+@pytest.fixture(scope="module")
+def meeting(arms: dict[str, Arm], home: dict[str, float]) -> tuple[dict[str, float], Motion, Motion]:
+    """The left arm stands over the middle and goes home slowly; the right one wants there."""
+    left, right = arms["left"], arms["right"]
+    there = to_the_middle(left, home)
+    return standing(home, left, there.q[-1]), back(there), Motion.of(to_the_middle(right, home))
+
+
+def test_n12_an_arm_rests_until_the_other_one_leaves_room(arms, meeting) -> None:
+    state, left, right = meeting
+    wait = least_wait(Course(arms["right"], right), [Course(arms["left"], left)], state)
+    assert 0.2 < wait < left.t[-1]
+    assert nearest(arms, state, left, right.later(wait)) >= 0.020
+    assert nearest(arms, state, left, right.later(wait - 0.1)) < 0.024  # not longer than it must
+    assert nearest(arms, state, left, right) < 0.020
+
+
+def test_n12_what_has_passed_of_a_motion_under_way_counts(arms, meeting) -> None:
+    state, left, right = meeting
+    mine = Course(arms["right"], right)
+    whole = least_wait(mine, [Course(arms["left"], left)], state)
+    begun = left.later(-0.6)
+    now = standing(state, arms["left"], begun.states(np.zeros(1))[0])
+    assert least_wait(mine, [Course(arms["left"], begun)], now) == pytest.approx(whole - 0.6, abs=0.11)
+
+
+def test_n12_arms_that_do_not_meet_set_out_at_once(arms, home) -> None:
+    left = Motion.of(to_the_middle(arms["left"], home, 0.25))
+    right = Motion.of(to_the_middle(arms["right"], home, -0.25))
+    assert least_wait(Course(arms["right"], right), [Course(arms["left"], left)], home) == 0.0
+    assert nearest(arms, home, left, right) >= 0.020
+
+
+def test_a74_an_arm_that_ends_in_the_way_is_no_matter_of_time(arms, home) -> None:
+    left, right = (Motion.of(to_the_middle(arms[side], home)) for side in ("left", "right"))
+    with pytest.raises(OpenArmError, match=r"right arm after .*openarm_left_\w+.* no rest before it helps") as caught:
+        least_wait(Course(arms["right"], right), [Course(arms["left"], left)], home)
+    assert caught.value.code == Code.IN_COLLISION
+    assert "longer" not in caught.value.message
+
+
+def test_a_rest_that_is_too_long_is_refused(arms, meeting) -> None:
+    state, left, right = meeting
+    with pytest.raises(OpenArmError, match=r"within 0\.2 s; it would have to wait longer"):
+        least_wait(Course(arms["right"], right), [Course(arms["left"], left)], state, longest=0.2)
+    with pytest.raises(OpenArmError) as caught:
+        least_wait(Course(arms["right"], right), [Course(arms["left"], left)], state, stopped=lambda: True)
+    assert caught.value.code == Code.CANCELLED
+
+
+def test_of_several_motions_the_one_that_arrives_first_is_taken(arms, home, meeting) -> None:
+    state, left, middle = meeting
+    aside = Motion.of(to_the_middle(arms["right"], home, -0.25))
+    mine = [Course(arms["right"], motion) for motion in (middle, aside)]
+    assert first_to_arrive(mine, [Course(arms["left"], left)], state) == (1, 0.0)
+    k, wait = first_to_arrive(mine[:1], [Course(arms["left"], left)], state)
+    assert k == 0
+    assert wait > 0.0
+    with pytest.raises(OpenArmError, match="no candidates"):
+        first_to_arrive([], [], state)
+
+
+def test_n12_two_held_objects_keep_apart_too(arms, home) -> None:
+    """Hands that pass each other with room, but carry plates that would not."""
+    plate = box_from("plate", (0.0, 0.0, 0.10), (0.05, 0.26, 0.02))
+    left = Motion.of(to_the_middle(arms["left"], home, 0.20))
+    right = Motion.of(to_the_middle(arms["right"], home, -0.20))
+    both = BothArms(arms["left"], arms["right"])
+    ends = np.concatenate([left.q[-1], right.q[-1]])
+    assert not both.pair_scene(home, 0.02).collides(ends)
+    least_wait(Course(arms["right"], right), [Course(arms["left"], left)], home)
+    wide = box_from("plate", (0.0, 0.0, 0.20), (0.05, 0.44, 0.02))
+    hits = both.pair_scene(home, 0.02, ([wide], [wide])).contacts(ends)
+    assert {c.first.split()[-1] for c in hits} >= {"plate"}
+    for held in (plate, wide):
+        meet = both.pair_scene(home, 0.02, ([held], [held])).collides(ends)
+        mine, other = Course(arms["right"], right, [held]), Course(arms["left"], left, [held])
+        if meet:
+            with pytest.raises(OpenArmError, match="plate"):
+                least_wait(mine, [other], home)
+        else:
+            least_wait(mine, [other], home)
+
+
+def test_motions_are_interpolated_as_controllers_do(arms, home) -> None:
+    plan = to_the_middle(arms["left"], home, 0.25)
+    whole = Motion.of(plan)
+    times = np.linspace(-0.5, plan.duration + 0.5, 300)
+    np.testing.assert_allclose(whole.states(times), plan.at(times)[0], atol=1e-12)
+    cubic, linear = Motion(plan.names, plan.t, plan.q, plan.v), Motion(plan.names, plan.t, plan.q)
+    for near, tolerance in ((cubic, 1e-4), (linear, 2e-3)):
+        np.testing.assert_allclose(near.states(times), plan.at(times)[0], atol=tolerance)
+    assert np.abs(linear.states(times) - cubic.states(times)).max() > 1e-5
+    for one, other in itertools.pairwise([whole.later(0.3).at(0.9), whole.at(0.6)]):
+        assert one == pytest.approx(other)
+    assert Motion(plan.names, plan.t[:1], plan.q[:1]).states(times).shape == (300, 7)
