@@ -270,9 +270,9 @@ class DetectNode(BaseNode[DetectNodeConfig]):
 
     def _publish(self, frame: _Frame, perceived: Perceived, elapsed_ms: float) -> None:
         self._boxes.publish(convert.detections_2d(perceived.found, self._optical_frame, frame.t_ns))
-        self._objects.publish(convert.detections_3d(perceived.located, BASE_FRAME, frame.t_ns))
+        self._objects.publish(convert.detections_3d(perceived.boxes, BASE_FRAME, frame.t_ns))
         if self._markers.get_subscription_count():
-            self._markers.publish(convert.markers(perceived.located, BASE_FRAME, frame.t_ns))
+            self._markers.publish(convert.markers(perceived.boxes, BASE_FRAME, frame.t_ns))
         if self._picture.get_subscription_count():
             picture = annotate(frame.rgb, perceived)
             self._picture.publish(array_to_image(picture, "rgb8", self._optical_frame, frame.t_ns))

@@ -176,24 +176,9 @@ class Localizer:
                 f"{found.label} at pixel {_pixel(found)} is cut by the border of the image; its size is unknown",
             )
         patch = cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
-        share = float(np.count_nonzero(patch.robot & patch.coloured)) / found.area
-        if share > _MOSTLY:
-            raise OpenArmError(
-                Code.NOTHING_DETECTED,
-                f"{found.label} at pixel {_pixel(found)} is to {share:.0%} the robot or what it holds; it does not"
-                " stand on the table",
-            )
         if found.label in self._heights and self._valid(patch).sum() < self.config.min_points:
             return self.locate_on_plane(found, self._heights[found.label], intrinsics, T_base_camera)
-        solid = self._on_object(found, patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
-        count = int(np.count_nonzero(solid))
-        if count < self.config.min_points:
-            raise OpenArmError(
-                Code.NOTHING_DETECTED,
-                f"{found.label} at pixel {_pixel(found)} has {count} points above the table at"
-                f" {self.table_height:.3f} m, expected at least {self.config.min_points};"
-                " is it flat, or is the table height wrong?",
-            )
+        solid = self._solid(found, patch)
         top = self._top_height(patch.points[..., 2][solid], patch.band)
         face = self._top_face(patch, top)
         pixel = float(np.median(patch.z[solid])) / intrinsics.fx
@@ -209,7 +194,28 @@ class Localizer:
         except OpenArmError as error:
             where = f"{found.label} at pixel {_pixel(found)}"
             raise OpenArmError(error.code, f"{where}: {error.message}") from error
-        return self._detection(found, shape, top, count, visible)
+        return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
+
+    def enclose(
+        self,
+        found: Detection2D,
+        depth: DepthImage,
+        intrinsics: Intrinsics,
+        T_base_camera: Array,
+        robot: Mask | None = None,
+    ) -> Detection3D:
+        """A box around what is seen of a detection that cannot be measured: in the way at least there. Its score is 0.
+
+        Args and errors as for `locate`; what is hidden or beyond the border of the image is not in the box.
+        """
+        patch = cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
+        solid = self._solid(found, patch)
+        # at its borders a real sensor reports any depth
+        inner = cv2.erode(solid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        points = patch.points[inner if inner.any() else solid]
+        top = self._top_height(points[:, 2], patch.band)
+        shape = footprint.bound(points[:, :2], 3.0 * float(np.median(patch.z[solid])) / intrinsics.fx)
+        return replace(self._detection(found, shape, top, len(points), 0.0), score=0.0)
 
     def locate_on_plane(
         self, found: Detection2D, height: float, intrinsics: Intrinsics, T_base_camera: Array
@@ -258,6 +264,26 @@ class Localizer:
             )
         gate = np.abs(patch.z - np.median(patch.z[valid])) <= self.config.depth_gate
         return valid & gate
+
+    def _solid(self, found: Detection2D, patch: Patch) -> Mask:
+        """Points of the object above the table."""
+        share = float(np.count_nonzero(patch.robot & patch.coloured)) / found.area
+        if share > _MOSTLY:
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"{found.label} at pixel {_pixel(found)} is to {share:.0%} the robot or what it holds; it does not"
+                " stand on the table",
+            )
+        solid = self._on_object(found, patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
+        count = int(np.count_nonzero(solid))
+        if count < self.config.min_points:
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"{found.label} at pixel {_pixel(found)} has {count} points above the table at"
+                f" {self.table_height:.3f} m, expected at least {self.config.min_points};"
+                " is it flat, or is the table height wrong?",
+            )
+        return solid
 
     @staticmethod
     def _top_height(heights: Array, band: float) -> float:

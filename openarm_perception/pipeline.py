@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ class Perceived:
         found: In the image.
         located: In the base frame; those of `found` that could be.
         refused: Why the others could not be, one sentence each.
+        unmeasured: Boxes around what is seen of those, with score 0: in the way, but not to be grasped.
         robot: (h, w) pixels that show the robot or what it holds; None when nobody looked for them.
     """
 
@@ -30,6 +32,12 @@ class Perceived:
     located: tuple[Detection3D, ...]
     refused: tuple[str, ...]
     robot: Mask | None = None
+    unmeasured: tuple[Detection3D, ...] = ()
+
+    @property
+    def boxes(self) -> tuple[Detection3D, ...]:
+        """Everything that stands there, what could be measured first."""
+        return (*self.located, *self.unmeasured)
 
 
 class Pipeline:
@@ -75,9 +83,12 @@ class Pipeline:
         found = rank(self.detector.detect(rgb), self.policy, size, self.label)
         located: list[Detection3D] = []
         refused: list[str] = []
+        unmeasured: list[Detection3D] = []
         for detection in found:
             try:
                 located.append(self.localizer.locate(detection, depth, intrinsics, T_base_camera, robot))
             except OpenArmError as error:
                 refused.append(error.message)
-        return Perceived(found, tuple(located), tuple(refused), robot)
+                with contextlib.suppress(OpenArmError):  # flat on the table, or the robot: it stands in nobody's way
+                    unmeasured.append(self.localizer.enclose(detection, depth, intrinsics, T_base_camera, robot))
+        return Perceived(found, tuple(located), tuple(refused), robot, tuple(unmeasured))

@@ -41,3 +41,19 @@ def test_b27_the_pipeline_ranks_and_filters(tabletop, pipeline) -> None:
     assert [p.label for p in run(central, view).located] == ["red", "blue"]
     only = Pipeline(pipeline.detector, pipeline.localizer, label="blue")
     assert [p.label for p in run(only, view).located] == ["blue"]
+
+
+def test_what_cannot_be_measured_is_still_in_the_way(tabletop, pipeline) -> None:
+    """A block closely built in on both sides has no outline of its own, but a box around it, with score 0."""
+    things = [
+        tabletop.Thing(c, "box", (0.05, 0.05, 0.05), 0.27, y)
+        for c, y in (("red", -0.05), ("blue", 0.0), ("green", 0.05))
+    ]
+    perceived = run(pipeline, tabletop.render(things))
+    boxes = {box.label: box for box in perceived.boxes}
+    assert set(boxes) == {"red", "blue", "green"}
+    built_in = boxes["blue"]
+    assert built_in not in perceived.located
+    assert built_in.score == 0.0
+    assert built_in.position[:2] == pytest.approx((0.27, 0.0), abs=0.006)
+    assert built_in.size == pytest.approx((0.05, 0.05, 0.05), abs=0.008)
