@@ -3,19 +3,17 @@
 
 from __future__ import annotations
 
-import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
 from openarm_bringup import calibrate_live_cli
+from openarm_bringup.calibration_source import NOT_GIVEN, Recording, Solved, now, store_in, stored_of, with_solved
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
-    from openarm_calibration.offline import Result
-    from openarm_calibration.samples import SampleSet
     from openarm_calibration.store import CalibrationStore, StoredCalibration
 
 app = App(name="calibrate", help="Where are the cameras? Boards, solving, checking and storing hand-eye calibrations.")
@@ -63,59 +61,67 @@ def board(
 
 @app.command
 def solve(
-    session: Path,
+    samples: Path,
     *,
     algorithm: str = "REFINED",
     exclude: tuple[str, ...] = (),
     save: Annotated[bool, Parameter(negative=())] = False,
     store: Path | None = None,
+    recording: Recording = NOT_GIVEN,
 ) -> Outcome:
-    """Solve a session file and say how good the result is.
+    """Solve a session file or a bag and say how good the result is.
 
     Args:
-        session: File of samples (.npz).
+        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
         algorithm: REFINED, or a closed form: TSAI PARK HORAUD ANDREFF DANIILIDIS SHAH LI.
         exclude: Names of samples to leave out.
         save: Store the result, unless it fails.
         store: Folder of stored calibrations.
+        recording: What a bag does not say.
     """
-    samples, result = _solved(session, algorithm, exclude, store)
-    return _outcome(samples, result, _store(store) if save else None)
+    place = store_in(store) if save else None
+    return with_solved(samples, recording, exclude, store, lambda done: _outcome(done, place), algorithm=algorithm)
 
 
 @app.command
-def check(session: Path, *, exclude: tuple[str, ...] = (), store: Path | None = None) -> Outcome:
-    """Judge a session file and its distance from what is stored; exit code 1 when it fails the limits.
+def check(
+    samples: Path, *, exclude: tuple[str, ...] = (), store: Path | None = None, recording: Recording = NOT_GIVEN
+) -> Outcome:
+    """Judge a session file or a bag and its distance from what is stored; exit code 1 when it fails the limits.
 
     Args:
-        session: File of samples (.npz).
+        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
         exclude: Names of samples to leave out.
         store: Folder of stored calibrations.
+        recording: What a bag does not say.
     """
-    samples, result = _solved(session, "REFINED", exclude, store)
-    return _outcome(samples, result, None)
+    return with_solved(samples, recording, exclude, store, lambda done: _outcome(done, None))
 
 
 @app.command
 def save(
-    session: Path,
+    samples: Path,
     *,
     algorithm: str = "REFINED",
     exclude: tuple[str, ...] = (),
     store: Path | None = None,
     force: Annotated[bool, Parameter(negative=())] = False,
+    recording: Recording = NOT_GIVEN,
 ) -> Outcome:
-    """Solve a session file and store the result; a running graph takes it over at once.
+    """Solve a session file or a bag and store the result; a running graph takes it over at once.
 
     Args:
-        session: File of samples (.npz).
+        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
         algorithm: As for `solve`.
         exclude: Names of samples to leave out.
         store: Folder of stored calibrations.
+        recording: What a bag does not say.
         force: Store also what fails the limits.
     """
-    samples, result = _solved(session, algorithm, exclude, store)
-    return _outcome(samples, result, _store(store), force=force)
+    place = store_in(store)
+    return with_solved(
+        samples, recording, exclude, store, lambda done: _outcome(done, place, force=force), algorithm=algorithm
+    )
 
 
 @app.command
@@ -140,8 +146,8 @@ def together(
     results = calibrate_together(
         [samples for samples, _ in opened],
         hashes=[digest for _, digest in opened],
-        created=_now(),
-        stored=[_stored(samples, store) for samples, _ in opened],
+        created=now(),
+        stored=[stored_of(samples, store) for samples, _ in opened],
     )
     names = [samples.head.camera for samples, _ in opened]
     data: dict[str, Any] = {"cameras": {n: result.as_json() for n, result in zip(names, results, strict=True)}}
@@ -150,32 +156,44 @@ def together(
     if any(result.verdict.grade == "fail" for result in results):
         return Outcome(False, f"{grades}; nothing was stored", Code.DEGENERATE, data, text)
     if save:
-        paths = [str(_store(store).save(result.calibration)) for result in results]
+        paths = [str(store_in(store).save(result.calibration)) for result in results]
         return Outcome(True, f"{grades}. Stored in {', '.join(paths)}", data=data, text=text)
     return Outcome(True, grades, data=data, text=text)
 
 
 @app.command
-def report(session: Path, out: Path, *, exclude: tuple[str, ...] = (), store: Path | None = None) -> Outcome:
-    """Write a page with pictures on a session file: coverage, residuals, poses, samples, methods.
+def report(
+    samples: Path,
+    out: Path,
+    *,
+    exclude: tuple[str, ...] = (),
+    store: Path | None = None,
+    recording: Recording = NOT_GIVEN,
+) -> Outcome:
+    """Write a page with pictures on a session file or a bag: coverage, residuals, poses, samples, methods.
 
     Args:
-        session: File of samples (.npz).
+        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
         out: HTML file to write.
         exclude: Names of samples to leave out.
         store: Folder of stored calibrations.
+        recording: What a bag does not say.
     """
     from openarm_calibration.report import page
 
     if out.suffix not in (".html", ".htm"):
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{out}: a report is written as .html")
-    samples, result = _solved(session, "REFINED", exclude, store)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(page(samples, result), encoding="utf-8")
-    except OSError as error:
-        raise OpenArmError(Code.ENVIRONMENT, f"can't write {out}: {error.strerror}") from error
-    return Outcome(True, f"{result.verdict.grade}; wrote {out}", data={"written": str(out), **result.as_json()})
+
+    def write(done: Solved) -> Outcome:
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            out.write_text(page(done.samples, done.result), encoding="utf-8")
+        except OSError as error:
+            raise OpenArmError(Code.ENVIRONMENT, f"can't write {out}: {error.strerror}") from error
+        said = f"{done.result.verdict.grade}; wrote {out}"
+        return Outcome(True, said, data={"written": str(out), **_json(done)}, text=done.text)
+
+    return with_solved(samples, recording, exclude, store, write)
 
 
 @app.command(name="list")
@@ -185,7 +203,7 @@ def list_(*, store: Path | None = None) -> Outcome:
     Args:
         store: Folder of stored calibrations.
     """
-    opened = _store(store)
+    opened = store_in(store)
     data: dict[str, Any] = {"store": str(opened.folder), "cameras": {}}
     lines: list[str] = []
     faults: list[str] = []
@@ -210,39 +228,19 @@ def rollback(camera: str, *, store: Path | None = None) -> Outcome:
         camera: Its name.
         store: Folder of stored calibrations.
     """
-    now = _store(store).rollback(camera)
+    now = store_in(store).rollback(camera)
     return Outcome(True, f"now in use: {_line(now)}", data=now.model_dump(mode="json"))
 
 
-def _solved(session: Path, algorithm: str, exclude: tuple[str, ...], store: Path | None) -> tuple[SampleSet, Result]:
-    from openarm_calibration.offline import calibrate, checked_algorithm, without_named
-    from openarm_calibration.samples import load_session
-    from openarm_common.description import RobotDescription
-
-    checked_algorithm(algorithm)
-    samples, digest = load_session(session, RobotDescription.load())
-    without_named(samples, exclude)
-    stored = _stored(samples, store)
-    return samples, calibrate(samples, algorithm=algorithm, session=digest, created=_now(), stored=stored)
+def _json(done: Solved) -> dict[str, Any]:
+    return done.result.as_json() | ({"stills": done.stills} if done.stills else {})
 
 
-def _stored(samples: SampleSet, store: Path | None) -> StoredCalibration | None:
-    """What is stored of the camera; None also for one of other mounts, whose distance says nothing."""
-    found = _store(store).find(samples.head.camera)
-    if found is None or found.calibration.mount_seed != samples.head.mount_seed:
-        return None
-    return found.calibration
-
-
-def _now() -> str:
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-
-
-def _outcome(samples: SampleSet, result: Result, store: CalibrationStore | None, *, force: bool = False) -> Outcome:
+def _outcome(done: Solved, store: CalibrationStore | None, *, force: bool = False) -> Outcome:
     from openarm_calibration.report import summary
 
-    data: dict[str, Any] = result.as_json()
-    text = summary(result)
+    result, data = done.result, _json(done)
+    text = "\n\n".join(part for part in (done.text, summary(result)) if part)
     failed = result.verdict.grade == "fail"
     message = f"{result.verdict.grade}: {'; '.join(result.verdict.reasons) or 'within all limits'}"
     if store is not None and (force or not failed):
@@ -250,14 +248,8 @@ def _outcome(samples: SampleSet, result: Result, store: CalibrationStore | None,
         data["stored"] = str(path)
         return Outcome(True, f"{message}. Stored in {path}", data=data, text=text)
     if store is not None:
-        message += f"; not stored (--force of `openarm calibrate save` stores it all the same), {len(samples)} samples"
+        message += "; not stored (--force of `openarm calibrate save` stores it all the same)"
     return Outcome(not failed, message, Code.DEGENERATE if failed else Code.OK, data, text)
-
-
-def _store(folder: Path | None) -> CalibrationStore:
-    from openarm_calibration.store import CalibrationStore, default_folder
-
-    return CalibrationStore(folder if folder is not None else default_folder())
 
 
 def _line(item: StoredCalibration) -> str:

@@ -25,7 +25,7 @@ from openarm_common.convert import matrix_to_pose, vector
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
-    from openarm_calibration.node import CalibrationNode
+    from openarm_calibration.session_node import SessionNode
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class AutoCalibrator:
         node: That has the samples, the solver and the store.
     """
 
-    def __init__(self, node: CalibrationNode) -> None:
+    def __init__(self, node: SessionNode) -> None:
         self._node = node
         self._config = node.config.auto
         self._mover = ActionClient(node, MoveArm, "/motion/move")
@@ -81,7 +81,7 @@ class _Run:
     """One goal."""
 
     def __init__(
-        self, node: CalibrationNode, mover: ActionClient, handle: ServerGoalHandle, result: AutoCalibrate.Result
+        self, node: SessionNode, mover: ActionClient, handle: ServerGoalHandle, result: AutoCalibrate.Result
     ) -> None:
         self._node, self._mover, self._handle, self._result = node, mover, handle, result
         self._goal: AutoCalibrate.Goal = handle.request

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError, field_validator, model_validator
 
@@ -205,3 +206,20 @@ def parse_board(data: dict[str, Any], where: str = "board") -> Board:
     except ValidationError as error:
         model = CircleGrid if kind == "circles" else Charuco
         raise OpenArmError(Code.CONFIG_INVALID, describe_faults(error, where, model)) from error
+
+
+def read_board(text: str, where: str = "board") -> Board:
+    """Make a board of its keys as YAML, such as `{kind: circles, rows: 11}`; an empty text is the default board.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming `where` and what is wrong.
+    """
+    try:
+        keys: Any = yaml.safe_load(text) if text else {}
+    except yaml.YAMLError as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"{where} {text!r} is not YAML: {error}") from error
+    if not isinstance(keys, dict):
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"{where} is {text!r}, expected keys and values, such as {{kind: charuco}}"
+        )
+    return parse_board(keys, where)  # pyright: ignore[reportUnknownArgumentType]

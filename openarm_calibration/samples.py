@@ -210,6 +210,22 @@ class SampleSet:
         return X @ se3.inverse(T_LINK_OPTICAL)
 
     # --- session file
+    def _text(self) -> str:
+        """All but marks and images, as JSON."""
+        listed = [
+            {
+                "name": sample.name, "t_image_ns": sample.t_image_ns, "t_joints_ns": sample.t_joints_ns,
+                "joints": dict(sample.joints), "speed": sample.speed, "residual": sample.detection.residual,
+                "track": [[t, dict(state)] for t, state in sample.track],
+            }
+            for sample in self._samples
+        ]  # fmt: skip
+        return json.dumps({"format": 1, "head": self.head.model_dump(mode="json"), "samples": listed})
+
+    def digest(self) -> str:
+        """Hash of the session as it is now, as `save` returns it."""
+        return hashlib.sha256(self._text().encode()).hexdigest()
+
     def save(self, path: Path) -> str:
         """Write the session and return its hash.
 
@@ -218,21 +234,13 @@ class SampleSet:
         """
         if path.suffix != ".npz":
             raise OpenArmError(Code.INVALID_ARGUMENT, f"session file {path}: expected a name that ends in .npz")
+        text = self._text()
         arrays: dict[str, NDArray[Any]] = {}
-        listed: list[dict[str, Any]] = []
         for k, sample in enumerate(self._samples):
-            listed.append(
-                {
-                    "name": sample.name, "t_image_ns": sample.t_image_ns, "t_joints_ns": sample.t_joints_ns,
-                    "joints": dict(sample.joints), "speed": sample.speed, "residual": sample.detection.residual,
-                    "track": [[t, dict(state)] for t, state in sample.track],
-                }
-            )  # fmt: skip
             arrays[f"ids_{k}"] = sample.detection.ids
             arrays[f"pixels_{k}"] = sample.detection.pixels
             arrays[f"pose_{k}"] = sample.T_camera_board
             arrays[f"png_{k}"] = np.frombuffer(sample.png, dtype=np.uint8)
-        text = json.dumps({"format": 1, "head": self.head.model_dump(mode="json"), "samples": listed})
         arrays["head"] = np.frombuffer(text.encode(), dtype=np.uint8)
         stream = io.BytesIO()
         np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
@@ -295,6 +303,12 @@ def moving_joints(head: SessionHead, description: RobotDescription) -> tuple[str
     """Names of the joints between the base and what the arm carries."""
     link = head.parent if head.setup == "in_hand" else head.carrier
     return tuple(joint.name for joint in description.chain(link) if joint.type != "fixed")
+
+
+def setup_of(description: RobotDescription, parent: str) -> Literal["in_hand", "to_hand"]:
+    """Whether a camera on a link moves with the arm, or stands and looks at a board that the arm carries."""
+    moves = any(joint.type != "fixed" for joint in description.chain(parent))
+    return "in_hand" if moves else "to_hand"
 
 
 def without(samples: SampleSet, names: Sequence[str], description: RobotDescription) -> SampleSet:

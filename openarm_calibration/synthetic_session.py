@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sessions with a known mount on the arm's own kinematics, for tests; m, rad, px."""
+"""Sessions with a known mount on the arm's own kinematics, and pictures of boards, for tests; m, rad, px."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_calibration.board import CircleGrid
+from openarm_calibration.board import Board, CircleGrid
 from openarm_calibration.detect import Detection
 from openarm_calibration.projection import project
 from openarm_calibration.samples import Sample, SampleSet, SessionHead
 from openarm_common import se3
-from openarm_common.cameras import T_LINK_OPTICAL, load_cameras, true_mount
+from openarm_common.cameras import T_LINK_OPTICAL, Intrinsics, load_cameras, true_mount
 from openarm_common.description import RobotDescription
 
 Array = NDArray[np.float64]
@@ -29,6 +30,20 @@ class Known:
     samples: SampleSet
     X: Array
     description: RobotDescription
+
+
+def photograph(board: Board, T_camera_board: Array, optics: Intrinsics, *, mirrored: bool = False) -> Array:
+    """Grey picture (h, w) of a board alone, 16 samples a pixel; 0 to 255."""
+    scale, zoom = 4000.0, 4
+    w, h = board.size
+    to_board = np.array([[1 / scale, 0, 0.5 / scale - w / 2], [0, 1 / scale, 0.5 / scale - h / 2], [0, 0, 1]])
+    K = optics.matrix
+    K[:2] *= zoom
+    K[:2, 2] += (zoom - 1) / 2
+    H = K @ T_camera_board[:3, [0, 1, 3]] @ to_board
+    picture = board.draw(scale)[:, :: -1 if mirrored else 1]
+    large = cv2.warpPerspective(picture, H, (optics.width * zoom, optics.height * zoom), borderValue=(130.0,))
+    return cv2.resize(large, (optics.width, optics.height), interpolation=cv2.INTER_AREA).astype(np.float64)
 
 
 def make_session(

@@ -81,7 +81,7 @@ def test_a43_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) ->
         (["board", "b.png", "--rows", "10"], 2, "odd"),
         (["board", "b.png", "--kind", "dots"], 2, "dots"),
         (["board", "b.png", "--dpi", "7"], 2, "expected 50 to 2400"),
-        (["solve"], 2, "session"),
+        (["solve"], 2, "samples"),
         (["solve", "nowhere.npz"], 1, "does not exist"),
         (["solve", "SESSION", "--algorithm", "tsay"], 2, "algorithms: REFINED, TSAI"),
         (["solve", "SESSION", "--exclude", "s999"], 2, "samples: s001"),

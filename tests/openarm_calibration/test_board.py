@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from openarm_calibration import synthetic_session
 from openarm_calibration.board import Board, Charuco, CircleGrid, parse_board
 from openarm_calibration.board_files import png, write_board
 from openarm_calibration.centroids import refined
@@ -32,17 +33,8 @@ def pose(rng: np.random.Generator, far: float = 0.7) -> np.ndarray:
 
 
 def photograph(board: Board, T: np.ndarray, rng: np.random.Generator, mirrored: bool = False) -> np.ndarray:
-    """Picture of a board: 16 samples a pixel, grey noise of 2."""
-    scale, zoom = 4000.0, 4
-    w, h = board.size
-    to_board = np.array([[1 / scale, 0, 0.5 / scale - w / 2], [0, 1 / scale, 0.5 / scale - h / 2], [0, 0, 1]])
-    camera = K.matrix
-    camera[:2] *= zoom
-    camera[:2, 2] += (zoom - 1) / 2
-    H = camera @ np.stack([T[:3, 0], T[:3, 1], T[:3, 3]], axis=1) @ to_board
-    picture = board.draw(scale)
-    image = cv2.warpPerspective(picture[:, ::-1] if mirrored else picture, H, (640 * zoom, 480 * zoom), borderValue=130)
-    image = cv2.resize(image, (640, 480), interpolation=cv2.INTER_AREA) + rng.normal(0.0, 2.0, (480, 640))
+    """Picture of a board with grey noise of 2."""
+    image = synthetic_session.photograph(board, T, K, mirrored=mirrored) + rng.normal(0.0, 2.0, (480, 640))
     return np.clip(image, 0, 255).astype(np.uint8)
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-import cv2
 import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
 from openarm_calibration.board import CircleGrid
-from openarm_calibration.synthetic_session import Known
+from openarm_calibration.synthetic_session import Known, photograph
 from openarm_common import se3
 from openarm_common.convert import array_to_image, info_from_intrinsics, ns_to_stamp
 from openarm_common.node import QOS_COMMAND, QOS_SENSOR
@@ -53,15 +52,7 @@ class PosedRobot:
         A = samples.pose(self.joints)
         B = se3.inverse(A) if samples.head.setup == "in_hand" else A
         T = se3.inverse(self.known.X) @ B @ self.Z
-        scale, zoom = 4000.0, 3
-        w, h = BOARD.size
-        to_board = np.array([[1 / scale, 0, 0.5 / scale - w / 2], [0, 1 / scale, 0.5 / scale - h / 2], [0, 0, 1]])
-        K = optics.matrix
-        K[:2] *= zoom
-        K[:2, 2] += (zoom - 1) / 2
-        H = K @ np.stack([T[:3, 0], T[:3, 1], T[:3, 3]], axis=1) @ to_board
-        large = cv2.warpPerspective(BOARD.draw(scale), H, (640 * zoom, 480 * zoom), borderValue=130)
-        grey = cv2.resize(large, (640, 480), interpolation=cv2.INTER_AREA)
+        grey = photograph(BOARD, T, optics)
         self._pixels = np.repeat(grey[:, :, None], 3, axis=2).astype(np.uint8)
 
     def _tick(self) -> None:
