@@ -13,6 +13,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/launch", ["launch/openarm.launch.py"]),
     ],
     install_requires=["setuptools"],
     entry_points={"console_scripts": ["openarm = openarm_bringup.cli:main"]},

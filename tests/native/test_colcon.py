@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole tree as a colcon workspace; a quarter of an hour, so only when asked for: OPENARM_COLCON=1."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.skipif(not os.environ.get("OPENARM_COLCON"), reason="takes a quarter of an hour; set OPENARM_COLCON=1")
+@pytest.mark.timeout(3600)
+def test_colcon_builds_the_tree_and_what_it_installs_runs(tmp_path: Path) -> None:
+    command = [str(ROOT / "tools" / "colcon_check.sh"), str(tmp_path)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=3500, check=False)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    assert "packages, models and config come from" in done.stdout
+    assert done.stdout.count("a joint state of 16 joints") == 2

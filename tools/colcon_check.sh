@@ -1,0 +1,53 @@
+#!/bin/sh
+# SPDX-License-Identifier: Apache-2.0
+# tools/colcon_check.sh [FOLDER]: builds the committed tree with colcon as a native ROS 2 workspace does, then starts a node and
+# a graph of what was installed. Takes a quarter of an hour on two cores; FOLDER (a new temporary one) keeps all of it.
+# ROS itself comes from the wheels here, in an environment of its own; in a native Jazzy, source that and call colcon.
+set -eu
+
+root=$(cd "$(dirname -- "$0")/.." && pwd)
+work=${1:-$(mktemp -d "${TMPDIR:-/tmp}/openarm-colcon-XXXXXX")}
+mkdir -p "$work"
+work=$(cd "$work" && pwd)
+env=$work/env
+uv=$root/.venv/bin/uv
+[ -x "$uv" ] || uv=uv
+say() { printf '== %s\n' "$*"; }
+
+unset PYTHONPATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+say "environment in $env"
+python=$root/.venv/bin/python
+[ -x "$python" ] || python=python3
+[ -x "$env/bin/python" ] || "$uv" venv --quiet --no-python-downloads --python "$python" "$env"
+for lock in requirements.lock requirements-build.lock; do
+    "$uv" pip install --quiet --python "$env" --require-hashes -r "$root/$lock"
+done
+"$uv" pip install --quiet --python "$env" colcon-common-extensions
+PATH=$env/bin:$PATH
+export PATH
+
+say "copy of the tree in $work/ws/src"
+rm -rf "$work/ws/src"
+mkdir -p "$work/ws/src/openarm"
+git -C "$root" archive HEAD | tar -x -C "$work/ws/src/openarm"
+
+say "colcon build"
+cd "$work/ws"
+AMENT_PREFIX_PATH=$env CMAKE_PREFIX_PATH=$env colcon build --executor sequential --event-handlers console_direct- \
+    --cmake-args "-DPython3_EXECUTABLE=$env/bin/python" -DBUILD_TESTING=OFF --no-warn-unused-cli
+
+say "what was installed"
+AMENT_PREFIX_PATH=$env
+export AMENT_PREFIX_PATH
+set +u
+. install/setup.sh
+set -u
+ROS_DOMAIN_ID=${ROS_DOMAIN_ID:-$(python -c 'import random; print(random.randrange(1, 102))')}
+ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
+MUJOCO_GL=${MUJOCO_GL:-egl}
+OPENARM_RUNS=$work/runs
+XDG_RUNTIME_DIR=$work/xdg
+export ROS_DOMAIN_ID ROS_AUTOMATIC_DISCOVERY_RANGE MUJOCO_GL OPENARM_RUNS XDG_RUNTIME_DIR
+mkdir -p "$XDG_RUNTIME_DIR"
+exec python "$root/tools/colcon_run.py" "$work/ws/install"
