@@ -34,7 +34,7 @@ PALETTE: Mapping[str, Rgba] = MappingProxyType(
         "purple": (0.46, 0.10, 0.66, 1.0),
     }
 )
-SHAPES = ("box", "cylinder")
+SHAPES = ("box", "cylinder", "sphere")
 RESERVED_NAMES = ("world", "floor", "table", "table_top")
 DENSITY = 700.0  # kg/m3, of an object without a mass: hard wood
 MAX_EDGE = 0.30  # m
@@ -79,13 +79,14 @@ class Table(Config):
 class SceneObject(Config):
     """A free body in one plain colour.
 
-    `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height.
+    `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height; a sphere's
+    diameter three times.
     `position` is x, y, or x, y, z of the centre; without z the object stands on the table.
     """
 
     name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")
     label: str = Field(default="", description="what the detector calls it; the colour where it is not given")
-    shape: str = Field(description="box or cylinder")
+    shape: str = Field(description="box, cylinder or sphere")
     size: tuple[float, float, float] = Field(description="extents, m")
     color: str = Field(description="a colour of the palette")
     mass: float = Field(default=0.0, ge=0.0, le=10.0, description="kg; 0 is the volume times the density of hard wood")
@@ -135,6 +136,12 @@ class SceneObject(Config):
             raise ValueError("expected finite numbers")
         return value
 
+    @model_validator(mode="after")
+    def _round(self) -> SceneObject:
+        if self.shape == "sphere" and len(set(self.size)) > 1:
+            raise ValueError(f"a sphere has one diameter; expected three equal extents, got {self.size}")
+        return self
+
     @property
     def rgba(self) -> Rgba:
         """Colour."""
@@ -144,7 +151,7 @@ class SceneObject(Config):
     def volume(self) -> float:
         """Cubic metres."""
         x, y, z = self.size
-        return x * y * z * (math.pi / 4.0 if self.shape == "cylinder" else 1.0)
+        return x * y * z * {"box": 1.0, "cylinder": math.pi / 4.0, "sphere": math.pi / 6.0}[self.shape]
 
     @property
     def mass_kg(self) -> float:
@@ -162,7 +169,7 @@ class SceneObject(Config):
 
     def outline(self) -> Array:
         """Convex outline (n, 2) of the footprint in the base frame, m."""
-        if self.shape == "cylinder":
+        if self.shape != "box":
             angles = np.arange(32) * (math.tau / 32.0)
             corners = np.stack([np.cos(angles), np.sin(angles)], axis=1) * (self.size[0] / 2.0)
         else:

@@ -26,6 +26,7 @@ _FLOOR_RGBA = (0.48, 0.48, 0.49, 1.0)  # plain: a texture that fills half of an 
 _LEG_RGBA = (0.30, 0.30, 0.31, 1.0)
 _HOUSING_RGBA = (0.13, 0.13, 0.14, 1.0)
 _LENS_RGBA = (0.02, 0.02, 0.02, 1.0)
+_ROUND = 16  # facets of a sphere from pole to pole
 _LEG = 0.02  # half the edge of a table leg, m
 #: Clipping planes of every camera, m; the near one lies before anything that a camera reports.
 NEAR, FAR = 0.02, 20.0
@@ -116,6 +117,9 @@ def add_object(spec: mujoco.MjSpec, item: SceneObject, table: Table, contact: Ma
     x, y, z = item.size
     if item.shape == "cylinder":
         kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, (x / 2.0, z / 2.0, 0.0)
+    elif item.shape == "sphere":
+        kind, size = mujoco.mjtGeom.mjGEOM_SPHERE, (x / 2.0, 0.0, 0.0)
+        spec.visual.quality.numstacks = _ROUND  # the facets of `add_surroundings` would make a double cone of it
     else:
         kind, size = mujoco.mjtGeom.mjGEOM_BOX, (x / 2.0, y / 2.0, z / 2.0)
     body.add_geom(

@@ -80,7 +80,7 @@ def test_mass_follows_from_the_volume_where_none_is_given() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"shape": "ball"}, "objects.0.shape: .*unknown shape; shapes: box, cylinder, got 'ball'"),
+        ({"shape": "ball"}, "objects.0.shape: .*unknown shape; shapes: box, cylinder, sphere, got 'ball'"),
         ({"color": "pink"}, "objects.0.color: .*colours: red, orange, yellow, green, blue, purple, got 'pink'"),
         ({"size": [0.05, 0.05, 0.31]}, "objects.0.size: .*too large .*0.01 .. 0.3 m"),
         ({"size": [0.05, 0.05, 0.001]}, "objects.0.size: .*too small"),
