@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Depth to cloud and to octree, beside the usual ways of doing it on the same images in the same run.
 
-    python benchmarks/perception.py [--quick] [--pyoctomap PYTHON] [--json PATH]
+    python benchmarks/perception.py [--quick] [--bindings PYTHON] [--json PATH]
 
 Images are those of both cameras of the simulated robot (640 x 480, 16UC1, noise and dropouts) over demo and random
 scenes. Times are CPU times of one thread, median; a cycle is one update from the images of both cameras.
@@ -9,7 +9,8 @@ scenes. Times are CPU times of one thread, median; a cycle is one update from th
     cloud_ms               depth image to organised points; peer: numpy with a meshgrid for every image
     octree_cycle_ms        end cells, rays, log-odds and the binary octree of two cameras; peer: liboctomap (C++)
     octree_cycle_full_ms   the same with self-filter, distance field and the reset of the robot's cells
-    octree_python_ratio    pyoctomap's time for a cycle over ours
+    pyoctomap_ratio, octomap_python_ratio   time of a Python binding of liboctomap for a cycle over ours
+    ..._round_trip         1 when our .bt file has the same bytes after that binding has read and written it
     distance_field_ms      of that: the distance field
     self_filter_ms         of that: the labels of both images
     voxel_mismatch         cells that differ from liboctomap's after all frames, cleared ones among them
@@ -17,13 +18,14 @@ scenes. Times are CPU times of one thread, median; a cycle is one update from th
     clear_ms, mark_ms      simulated time from an object's removal (arrival) to the map without (with) it, worst phase
 
 liboctomap is compiled from benchmarks/liboctomap_peer.cpp when g++ and its headers are there: those of Debian's
-liboctomap-dev, or those that come with the wheel cmeel-octomap (a dependency of pin). pyoctomap is used when this
-Python has it, or another one given by --pyoctomap.
+liboctomap-dev, or those that come with the wheel cmeel-octomap (a dependency of pin). pyoctomap and octomap-python are
+used when this Python has them, or another one given by --bindings.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 import subprocess
 import sys
@@ -37,7 +39,7 @@ import numpy as np
 
 from benchmarks.map_scene import MapScene
 from benchmarks.report import Row, write_report
-from openarm_common.octomap_codec import read_file
+from openarm_common.octomap_codec import read_file, write_file
 from openarm_common.scene import load_scene, random_scene
 from openarm_common.self_filter import SelfFilter
 from openarm_octomap.accuracy import compare
@@ -58,20 +60,6 @@ THEIRS = {
     "max_range": -1.0,
     "clear_without_return": False,
 }
-
-_PYOCTOMAP = """
-import sys, time
-import numpy as np, pyoctomap
-data = np.load(sys.argv[1])
-tree = pyoctomap.OcTree(0.02)
-cycles = []
-for i in range(0, int(data["n"]), 2):
-    begin = time.process_time()
-    for k in (i, i + 1):
-        tree.insertPointCloud(data[f"p{k}"].astype(np.float64), data[f"o{k}"].astype(np.float64), discretize=True)
-    cycles.append(time.process_time() - begin)
-print(1e3 * float(np.median(cycles)))
-"""
 
 
 def cpu_ms(work: Callable[[], object], repeats: int) -> float:
@@ -123,7 +111,7 @@ def cloud_rows(frames: Sequence[Frame], repeats: int) -> list[Row]:
 
 
 def octree_rows(pairs: Sequence[Sequence[Frame]], repeats: int, python: str) -> list[Row]:
-    """The octree, exact, beside liboctomap and pyoctomap on the same points."""
+    """The octree, exact, beside liboctomap and its bindings on the same points."""
     grid = OccupancyGrid(GridConfig(**THEIRS))
     times: list[float] = []
     for turn in range(max(1, repeats // len(pairs)) + 1):
@@ -147,11 +135,11 @@ def octree_rows(pairs: Sequence[Sequence[Frame]], repeats: int, python: str) -> 
             rows.append(Row("voxel_mismatch", different, "", "lower", 0.0, n=int(np.count_nonzero(theirs))))
         else:
             rows.append(Row("octree_cycle_ms", ours, "ms", "lower", 25.0, n=len(times)))
-        binding = pyoctomap(clouds, Path(folder), python)
-        if binding is not None:
-            rows.append(
-                Row("octree_python_ratio", binding / ours, "x", "higher", None, "pyoctomap ms", binding, len(pairs))
-            )
+        write_file(Path(folder) / "ours.bt", grid.binary(), grid.lattice.resolution)
+        for name, answer in bindings(clouds, Path(folder), python).items():
+            key, theirs = name.replace("-", "_"), answer["ms"]
+            rows.append(Row(f"{key}_ratio", theirs / ours, "x", "higher", None, f"{name} ms", theirs, len(pairs)))
+            rows.append(Row(f"{key}_round_trip", int(answer["same"]), "", "higher", 1.0))
     return rows
 
 
@@ -179,17 +167,18 @@ def liboctomap(scans: Sequence[DepthScan], folder: Path) -> tuple[float, float] 
     return float(answer[0]) + float(answer[1]), float(answer[1])
 
 
-def pyoctomap(scans: Sequence[DepthScan], folder: Path, python: str) -> float | None:
-    """Insert frames with pyoctomap; CPU time of a pair, ms, without encoding."""
-    if subprocess.run([python, "-c", "import pyoctomap"], capture_output=True).returncode:
-        print(f"pyoctomap: {python} does not have it (pip install pyoctomap, or --pyoctomap PYTHON); left out")
-        return None
+def bindings(scans: Sequence[DepthScan], folder: Path, python: str) -> dict[str, dict[str, float]]:
+    """What the Python bindings of liboctomap take for a pair of frames, and what they make of our map in `ours.bt`."""
     some = scans[:4]
     arrays = {f"p{i}": scan.points() for i, scan in enumerate(some)}
     arrays |= {f"o{i}": scan.T_base_camera[:3, 3].astype(np.float32) for i, scan in enumerate(some)}
     np.savez(folder / "frames.npz", n=len(some), **arrays)
-    arguments = [python, "-c", _PYOCTOMAP, str(folder / "frames.npz")]
-    return float(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout)
+    script = Path(__file__).with_name("octomap_bindings.py")
+    arguments = [python, str(script), str(folder / "frames.npz"), str(folder / "ours.bt"), str(folder)]
+    answers = json.loads(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout)
+    for name in sorted({"pyoctomap", "octomap-python"} - answers.keys()):
+        print(f"{name}: {python} does not have it (--bindings PYTHON names one that has); left out")
+    return answers
 
 
 def full_rows(scene: MapScene, pairs: Sequence[Sequence[Frame]], repeats: int) -> list[Row]:
@@ -270,13 +259,13 @@ def main() -> None:
     """Run all parts."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="fewer scenes and repetitions")
-    parser.add_argument("--pyoctomap", default=sys.executable, metavar="PYTHON", help="a Python that has pyoctomap")
+    parser.add_argument("--bindings", default=sys.executable, metavar="PYTHON", help="a Python with the bindings")
     parser.add_argument("--json", type=Path, default=None, help="also write the report there")
     args = parser.parse_args()
     repeats = 20 if args.quick else 100
     pairs = record(args.quick)
     scene = MapScene(load_scene("demo"))
-    rows = cloud_rows(pairs[0], repeats) + octree_rows(pairs, repeats, args.pyoctomap)
+    rows = cloud_rows(pairs[0], repeats) + octree_rows(pairs, repeats, args.bindings)
     rows += full_rows(scene, pairs, repeats)
     scene.close()
     rows += accuracy_rows(args.quick)
