@@ -45,6 +45,7 @@ def build_app() -> App:
         ros_cli,
         tf_cli,
         up_cli,
+        view_cli,
     )
 
     app = App(
@@ -56,6 +57,7 @@ def build_app() -> App:
         default_parameter=Parameter(negative_iterable=()),
     )
     app.command(up_cli.up)
+    app.command(view_cli.view)
     app.command(pick_cli.pick)
     app.command(order_cli.order)
     app.command(demo_cli.demo)

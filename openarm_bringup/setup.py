@@ -9,7 +9,7 @@ setup(
     version="0.1.0",
     packages=[NAME],
     package_dir={NAME: "."},
-    package_data={NAME: ["py.typed"]},
+    package_data={NAME: ["py.typed", "view_page/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

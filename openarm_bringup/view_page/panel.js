@@ -1,0 +1,138 @@
+// SPDX-License-Identifier: Apache-2.0
+// The panel beside the scene: the state of the grasp, what can be asked for, how the nodes are.
+// What comes from the graph is shown as text (textContent), never as markup.
+
+const $ = (id) => document.getElementById(id);
+
+/** Colours of the labels that the detector knows; others stay grey. */
+const SWATCHES = { red: "#d64541", orange: "#e8863a", yellow: "#e3c02f", green: "#4a9d5b", blue: "#3f74c9", purple: "#8657b5" };
+
+export function element(tag, { text, ...attributes } = {}, ...children) {
+  const made = document.createElement(tag);
+  if (text !== undefined) made.textContent = text;
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  made.append(...children);
+  return made;
+}
+
+const swatch = (label) => SWATCHES[label] ?? "#8b989e";
+const spoken = (state) => state.charAt(0) + state.slice(1).toLowerCase().replaceAll("_", " ");
+
+export class GraspPanel {
+  setStates(states) {
+    this.states = states;
+    $("track").replaceChildren(...states.map((state) => element("li", { title: spoken(state) })));
+  }
+
+  show({ steps }) {
+    const last = steps.at(-1);
+    const at = this.states.indexOf(last.state);
+    $("state").textContent = spoken(last.state);
+    $("reason").textContent = last.reason;
+    const facts = [last.label, last.arm && `${last.arm} arm`, last.attempt > 0 && `attempt ${last.attempt}`];
+    $("facts").textContent = facts.filter(Boolean).join(" · ");
+    [...$("track").children].forEach((bar, i) => {
+      bar.className = at === 0 ? "" : i < at ? "past" : i === at ? "now" : "";
+    });
+    const rows = steps.map((step) =>
+      element("li", {}, element("time", { text: `${step.t.toFixed(1)} s` }), element("b", { text: spoken(step.state) }), element("span", { text: step.reason })),
+    );
+    $("steps").replaceChildren(...rows.reverse());
+  }
+}
+
+export class AskPanel {
+  /** @param ask sends a request and gives its answer  @param onChosen called with the label that is to be picked */
+  constructor(ask, onChosen) {
+    this.ask = ask;
+    this.onChosen = onChosen;
+    this.labels = null;
+    this.label = null;
+    this.running = false;
+    $("ask").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.#pick(new FormData($("ask")));
+    });
+    $("cancel").addEventListener("click", async () => this.#tell("outcome", await this.ask("cancel")));
+    $("reset").addEventListener("click", () => this.#reset({}));
+    $("shuffle").addEventListener("click", () => this.#reset({ scene: "random", seed: Math.floor(Math.random() * 1e6) }));
+  }
+
+  setDetections(boxes) {
+    const labels = [...new Set(boxes.map((box) => box.label))].sort();
+    if (labels.join() === this.labels?.join()) return;
+    this.labels = labels;
+    this.choose(labels.includes(this.label) ? this.label : (labels[0] ?? null));
+  }
+
+  choose(label) {
+    this.label = label;
+    const chips = (this.labels ?? []).map((name) => {
+      const chip = element("button", { type: "button", role: "radio", "aria-checked": name === label, text: name });
+      chip.style.setProperty("--swatch", swatch(name));
+      chip.addEventListener("click", () => this.choose(name));
+      return chip;
+    });
+    $("choices").replaceChildren(...(chips.length ? chips : [element("span", { text: "nothing is seen" })]));
+    this.#enable();
+    this.onChosen(label);
+  }
+
+  showOutcome(outcome) {
+    this.running = outcome.running;
+    this.#enable();
+    if (outcome.running) {
+      $("outcome").textContent = "";
+    } else {
+      this.#tell("outcome", outcome);
+    }
+  }
+
+  async #pick(form) {
+    const answer = await this.ask("pick", { label: this.label, arm: form.get("arm"), dry_run: form.has("dry_run") });
+    if (!answer.success) this.#tell("outcome", answer);
+  }
+
+  async #reset(order) {
+    const answer = await this.ask("reset", order);
+    this.#tell("world-answer", answer);
+  }
+
+  #tell(id, { success, code, message }) {
+    $(id).dataset.result = success ? "success" : "failure";
+    $(id).textContent = success ? message : `${code}: ${message}`;
+  }
+
+  #enable() {
+    $("pick").disabled = this.running || this.label === null;
+    $("pick").textContent = this.running ? "Picking…" : this.label === null ? "Pick" : `Pick ${this.label}`;
+  }
+}
+
+export class HealthPanel {
+  constructor() {
+    this.rows = new Map();
+  }
+
+  show({ nodes, speed }) {
+    if (speed !== null) $("speed").textContent = `${speed.toFixed(2)}×`;
+    for (const node of nodes) this.#fill(this.rows.get(node.name) ?? this.#add(node.name), node);
+  }
+
+  #add(name) {
+    const row = { said: element("em"), facts: element("dl") };
+    row.summary = element("summary", {}, element("span", { text: name }), row.said);
+    row.item = element("li", { "data-name": name }, element("details", {}, row.summary, row.facts));
+    this.rows.set(name, row);
+    $("nodes").replaceChildren(...[...this.rows].sort(([a], [b]) => a.localeCompare(b)).map(([, { item }]) => item));
+    return row;
+  }
+
+  #fill(row, node) {
+    row.item.dataset.level = node.level;
+    row.said.textContent = node.message;
+    row.summary.title = node.message;
+    const facts = Object.entries(node.values).flatMap(([key, value]) => [element("dt", { text: key }), element("dd", { text: value })]);
+    row.facts.replaceChildren(element("p", { text: node.message }), ...facts);
+  }
+}

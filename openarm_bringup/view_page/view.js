@@ -1,0 +1,277 @@
+// SPDX-License-Identifier: Apache-2.0
+// The page: a websocket brings what is wanted, the scene and the panel show it, requests ask the robot.
+
+import { boxEdges } from "./meshes.js";
+import { multiply, scaled } from "./matrix.js";
+import { AskPanel, GraspPanel, HealthPanel, element } from "./panel.js";
+import { INSTANCE, Scene } from "./scene.js";
+
+const $ = (id) => document.getElementById(id);
+const token = new URLSearchParams(location.search).get("token") ?? "";
+
+const LAYERS = { detections: "Objects", cloud: "Cloud", map: "Map", plan: "Plan" };
+const wanted = new Set(["robot", "detections", "cloud", "plan"]);
+const scene = new Scene($("scene"), placeLabels);
+const grasp = new GraspPanel();
+const asking = new AskPanel(ask, markChosen);
+const health = new HealthPanel();
+
+let socket = null;
+let robot = null; // links, and shapes by mesh with their pose in the link
+let poses = null; // of the links, as they came
+let held = [];
+let boxes = [];
+
+const handlers = {
+  hello(message) {
+    robot = { links: message.robot.links, shapes: sorted(message.robot.shapes) };
+    grasp.setStates(message.states);
+    if (!$("cameras").children.length) makeCameras(message.cameras);
+    drawFloor();
+    want();
+  },
+  robot(_, body) {
+    poses = new Float32Array(body);
+    drawRobot();
+  },
+  held(message) {
+    held = message.boxes.filter((box) => robot.links.includes(box.link));
+    if (poses) drawRobot();
+  },
+  cloud(head, body) {
+    const end = 12 * head.count;
+    scene.setPoints("cloud", new Float32Array(body, 0, 3 * head.count), new Uint8Array(body, end), 3, 0.009);
+  },
+  map(head, body) {
+    drawMap(new Float32Array(body), head.count);
+  },
+  detections(message) {
+    boxes = message.boxes;
+    asking.setDetections(boxes);
+    drawDetections();
+  },
+  plan(message) {
+    const ends = message.ways.flatMap((way) => way.slice(1).flatMap((point, i) => [way[i], point]));
+    drawLines("plan", ends, [224, 138, 40, 255]);
+  },
+  image(head, body) {
+    const image = document.querySelector(`#cameras figure[data-camera="${CSS.escape(head.camera)}"] img`);
+    const old = image.src;
+    image.src = URL.createObjectURL(new Blob([body], { type: "image/jpeg" }));
+    if (old) URL.revokeObjectURL(old);
+  },
+  grasp: (message) => grasp.show(message),
+  health: (message) => health.show(message),
+  outcome: (message) => asking.showOutcome(message),
+  fault: showFault,
+};
+
+// --- the line to the server
+function connect() {
+  socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/socket?token=${encodeURIComponent(token)}`);
+  socket.binaryType = "arraybuffer";
+  socket.addEventListener("open", () => showLink("ok", "connected"));
+  socket.addEventListener("message", ({ data }) => receive(data));
+  socket.addEventListener("close", () => {
+    showLink("error", "not connected");
+    setTimeout(connect, 1500);
+  });
+}
+
+function receive(data) {
+  if (typeof data === "string") {
+    const message = JSON.parse(data);
+    handlers[message.kind](message);
+    return;
+  }
+  const length = new DataView(data).getUint32(0, true);
+  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+  handlers[head.kind](head, data.slice(4 + length));
+}
+
+function want() {
+  if (socket?.readyState !== WebSocket.OPEN) return;
+  // A page that nobody sees wants nothing.
+  socket.send(JSON.stringify({ want: document.hidden ? [] : [...wanted] }));
+}
+
+async function ask(what, order = {}) {
+  try {
+    const response = await fetch(`/${what}`, {
+      method: "POST",
+      headers: { "Content-Type": "application/json", Authorization: `Bearer ${token}` },
+      body: JSON.stringify(order),
+    });
+    const text = await response.text();
+    return response.headers.get("Content-Type")?.includes("json") ? JSON.parse(text) : { success: false, code: response.status, message: text };
+  } catch (error) {
+    return { success: false, code: "NOT_READY", message: `the server of this page does not answer (${error.message})` };
+  }
+}
+
+function showLink(level, text) {
+  $("link").dataset.level = level;
+  $("link").textContent = text;
+}
+
+function showFault({ layer, text }) {
+  const name = `fault-${layer}`;
+  document.getElementById(name)?.remove();
+  if (text) $("faults").append(element("li", { id: name, text }));
+}
+
+// --- what is drawn
+function sorted(shapes) {
+  const by = { box: [], cylinder: [], sphere: [] };
+  for (const { link, kind, size, pose, color } of shapes) {
+    const [x, y, z] = kind === "box" ? size : kind === "cylinder" ? [2 * size[0], 2 * size[0], size[1]] : Array(3).fill(2 * size[0]);
+    by[kind].push({ link, local: scaled(pose, x, y, z), color });
+  }
+  return by;
+}
+
+function drawRobot() {
+  for (const [mesh, shapes] of Object.entries(robot.shapes)) {
+    if (!shapes.length) continue;
+    const data = new Float32Array(INSTANCE * shapes.length);
+    shapes.forEach(({ link, local, color }, i) => {
+      multiply(poses, local, data, INSTANCE * i, 16 * link);
+      data.set(color, INSTANCE * i + 16);
+    });
+    scene.setSolids(`robot ${mesh}`, mesh, data);
+  }
+  const data = new Float32Array(INSTANCE * held.length);
+  held.forEach((box, i) => {
+    multiply(poses, scaled(box.pose, ...box.size), data, INSTANCE * i, 16 * robot.links.indexOf(box.link));
+    data.set([0.31, 0.7, 0.75, 0.45], INSTANCE * i + 16);
+  });
+  scene.setSolids("held", "box", data, { glass: true });
+}
+
+function drawMap(cells, count) {
+  const data = new Float32Array(INSTANCE * count);
+  for (let i = 0; i < count; i++) {
+    const [x, y, z, edge] = cells.subarray(4 * i, 4 * i + 4);
+    const size = 0.94 * edge;
+    const u = Math.min(1, Math.max(0, z / 1.0));
+    data.set([size, 0, 0, 0, 0, size, 0, 0, 0, 0, size, 0, x, y, z, 1, 0.22 + 0.66 * u, 0.47 + 0.14 * u, 0.62 - 0.32 * u, 1], INSTANCE * i);
+  }
+  scene.setSolids("map", "box", data);
+}
+
+function drawDetections() {
+  const glass = new Float32Array(INSTANCE * boxes.length);
+  const ends = [];
+  boxes.forEach((box, i) => {
+    glass.set(scaled(box.pose, ...box.size), INSTANCE * i);
+    glass.set([0.31, 0.7, 0.75, 0.18], INSTANCE * i + 16);
+    ends.push(...boxEdges(box.pose, box.size));
+  });
+  scene.setSolids("detections", "box", glass, { glass: true });
+  drawLines("detection edges", ends, [79, 179, 191, 255]);
+  // In place: a label that is made anew between press and release is not clicked.
+  const labels = $("labels");
+  while (labels.children.length > boxes.length) labels.lastChild.remove();
+  while (labels.children.length < boxes.length) labels.append(makeLabel(labels.children.length));
+  boxes.forEach((box, i) => {
+    const [name, score] = labels.children[i].children;
+    name.textContent = box.label;
+    score.textContent = `${Math.round(100 * box.score)} %`;
+    labels.children[i].title = `${box.size.map((v) => (100 * v).toFixed(1)).join(" × ")} cm`;
+  });
+  markChosen(asking.label);
+  placeLabels();
+}
+
+function makeLabel(i) {
+  const label = element("button", { type: "button" }, element("span"), element("small"));
+  label.addEventListener("click", () => asking.choose(boxes[i].label));
+  return label;
+}
+
+function markChosen(chosen) {
+  [...$("labels").children].forEach((label, i) => label.setAttribute("aria-pressed", boxes[i].label === chosen));
+}
+
+function placeLabels() {
+  [...$("labels").children].forEach((label, i) => {
+    const { pose, size } = boxes[i];
+    const at = scene.onScreen([pose[12], pose[13], pose[14] + size[2] / 2 + 0.02]);
+    label.hidden = !at;
+    if (at) label.style.transform = `translate(${at[0].toFixed(1)}px, ${at[1].toFixed(1)}px) translate(-50%, -100%)`;
+  });
+}
+
+function drawLines(name, ends, color) {
+  scene.setLines(name, new Float32Array(ends.flat()), Uint8Array.from(ends.flatMap(() => color)));
+}
+
+function drawFloor() {
+  const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+  scene.theme = dark
+    ? { background: [0.06, 0.078, 0.086], sky: [0.78, 0.82, 0.84], ground: [0.42, 0.42, 0.44] }
+    : { background: [0.914, 0.933, 0.941], sky: [0.72, 0.74, 0.75], ground: [0.46, 0.45, 0.44] };
+  const [ends, colors] = [[], []];
+  const line = (a, b) => {
+    for (let k = 0; k < 20; k++) {
+      for (const u of [k / 20, (k + 1) / 20]) {
+        const point = a.map((v, i) => v + u * (b[i] - v));
+        const fade = Math.max(0, 1 - Math.hypot(point[0] - 0.3, point[1]) / 1.9);
+        ends.push(point);
+        colors.push(...(dark ? [150, 170, 178] : [90, 110, 118]), 110 * fade);
+      }
+    }
+  };
+  for (let k = -8; k <= 8; k++) {
+    line([k / 4 + 0.25, -2, 0], [k / 4 + 0.25, 2, 0]);
+    line([-1.75, k / 4, 0], [2.25, k / 4, 0]);
+  }
+  scene.setLines("floor", new Float32Array(ends.flat()), Uint8Array.from(colors));
+}
+
+// --- what can be chosen
+function toggle(layer, on) {
+  on ? wanted.add(layer) : wanted.delete(layer);
+  want();
+  if (on) return;
+  showFault({ layer, text: "" });
+  const drawn = { detections: ["detections", "detection edges"] }[layer] ?? [layer];
+  drawn.forEach((name) => scene.remove(name));
+  if (layer === "detections") $("labels").replaceChildren();
+}
+
+function makeLayers() {
+  for (const [layer, name] of Object.entries(LAYERS)) {
+    const button = element("button", { type: "button", "aria-pressed": wanted.has(layer), text: name });
+    button.addEventListener("click", () => {
+      const on = !wanted.has(layer);
+      button.setAttribute("aria-pressed", on);
+      toggle(layer, on);
+    });
+    $("layers").append(button);
+  }
+}
+
+function makeCameras(names) {
+  for (const name of names) {
+    const picture = element("img", { alt: `what the ${name} camera sees` });
+    const button = element("button", { type: "button", text: name });
+    const figure = element("figure", { "data-camera": name }, picture, button);
+    const set = (on) => {
+      figure.dataset.open = on;
+      button.setAttribute("aria-pressed", on);
+      button.title = on ? `close ${name}` : `open ${name}`;
+      if (!on) picture.removeAttribute("src");
+      toggle(`image:${name}`, on);
+    };
+    button.addEventListener("click", () => set(figure.dataset.open !== "true"));
+    picture.addEventListener("click", () => figure.classList.toggle("large"));
+    $("cameras").append(figure);
+    set(name !== "spectator"); // rendered for people alone, so only when asked for
+  }
+}
+
+makeLayers();
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawFloor);
+document.addEventListener("visibilitychange", want);
+connect();

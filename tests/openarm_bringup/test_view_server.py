@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who may open the page, listen to it and move the robot with it; what it is sent; when the graph is looked at."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import aiohttp
+import pytest
+from aiohttp import web
+
+from openarm_bringup.view_guard import Guard
+from openarm_bringup.view_server import PAGE, Item, Order, Reset, ViewServer
+from openarm_common.errors import Code, OpenArmError
+
+
+@dataclass
+class Graph:
+    """Notes what is asked of it."""
+
+    layers: tuple[str, ...] = ("states", "robot", "image:overhead")
+    wanted: frozenset[str] = frozenset()
+    asked: list[Any] = field(default_factory=list)
+    go_on: threading.Event = field(default_factory=threading.Event)
+
+    def want(self, layers: frozenset[str]) -> None:
+        self.wanted = layers
+
+    def pick(self, order: Order) -> dict[str, Any]:
+        self.asked.append(order)
+        self.go_on.wait(10.0)
+        return {"success": True, "code": "OK", "message": "placed"}
+
+    def cancel(self) -> tuple[bool, str]:
+        self.asked.append("cancel")
+        return False, "no grasp runs"
+
+    def reset(self, order: Reset) -> tuple[bool, str]:
+        self.asked.append(order)
+        raise OpenArmError(Code.NOT_READY, "no service /sim/reset_world")
+
+
+class Bench:
+    """A server that listens, and a browser's way of asking it."""
+
+    def __init__(self, server: ViewServer, graph: Graph, session: aiohttp.ClientSession, port: int) -> None:
+        self.server, self.graph, self.session = server, graph, session
+        self.url, self.token = f"http://127.0.0.1:{port}", server.guard.token
+        self.origin = {"Origin": self.url}
+
+    async def get(self, path: str, **headers: str) -> tuple[int, str]:
+        async with self.session.get(self.url + path, headers=headers) as response:
+            return response.status, await response.text()
+
+    async def post(self, path: str, body: Any, *, token: str | None = None, **headers: str) -> tuple[int, Any]:
+        known = {"Authorization": f"Bearer {self.token if token is None else token}", **self.origin, **headers}
+        known = {name: value for name, value in known.items() if value}
+        async with self.session.post(self.url + path, data=json.dumps(body), headers=json_body(known)) as response:
+            text = await response.text()
+            return response.status, json.loads(text) if text.startswith("{") else text
+
+    def socket(self, *, token: str | None = None, **headers: str) -> Any:
+        path = f"{self.url}/socket?token={self.token if token is None else token}"
+        return self.session.ws_connect(path, headers={**self.origin, **headers})
+
+
+def json_body(headers: dict[str, str]) -> dict[str, str]:
+    return {"Content-Type": "application/json", **headers}
+
+
+@asynccontextmanager
+async def serving(host: str = "127.0.0.1") -> AsyncIterator[Bench]:
+    graph = Graph()
+    server = ViewServer(Guard(host), {"robot": {}, "cameras": [], "states": []}, graph)
+    runner = web.AppRunner(server.app(), shutdown_timeout=0.2)
+    await runner.setup()
+    await web.TCPSite(runner, "127.0.0.1", 0).start()
+    try:
+        async with aiohttp.ClientSession() as session:
+            yield Bench(server, graph, session, runner.addresses[0][1])
+    finally:
+        graph.go_on.set()
+        await runner.cleanup()
+
+
+def with_bench(test: Callable[[Bench], Awaitable[None]]) -> None:
+    async def main() -> None:
+        async with serving() as bench:
+            await asyncio.wait_for(test(bench), 20.0)
+
+    asyncio.run(main())
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(10.0):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+# --- who may
+WRONG = {
+    "no token": ({"token": ""}, "no token; open the address that was printed"),
+    "wrong token": ({"token": "x" * 32}, "wrong token"),
+    "foreign origin": ({"Origin": "https://evil.example"}, "the page 'https://evil.example' may not ask"),
+    "another port of this machine": ({"Origin": "http://127.0.0.1:1"}, "may not ask"),
+    "hidden origin": ({"Origin": "null"}, "may not ask"),
+    "no origin": ({"Origin": ""}, "may not ask"),
+    "rebound name": ({"Host": "evil.example:8088", "Origin": "http://evil.example:8088"}, "was called 'evil.example'"),
+    "rebound name with a dot": (
+        {"Host": "localhost.evil.example", "Origin": "http://localhost.evil.example"},
+        "called",
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_who_may_not_gets_403_and_nothing_is_asked_of_the_robot(wrong: str) -> None:
+    headers, why = WRONG[wrong]
+
+    async def test(bench: Bench) -> None:
+        for path, body in (("/pick", {"label": "red"}), ("/cancel", {}), ("/reset", {})):
+            status, answer = await bench.post(path, body, **headers)
+            assert (status, answer["success"]) == (403, False)
+            assert why in answer["message"]
+        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+            async with bench.socket(**headers):
+                pass
+        assert refused.value.status == 403
+        assert bench.graph.asked == []
+        assert bench.graph.wanted == frozenset()
+
+    with_bench(test)
+
+
+def test_the_page_itself_needs_the_token_and_one_of_our_names() -> None:
+    async def test(bench: Bench) -> None:
+        good = f"/?token={bench.token}"
+        assert (await bench.get(good))[0] == 200
+        assert (await bench.get(good, Host="localhost:8088"))[0] == 200
+        assert (await bench.get(good, Host="[::1]:8088"))[0] == 200
+        assert (await bench.get("/"))[0] == 403
+        assert (await bench.get(f"/?token={bench.token[:-1]}"))[0] == 403
+        for name in ("evil.example", "192.168.1.2:8088", "127.0.0.1.evil.example", "[::1", "@127.0.0.1"):
+            status, text = await bench.get(good, Host=name)
+            assert status == 403, name
+            assert "answers to" in text
+
+    with_bench(test)
+
+
+def test_only_json_can_ask() -> None:
+    """A form of another page can't send that type without asking first."""
+
+    async def test(bench: Bench) -> None:
+        status, _ = await bench.post("/pick", {"label": "red"}, **{"Content-Type": "text/plain"})
+        assert status == 415
+        assert bench.graph.asked == []
+
+    with_bench(test)
+
+
+def test_beyond_this_machine_addresses_are_known_by_number_and_by_the_name_given() -> None:
+    guard = Guard("robot.lan")
+    for host in ("robot.lan:8088", "10.0.0.7:8088", "localhost"):
+        guard.check_host(host)
+    for host in ("evil.example", "", None, "robot.lan.evil.example"):
+        with pytest.raises(OpenArmError, match="answers to"):
+            guard.check_host(host)
+
+
+def test_a_page_of_others_may_speak_when_it_was_named() -> None:
+    guard = Guard(origins=("https://app.example.org",))
+    guard.check_origin("https://app.example.org", "127.0.0.1:1")
+    with pytest.raises(OpenArmError, match="may not ask"):
+        guard.check_origin("https://app.example.org.evil.example", "127.0.0.1:1")
+
+
+def test_a_token_is_new_each_time_and_never_short() -> None:
+    assert Guard().token != Guard().token
+    assert len(Guard().token) >= 32
+    with pytest.raises(OpenArmError, match="at least 16"):
+        Guard(token="secret")
+
+
+def test_every_answer_forbids_scripts_of_others() -> None:
+    async def test(bench: Bench) -> None:
+        for path in (f"/?token={bench.token}", "/view.js", "/nothing", "/"):
+            async with bench.session.get(bench.url + path) as response:
+                policy = response.headers["Content-Security-Policy"]
+                assert "default-src 'none'" in policy
+                assert "script-src 'self'" in policy
+                assert "unsafe" not in policy
+                assert response.headers["X-Content-Type-Options"] == "nosniff"
+
+    with_bench(test)
+
+
+def test_labels_can_only_become_text() -> None:
+    """Data of the graph reaches the page through textContent and attributes; nothing makes markup or code of it."""
+    scripts = [path.read_text(encoding="utf-8") for path in PAGE.glob("*.js")]
+    assert len(scripts) >= 4
+    for text in scripts:
+        assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|new Function", text)
+    page = (PAGE / "index.html").read_text(encoding="utf-8")
+    assert not re.search(r"<script(?![^>]*\bsrc=)|\son\w+=|\sstyle=|https?://", page)
+
+
+# --- what is shown
+def test_a_page_gets_what_it_wants_and_the_graph_is_looked_at_only_while_it_does() -> None:
+    async def test(bench: Bench) -> None:
+        async with bench.socket() as socket:
+            assert (await socket.receive_json())["kind"] == "hello"
+            await until(lambda: bench.graph.wanted == {"states"})
+            await socket.send_json({"want": ["robot"]})
+            await until(lambda: bench.graph.wanted == {"states", "robot"})
+            bench.server.put(Item("image:overhead", "image:overhead", b"not wanted"))
+            bench.server.put(Item("robot", "robot", b"wanted"))
+            assert await socket.receive_bytes() == b"wanted"
+            await socket.send_json({"want": []})
+            await until(lambda: bench.graph.wanted == {"states"})
+        await until(lambda: bench.graph.wanted == frozenset())
+
+    with_bench(test)
+
+
+def test_a_page_that_comes_later_gets_the_newest_of_each() -> None:
+    async def test(bench: Bench) -> None:
+        for text in ("old", "new"):
+            bench.server.put(Item("states", "grasp", text))
+        async with bench.socket() as socket:
+            await socket.receive_json()
+            assert await socket.receive_str() == "new"
+
+    with_bench(test)
+
+
+@pytest.mark.parametrize("message", ['{"want": ["everything"]}', '{"want": 3}', "}{"])
+def test_a_page_that_wants_nonsense_is_told_and_closed(message: str) -> None:
+    async def test(bench: Bench) -> None:
+        async with bench.socket() as socket:
+            await socket.receive_json()
+            await socket.send_str(message)
+            closing = await socket.receive()
+            assert closing.type is aiohttp.WSMsgType.CLOSE
+            assert closing.data == aiohttp.WSCloseCode.POLICY_VIOLATION
+            assert closing.extra
+
+    with_bench(test)
+
+
+# --- what is asked
+def test_a_pick_is_asked_once_at_a_time_and_its_outcome_is_shown() -> None:
+    async def test(bench: Bench) -> None:
+        status, answer = await bench.post("/pick", {"label": "red", "arm": "left", "dry_run": True})
+        assert (status, answer["success"]) == (202, True)
+        await until(lambda: bench.graph.asked)
+        assert bench.graph.asked == [Order(label="red", arm="left", dry_run=True)]
+        status, answer = await bench.post("/pick", {"label": "blue"})
+        assert (status, answer["code"]) == (409, "BUSY")
+        bench.graph.go_on.set()
+        async with bench.socket() as socket:
+            async with asyncio.timeout(10.0):
+                while (message := await socket.receive_json()).get("running", True):
+                    pass
+            assert message == {"kind": "outcome", "running": False, "success": True, "code": "OK", "message": "placed"}
+
+    with_bench(test)
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "why"),
+    [
+        ("/pick", {"label": "red", "arm": "third"}, "arm"),
+        ("/pick", {"label": "x" * 65}, "label"),
+        ("/pick", {"speed": 9}, "speed"),
+        ("/reset", {"scene": "../../etc/passwd"}, "scene"),
+        ("/reset", {"seed": -1}, "seed"),
+    ],
+)
+def test_a_wrong_request_is_refused_by_the_name_of_what_is_wrong(path: str, body: dict[str, Any], why: str) -> None:
+    async def test(bench: Bench) -> None:
+        status, answer = await bench.post(path, body)
+        assert (status, answer["code"]) == (400, "INVALID_ARGUMENT")
+        assert f"{path}:{why}" in answer["message"]
+        assert bench.graph.asked == []
+
+    with_bench(test)
+
+
+def test_what_the_graph_refuses_is_said() -> None:
+    async def test(bench: Bench) -> None:
+        assert await bench.post("/cancel", {}) == (
+            200,
+            {"success": False, "code": "REFUSED", "message": "no grasp runs"},
+        )
+        assert (await bench.post("/reset", {"scene": "demo"}))[1]["code"] == "NOT_READY"
+
+    with_bench(test)
+
+
+def test_files_outside_of_the_page_are_not_there() -> None:
+    async def test(bench: Bench) -> None:
+        for path in ("/../view_server.py", "/%2e%2e/view_server.py", "/view_page/../cli.py", "/index.html", "/nothing"):
+            assert (await bench.get(path))[0] == 404, path
+        assert (await bench.get("/view.js"))[0] == 200
+
+    with_bench(test)
