@@ -70,8 +70,8 @@ def numbers_of(bag: Bag, *, scene: str = "demo", board: Board | None = None) -> 
         board: Which calibration board to look for; None is that of the suite.
 
     Returns:
-        By name: frames used and skipped, of each label how often it was found, its mean position (base frame) and size,
-        cells of the map by state, frames with a board and its residual.
+        By name: frames used and skipped, of each label how often it was found, where last (base frame), how far from
+        where it was found first, and its mean size; cells of the map by state; frames with a board and its residual.
 
     Raises:
         OpenArmError: NOTHING_DETECTED, when the bag has no frame that could be used.
@@ -154,9 +154,10 @@ def _numbers(found: _Found, mapper: Mapper, t_ns: int) -> dict[str, float]:
     numbers: dict[str, float] = {"frames": found.frames, "frames_skipped": found.skipped}
     for label, located in found.objects.items():
         numbers[f"detection/{label}/frames"] = len(located)
-        position = np.mean([one.T_base_object[:3, 3] for one in located], axis=0) * 1e3
+        first, last = (located[i].T_base_object[:3, 3] * 1e3 for i in (0, -1))
         size = np.mean([one.size for one in located], axis=0) * 1e3
-        for axis, at, extent in zip("xyz", position, size, strict=True):
+        numbers[f"detection/{label}/moved_mm"] = round(float(np.linalg.norm(last - first)), 3)
+        for axis, at, extent in zip("xyz", last, size, strict=True):
             numbers[f"detection/{label}/{axis}_mm"] = round(float(at), 3)
             numbers[f"detection/{label}/size_{axis}_mm"] = round(float(extent), 3)
     for state, count in mapper.counts(t_ns).items():

@@ -7,7 +7,11 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from openarm_interfaces.msg import GraspStatus
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
 
 from openarm_bringup import golden, record_cli
 from openarm_bringup.bag import BagWriter, open_bag
@@ -24,6 +28,30 @@ def test_the_bag_of_the_repository_gives_its_golden_numbers_twice() -> None:
         first, second = numbers_of(bag), numbers_of(bag)
     assert first == second
     assert not golden.compare(golden.read(BAG / "golden.json"), first)
+
+
+def test_the_bag_of_the_repository_shows_a_pick_from_start_to_end() -> None:
+    """The arm moves through the view, the cube ends elsewhere, and nothing else has moved."""
+    states: list[str] = []
+    joints: list[list[float]] = []
+    with open_bag(BAG) as bag:
+        assert bag.custom["lost"] == "0"
+        for record in bag.records(["/grasp/status", "/joint_states"]):
+            if record.topic == "/grasp/status":
+                states.append(deserialize_message(record.data, GraspStatus).state)
+            else:
+                joints.append(list(deserialize_message(record.data, JointState).position))
+    assert {"DETECT", "MOVE_TO_GRASP", "CLOSE_GRIPPER", "LIFT", "PLACE", "IDLE"} <= set(states)
+    assert np.ptp(np.array(joints), axis=0).max() > 0.5
+    numbers = golden.read(BAG / "golden.json")
+    ends = ("detection/overhead/", "/moved_mm")
+    moved = {
+        name.removeprefix(ends[0]).removesuffix(ends[1]): entry["value"]
+        for name, entry in numbers.items()
+        if name.startswith(ends[0]) and name.endswith(ends[1])
+    }
+    assert moved.pop("red") > 50.0
+    assert all(distance < 1.0 for distance in moved.values())
 
 
 def test_a_changed_golden_number_fails_and_is_named(tmp_path: Path) -> None:
