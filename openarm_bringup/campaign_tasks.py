@@ -52,6 +52,7 @@ class Task:
         mount_seed: Of the true camera mounts; None: nominal.
         place: (x, y) of the footprint centre that is asked for, base frame, m; None: chosen by the suite.
         posture: Joints that start elsewhere than at home, rad by name.
+        route: By which it must come to its place, as `GraspOutcome.route`; "": any.
     """
 
     set_name: str
@@ -65,6 +66,7 @@ class Task:
     mount_seed: int | None = None
     place: tuple[float, float] | None = None
     posture: Mapping[str, float] = field(default_factory=dict[str, float])
+    route: str = ""
 
     @property
     def possible(self) -> bool:
@@ -89,9 +91,15 @@ def clutter(seed: int) -> Task:
 
 def sets() -> Mapping[str, Callable[[int], Task]]:
     """Makers of tasks by the name of the set."""
-    from openarm_bringup import campaign_faults
+    from openarm_bringup import campaign_faults, campaign_two_arms
 
-    return {"nominal": nominal, "clutter": clutter, "faults": campaign_faults.fault_task}
+    return {
+        "nominal": nominal,
+        "clutter": clutter,
+        "faults": campaign_faults.fault_task,
+        "handover": campaign_two_arms.handover_task,
+        "push": campaign_two_arms.push_task,
+    }
 
 
 def make_task(set_name: str, seed: int) -> Task:

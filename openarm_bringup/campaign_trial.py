@@ -23,10 +23,11 @@ from openarm_bringup.trial import Trial
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import GraspOutcome, GraspRequest
+from openarm_grasp.legs import run_task
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.orders import Order
-from openarm_grasp.performer import Performer, run_request
+from openarm_grasp.performer import Performer
 from openarm_grasp.routing import ARMS
 from openarm_sim_bridge.faults import checked_fault
 
@@ -119,7 +120,7 @@ class Trials:
         request = GraspRequest(label, task.arm, task.place)
         result: GraspOutcome | OpenArmError
         try:
-            result = self.link.run(run_request(self.machine, self.performer, self.link, request, self._tell))
+            result = self.link.run(run_task(self.machine, self.performer, self.link, request, self._tell))
         except OpenArmError as error:
             result = error
         wall_s = time.monotonic() - began
@@ -146,6 +147,7 @@ class Trials:
             ),
             sim_s=(steps[-1].t_ns - steps[0].t_ns) * 1e-9 if steps else 0.0,
             wall_s=wall_s,
+            route=outcome.route,
         )
 
     # --- while it runs
@@ -218,7 +220,10 @@ def row_of(task: Task, trials: list[Trial], wall_s: float) -> dict[str, Any]:
     placed = bad is None
     false = any(g["false_success"] for g in grasps)
     allowed = {code.value for code in task.codes}
-    expected = not false and all(g["code"] in allowed and (g["placed"] or g["code"] != Code.OK) for g in grasps)
+    strayed = bool(task.route) and any(g["placed"] and g["route"] != task.route for g in grasps)
+    expected = not (false or strayed) and all(
+        g["code"] in allowed and (g["placed"] or g["code"] != Code.OK) for g in grasps
+    )
     refused = expected and not placed
     shown = bad or grasps[-1]
     return {

@@ -50,6 +50,7 @@ class Trial:
         verdict: Of ground truth; None when the object could not be watched.
         states: (state, s of simulated time, attempt, reason it was entered for), in order.
         sim_s: Simulated s from the request's first state to the last one's beginning.
+        route: By which the object came to its place.
     """
 
     seed: int | None
@@ -66,6 +67,7 @@ class Trial:
     states: tuple[tuple[str, float, int, str], ...]
     sim_s: float
     wall_s: float
+    route: str = ""
 
     @property
     def placed(self) -> bool:
@@ -90,6 +92,7 @@ class Trial:
             "target": self.target,
             "label": self.label,
             "arm": self.arm,
+            "route": self.route,
             "outcome": self.outcome,
             "placed": self.placed,
             "claimed_success": self.claimed,

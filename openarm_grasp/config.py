@@ -97,6 +97,12 @@ class HeldConfig(Config):
         default=0.003, gt=0.0, le=0.02, description="change of the gap on the way that counts as slipping, m"
     )
     rise: float = Field(default=0.03, gt=0.0, le=0.2, description="an object seen this much higher has risen, m")
+    askew: float = Field(
+        default=0.015, gt=0.0, le=0.1, description="a lifted object that sticks out farther is held elsewhere, m"
+    )
+    moved: float = Field(
+        default=0.012, gt=0.0, le=0.1, description="an object seen this far out of its place has moved, m"
+    )
 
 
 class DetectConfig(Config):
@@ -159,6 +165,38 @@ class PlaceConfig(Config):
         return self
 
 
+class HandOverConfig(Config):
+    """Where objects change hands: on the table, on a strip in the middle that both arms reach."""
+
+    x: tuple[float, float] = Field(default=(0.20, 0.32), description="ends of the strip, base frame, m")
+    abs_y: float = Field(default=0.03, gt=0.0, le=0.2, description="half of its width, m")
+    step: float = Field(default=0.03, gt=0.0, le=0.2, description="grid of spots, m")
+    tries: int = Field(default=6, ge=1, le=50, description="spots and turns that the other arm is asked about")
+
+    @model_validator(mode="after")
+    def _ascends(self) -> Self:
+        if not self.x[0] < self.x[1]:
+            raise ValueError(f"x {list(self.x)} must ascend")
+        return self
+
+
+class PushConfig(Config):
+    """How objects that no arm can grasp are pushed into reach."""
+
+    most: int = Field(default=3, ge=0, le=10, description="pushes of one object, each followed by a look; 0: none")
+    reach_x: tuple[float, float] = Field(
+        default=(0.17, 0.43), description="x of places that it is pushed to, beside the region of free spots, m"
+    )
+    reach_abs_y: tuple[float, float] = Field(default=(0.10, 0.26), description="|y| of those places, m")
+    shortest: float = Field(default=0.02, gt=0.0, le=0.2, description="shortest push, m")
+    longest: float = Field(default=0.15, gt=0.0, le=0.5, description="longest push, m")
+    gap: float = Field(default=0.012, ge=0.005, le=0.05, description="hand to object before it is pushed, m")
+    hand_half: float = Field(default=0.015, gt=0.0, le=0.05, description="half of the closed fingers' width, m")
+    tilts_deg: tuple[float, ...] = Field(
+        default=(0.0, 15.0, 30.0, 45.0, 60.0), description="leans of the pushing hand from vertical, deg"
+    )
+
+
 class LimitsConfig(Config):
     """When to stop trying and when to stop waiting."""
 
@@ -203,5 +241,7 @@ class GraspConfig(Config):
     detect: DetectConfig = DetectConfig()
     near: NearLookConfig = NearLookConfig()
     place: PlaceConfig = PlaceConfig()
+    hand_over: HandOverConfig = HandOverConfig()
+    push: PushConfig = PushConfig()
     limits: LimitsConfig = LimitsConfig()
     drift: DriftConfig = DriftConfig()

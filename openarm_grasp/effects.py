@@ -38,6 +38,9 @@ class GraspRequest:
         phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
         place_yaw: Of the object's x axis about the base z, rad (half a turn makes no difference); None: any.
         timeout: s of robot time for all of it; 0: none.
+        object_at: (x, y) near which the object stands, base frame, m; None: any of that label.
+        leave: (x, y) of objects that stay where they are, base frame, m.
+        why: What it is good for, when it is a part of another request.
     """
 
     label: str
@@ -47,6 +50,9 @@ class GraspRequest:
     phase: str = "all"
     place_yaw: float | None = None
     timeout: float = 0.0
+    object_at: tuple[float, ...] | None = None
+    leave: tuple[tuple[float, float], ...] = ()
+    why: str = ""
 
 
 @dataclass(frozen=True)
@@ -277,6 +283,8 @@ class GraspOutcome:
         place_position: (3,) target that was used, base frame, m; zeros when none.
         duration: s of robot time.
         held: The object is in the hand.
+        moved: It stands elsewhere than before, and not where it was asked for; the message says where.
+        route: How it came to its place: "direct", "hand_over" or "push"; "" when it did not.
     """
 
     code: Code
@@ -287,6 +295,8 @@ class GraspOutcome:
     place_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     duration: float = 0.0
     held: bool = False
+    moved: bool = False
+    route: str = ""
 
     @property
     def kind(self) -> str:
@@ -295,7 +305,7 @@ class GraspOutcome:
             return "SUCCESS"
         if self.code is Code.CANCELLED:
             return "CANCELLED"
-        if self.held:
+        if self.held or self.moved:
             return "PARTIAL"
         return "FAILED" if self.attempts else "REFUSED"
 

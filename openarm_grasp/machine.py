@@ -16,7 +16,7 @@ from openarm_grasp.drift import DriftWatch
 from openarm_grasp.effects import Effects, GraspOutcome, GraspRequest, Outcome
 from openarm_grasp.evidence import Verdict
 from openarm_grasp.judges import JUDGES, Judgement, fail, start_over
-from openarm_grasp.memory import Hand, Kept, Memory, Surroundings
+from openarm_grasp.memory import Hand, Kept, Known, Memory, Surroundings
 from openarm_grasp.recipes import RECIPES
 from openarm_grasp.routing import arm_order
 from openarm_grasp.states import TRANSITIONS, Event, State, load_transitions
@@ -48,6 +48,17 @@ class GraspMachine:
         self.drift = DriftWatch(around.config.drift)
         #: What stayed in a hand when the last request ended.
         self.kept: Kept | None = None
+        #: What was seen of the last object, and why arms were refused for it, when its request ended.
+        self.known: Known | None = None
+
+    @property
+    def around(self) -> Surroundings:
+        """Parameters, table and arms."""
+        return self._around
+
+    def note(self, reason: str) -> None:
+        """Say what is done between two requests that belong together."""
+        self.previous, self.reason = self.state, reason
 
     @property
     def carrying(self) -> str:
@@ -100,7 +111,8 @@ class GraspMachine:
                 )
             self._memory = m = self._place_request(event, t_ns) if event.phase == "place" else Memory(event, t_ns)
             self.outcome = None
-            return self._enter(m, Event.REQUEST, f"asked for {event.label or 'any object'!r}", t_ns)
+            why = f"; {event.why}" if event.why else ""
+            return self._enter(m, Event.REQUEST, f"asked for {event.label or 'any object'!r}{why}", t_ns)
         if m is None:
             raise OpenArmError(Code.INTERNAL, "an outcome came to the grasp machine while no request runs")
         kind, reason = self._judge(m, event, t_ns)
@@ -161,6 +173,7 @@ class GraspMachine:
             duration=(t_ns - m.started_ns) * 1e-9,
             held=m.hand.holding,
         )
+        self.known = Known(m.sighting, dict(m.refusals), m.place_refused) if m.sighting is not None else None
         if m.hand.holding and m.sighting is not None and m.candidate is not None:
             self.kept = Kept(m.arm, m.sighting.target, m.candidate)
         elif not m.hand.holding and not m.request.dry_run:

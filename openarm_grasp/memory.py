@@ -51,6 +51,7 @@ class Hand:
         homed: The arm is home again.
         retreats: Ways home that failed.
         near: How far the second look has come: "", "look", "plan", "go".
+        looked: The camera has looked again before the hand goes down.
     """
 
     holding: bool = False
@@ -62,6 +63,7 @@ class Hand:
     homed: bool = False
     retreats: int = 0
     near: str = ""
+    looked: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,21 @@ class Kept:
     arm: str
     target: Detection
     candidate: GraspCandidate
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a request leaves behind when it has ended.
+
+    Attributes:
+        sighting: The object as it stood before the grasp, and what else was in view.
+        refusals: Why arms were refused for it; empty when one was not.
+        place_refused: One of them could grasp, but not place.
+    """
+
+    sighting: Sighting
+    refusals: Mapping[str, Verdict]
+    place_refused: bool
 
 
 @dataclass
@@ -109,6 +126,7 @@ class Memory:
         hand: Where the hand stands.
         residual: Direction (2,) and how far along it the camera saw the object from where the hand put it.
         kept: What an earlier request left in the hand, to be placed by this one.
+        height: Of the object when it was first seen, m; None before that.
     """
 
     request: GraspRequest
@@ -136,6 +154,7 @@ class Memory:
     hand: Hand = field(default_factory=Hand)
     residual: tuple[NDArray[np.float64], float] | None = None
     kept: Kept | None = None
+    height: float | None = None
 
     @property
     def label(self) -> str:

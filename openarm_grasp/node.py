@@ -23,9 +23,9 @@ from openarm_grasp import convert
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import GraspOutcome, GraspRequest
 from openarm_grasp.executor import GraspExecutor
+from openarm_grasp.legs import run_task
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
-from openarm_grasp.performer import run_request
 from openarm_grasp.routing import ARMS
 from openarm_grasp.states import State
 
@@ -110,7 +110,7 @@ class GraspNode(BaseNode[GraspConfig]):
 
     async def _run(self, request: GraspRequest, on_status: OnStatus | None) -> GraspOutcome:
         link = self._executor
-        result = await run_request(self._machine, link.performer, link, request, lambda: self._tell(on_status))
+        result = await run_task(self._machine, link.performer, link, request, lambda: self._tell(on_status))
         report = f"{result.code}: {result.message} (arm {result.arm or '-'}, attempts {result.attempts})"
         self.get_logger().info(report) if result.success else self.get_logger().warning(report)
         drift = self._machine.drift.of(self.config.camera)

@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Push an object into reach: a closed hand behind it, low, along a straight line, and a look afterwards.
+
+A hand comes to more places than it can grasp at: a grasp also needs room above, and one of a few yaws. Where an object
+can be pushed is not written down but planned: the way behind the object, straight down, and the line itself, with the
+object as what the hand carries, so that both keep clear of everything else. Base frame, m, rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import cos, hypot, radians, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.candidates import UP, GraspCandidate, obstacle_boxes, target_box
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.effects import (
+    Execute,
+    Frames,
+    GoHome,
+    Measure,
+    MoveGripper,
+    MoveLinear,
+    Observe,
+    PlanGrasp,
+    Planned,
+    ToBase,
+    Together,
+)
+from openarm_grasp.evidence import Evidence
+from openarm_grasp.memory import Surroundings
+from openarm_grasp.observation import Detection, Sighting, find
+from openarm_grasp.performer import Link, Performer
+from openarm_grasp.rehearsal import NO_WAY, Rehearsal, standing_at
+from openarm_grasp.routing import ARMS, arm_order
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Push:
+    """A push that was planned.
+
+    Attributes:
+        arm: Whose hand.
+        start: (2,) where the object stands.
+        end: (2,) where it shall stand.
+        way: How the hand stands behind it, and its line.
+        plan: The trajectories.
+    """
+
+    arm: str
+    start: Array
+    end: Array
+    way: GraspCandidate
+    plan: Planned
+
+    def __str__(self) -> str:
+        """Sentence for the status."""
+        (x0, y0), (x1, y1) = self.start, self.end
+        return f"the {self.arm} hand pushes it from ({x0:.3f}, {y0:.3f}) to ({x1:.3f}, {y1:.3f}) m, into reach"
+
+
+class Pusher:
+    """Plans pushes and carries them out.
+
+    Args:
+        around: Parameters, table and arms.
+        performer: Carries out.
+        link: To the planner.
+        rehearsal: Says what could be grasped where.
+        note: Is told what is done.
+    """
+
+    def __init__(
+        self,
+        around: Surroundings,
+        performer: Performer,
+        link: Link,
+        rehearsal: Rehearsal,
+        note: Callable[[str], None],
+    ) -> None:
+        self._around, self._performer, self._link = around, performer, link
+        self._rehearsal, self._note = rehearsal, note
+
+    async def plan(self, seen: Sighting) -> Push:
+        """Find a push after which the object can be grasped.
+
+        Raises:
+            OpenArmError: UNREACHABLE, with the reason, when there is none; what the link raises.
+        """
+        faults: list[str] = []
+        for end in destinations(seen.target, seen.others, self._around):
+            x, y = end
+            try:
+                taker = await self._taker(seen, end)
+                return await self._push_to(seen, end, taker)
+            except OpenArmError as error:
+                if error.code not in NO_WAY:
+                    raise
+                faults.append(f"to ({x:.3f}, {y:.3f}) m: {error.message}")
+        why = "; ".join(faults) or f"no free place in reach is within {self._config.push.longest:g} m"
+        raise OpenArmError(Code.UNREACHABLE, f"it cannot be pushed into reach either: {why}")
+
+    @property
+    def _config(self) -> GraspConfig:
+        return self._around.config
+
+    async def _taker(self, seen: Sighting, end: Array) -> str:
+        """The arm that grasps the object there."""
+        fault: OpenArmError | None = None
+        for arm in arm_order("auto", float(end[1]), self._config.approach.overlap_half_width):
+            try:
+                await self._rehearsal.pick(arm, standing_at(seen.target, end), seen.others)
+            except OpenArmError as error:
+                if error.code not in NO_WAY:
+                    raise
+                fault = error
+                continue
+            return arm
+        raise fault or OpenArmError(Code.UNREACHABLE, "no arm")
+
+    async def _push_to(self, seen: Sighting, end: Array, taker: str) -> Push:
+        """The other arm is asked first: it comes from the other side."""
+        config, faults = self._config, list[str]()
+        ways = push_ways(seen.target, end, config)
+        for arm in sorted(ARMS, key=lambda arm: arm == taker):
+            self._link.check()
+            effect = PlanGrasp(arm, ways, obstacle_boxes(seen.others, config), target_box(seen.target, config))
+            try:
+                plan = await self._link.plan(effect)
+            except OpenArmError as error:
+                if error.code not in NO_WAY:
+                    raise
+                faults.append(error.message)
+                continue
+            return Push(arm, seen.target.p_base[:2], end, ways[plan.chosen], plan)
+        raise OpenArmError(Code.UNREACHABLE, f"no hand comes behind it: {'; '.join(faults)}")
+
+    async def carry_out(self, push: Push, label: str, number: int) -> str:
+        """Push, go home and look; returns what was seen.
+
+        Raises:
+            OpenArmError: EXECUTION_FAILED or HAND_COLLISION, when the hand did not do it; what looking raises, when the
+                object is not seen any more.
+        """
+        arm, way, config = push.arm, push.way, self._config
+        self._note(f"push {number} of at most {config.push.most}: {push}")
+        outcome = await self._performer.perform(
+            (
+                Together((MoveGripper(arm, 0.0, "close"), Execute(arm, push.plan.transfer, "move behind the object"))),
+                Execute(arm, push.plan.approach, "move down behind the object"),
+                Measure(arm, 0.0, way.T_base_tcp),
+            )
+        )
+        fault = None if outcome.ok else OpenArmError(outcome.code, outcome.message)
+        if fault is None and (error := outcome.last(Evidence).tcp_error) > config.held.max_tcp_error:
+            text = f"the {arm} hand stopped {error * 1e3:.0f} mm from its place behind the object"
+            fault = OpenArmError(Code.HAND_COLLISION, text)
+        back = way.T_base_tcp
+        if fault is None:
+            outcome = await self._performer.perform((Execute(arm, push.plan.retreat, "push"),))
+            fault = None if outcome.ok else OpenArmError(outcome.code, outcome.message)
+            back = shifted(way.T_base_tcp, way.retreat_offset - config.push.gap * _direction(way.retreat_offset))
+        if fault is None or fault.code not in (Code.CANCELLED, Code.ROBOT_LOST):
+            home = await self._home(arm, back, label)
+            fault = fault or home
+        if fault is not None:
+            raise OpenArmError(fault.code, f"push {number}: {fault.message}")
+        return await self._seen(push, label, number)
+
+    async def _home(self, arm: str, T_base_back: Array, label: str) -> OpenArmError | None:
+        """Leave the object the way the hand came, and go home; what kept it from that."""
+        low = self._around.table.top_z + 2.0 * self._config.approach.lift_height
+        # A line that cannot be followed is a kindness that is not done; the free way home may still be there.
+        await self._performer.perform((MoveLinear(arm, T_base_back, "leave the object"),))
+        outcome = await self._performer.perform((GoHome((arm,), back_off_below=low),))
+        return None if outcome.ok else OpenArmError(outcome.code, outcome.message)
+
+    async def _seen(self, push: Push, label: str, number: int) -> str:
+        """Where the camera sees the object afterwards."""
+        limits = self._config.detect
+        outcome = await self._performer.perform((Observe(limits.frames),))
+        if outcome.ok:
+            frames = outcome.last(Frames)
+            outcome = await self._performer.perform((ToBase(frames.frames, frames.frame_id),))
+        if not outcome.ok:
+            raise OpenArmError(outcome.code, f"push {number}: {label!r} was not seen since: {outcome.message}")
+        found = find(
+            outcome.last(Frames).frames, label, match_radius=limits.match_radius, agree_within=limits.agree_within
+        ).target
+        x, y = found.p_base[:2]
+        moved, off = (float(np.hypot(*(found.p_base[:2] - p))) for p in (push.start, push.end))
+        text = (
+            f"push {number} by the {push.arm} hand moved it {moved * 1e3:.0f} mm to ({x:.3f}, {y:.3f}) m,"
+            f" {off * 1e3:.0f} mm from where it was meant"
+        )
+        self._note(text)
+        return text
+
+
+def destinations(target: Detection, others: Sequence[Detection], around: Surroundings) -> tuple[Array, ...]:
+    """Places near the object where an arm usually grasps, free of others, the nearest first.
+
+    Args:
+        target: The object.
+        others: What else stands on the table.
+        around: Parameters.
+    """
+    config, place = around.config.push, around.config.place
+    p = target.p_base[:2]
+    found: list[tuple[float, float, float]] = []
+    regions = ((place.region_x, place.region_abs_y), (config.reach_x, config.reach_abs_y))
+    for ((x0, x1), (y0, y1)), side in product(regions, (1.0, -1.0)):
+        x, y = float(np.clip(p[0], x0, x1)), side * float(np.clip(side * p[1], y0, y1))
+        length = hypot(x - p[0], y - p[1])
+        room = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=np.inf)
+        if config.shortest <= length <= config.longest and room >= place.neighbour_distance:
+            found.append((length, x, y))
+    return tuple(np.array([x, y]) for _, x, y in sorted(found))
+
+
+def push_ways(target: Detection, end: Array, config: GraspConfig) -> tuple[GraspCandidate, ...]:
+    """How a closed hand may stand behind the object, the most upright first.
+
+    One of its four faces looks ahead, so that a flat side of the object is met flat; it leans sideways, or with its
+    tips ahead, never over the object. The tips are as low as in a grasp: below the middle of what stands upright.
+
+    Args:
+        target: The object.
+        end: (2,) where it shall be pushed.
+        config: Parameters.
+    """
+    way = np.array([*(end - target.p_base[:2]), 0.0])
+    ahead = _direction(way)
+    aside = np.cross(UP, ahead)
+    half = 0.5 * float(np.abs(target.T_base_object[:3, :2].T @ ahead) @ target.size[:2])
+    behind = half + config.push.hand_half + config.push.gap
+    found: list[GraspCandidate] = []
+    for (name, y_tool), tilt_deg, lean in product(
+        (("ahead+", ahead), ("ahead-", -ahead), ("aside+", aside), ("aside-", -aside)),
+        config.push.tilts_deg,
+        (1.0, -1.0),
+    ):
+        heading = lean * np.cross(UP, y_tool)
+        if (tilt_deg == 0.0 and lean < 0.0) or float(heading @ ahead) < -1e-6:
+            continue
+        tilt = radians(tilt_deg)
+        z_tool = sin(tilt) * heading - cos(tilt) * UP
+        p = target.p_base - behind * ahead
+        p[2] = target.bottom + config.hand.tip_clearance + config.hand.tip_clearance_tilted * sin(tilt)
+        found.append(
+            GraspCandidate(
+                id=f"{target.label}/push/{name}/tilt{tilt_deg:g}" + (f"/lean{lean:+g}" if tilt_deg else ""),
+                T_base_tcp=se3.make(se3.rotation_from_z_y(z_tool, y_tool), p),
+                approach_offset=config.approach.pregrasp_distance * UP,
+                retreat_offset=way + config.push.gap * ahead,
+                width=0.0,
+                tilt=tilt,
+                score=-tilt,
+                parts={"tilt": -tilt},
+            )
+        )
+    return tuple(sorted(found, key=lambda c: -c.score))
+
+
+def shifted(T: Array, offset: Array) -> Array:
+    """The pose moved by an offset in its parent frame."""
+    moved = T.copy()
+    moved[:3, 3] += offset
+    return moved
+
+
+def _direction(v: Array) -> Array:
+    return v / np.linalg.norm(v)

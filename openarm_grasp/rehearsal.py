@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans of what is not done yet: whether an arm could pick an object that stood somewhere, and put it somewhere else.
+
+Nothing moves. Ways with several parts are found so before their first part begins. Base frame, m, rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.candidates import GraspCandidate, held_box, obstacle_boxes, propose, target_box
+from openarm_grasp.effects import PlanGrasp, Planned, PlanPlace
+from openarm_grasp.memory import Surroundings
+from openarm_grasp.observation import Detection
+from openarm_grasp.performer import Link
+from openarm_grasp.place import PlaceTarget, place_targets
+
+Array = NDArray[np.float64]
+
+#: A plan that fails with one of these says that it cannot be done; with any other it was not found out.
+NO_WAY = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN, Code.TOO_WIDE)
+
+
+@dataclass(frozen=True)
+class Pick:
+    """A grasp that can be made, and its plan."""
+
+    candidate: GraspCandidate
+    plan: Planned
+
+
+class Rehearsal:
+    """Asks the planner.
+
+    Args:
+        link: To the planner.
+        around: Parameters and where the arms stand.
+    """
+
+    def __init__(self, link: Link, around: Surroundings) -> None:
+        self._link = link
+        self._around = around
+
+    async def pick(
+        self, arm: str, target: Detection, others: Sequence[Detection], without: frozenset[str] = frozenset()
+    ) -> Pick:
+        """Plan a grasp of an object that stands there.
+
+        Args:
+            arm: Whose.
+            target: The object.
+            others: What else stands on the table.
+            without: Holds (label and edge) that are of no use.
+
+        Raises:
+            OpenArmError: One of `NO_WAY`; what the link raises.
+        """
+        config = self._around.config
+        offered = propose(target, config, shoulder_xy=self._around.shoulders.get(arm, (0.0, 0.0)))
+        offered = tuple(c for c in offered if hold_of(c) not in without)
+        if not offered:
+            raise OpenArmError(Code.UNREACHABLE, f"no other way to hold {target.label!r} is left")
+        self._link.check()
+        effect = PlanGrasp(arm, offered, obstacle_boxes(others, config), target_box(target, config))
+        plan = await self._link.plan(effect)
+        return Pick(offered[plan.chosen], plan)
+
+    async def place(
+        self, arm: str, pick: Pick, target: Detection, others: Sequence[Detection], ways: Sequence[PlaceTarget]
+    ) -> PlaceTarget:
+        """Plan how an object that was picked so is put down one of these ways.
+
+        Raises:
+            OpenArmError: As `pick`.
+        """
+        config = self._around.config
+        self._link.check()
+        held = held_box(target, pick.candidate, config)
+        effect = PlanPlace(arm, tuple(ways), obstacle_boxes(others, config), held, pick.plan.retreat)
+        return ways[(await self._link.plan(effect)).chosen]
+
+    async def pick_and_place(
+        self,
+        arm: str,
+        target: Detection,
+        others: Sequence[Detection],
+        spots: Sequence[Array],
+        *,
+        yaw: float | None = None,
+        used: Sequence[PlaceTarget] = (),
+    ) -> PlaceTarget:
+        """Plan a grasp, and how it ends on one of the spots; other holds are tried when one cannot be put down.
+
+        Args:
+            arm: Whose.
+            target: The object.
+            others: What else stands on the table.
+            spots: (2,) footprint centres, best first.
+            yaw: Of the object there; None: any.
+            used: Ways to put it down that are of no use.
+
+        Raises:
+            OpenArmError: As `pick`.
+        """
+        useless: frozenset[str] = frozenset()
+        refused: OpenArmError | None = None
+        while True:
+            try:
+                pick = await self.pick(arm, target, others, useless)
+            except OpenArmError as error:
+                if refused is None or error.code not in NO_WAY:
+                    raise
+                raise refused from error
+            offered = place_targets(target, pick.candidate, spots, self._around.config, yaw=yaw)
+            ways = [way for way in offered if not any(_same(way, other) for other in used)]
+            try:
+                if not ways:
+                    raise OpenArmError(Code.UNREACHABLE, "no other way to put it down is left")
+                return await self.place(arm, pick, target, others, ways)
+            except OpenArmError as error:
+                if error.code not in NO_WAY:
+                    raise
+                refused = error
+                useless |= {hold_of(pick.candidate)}
+
+
+def hold_of(candidate: GraspCandidate) -> str:
+    """The hold of a grasp, whatever its tilt: label and edge."""
+    return "/".join(candidate.id.split("/")[:2])
+
+
+def standing_at(target: Detection, xy: Sequence[float] | Array, turn: float = 0.0) -> Detection:
+    """The object as it would stand elsewhere, turned by `turn` about the vertical."""
+    p = np.array([xy[0], xy[1], target.p_base[2]])
+    return replace(target, T_base_object=se3.make(se3.rot_z(turn) @ target.T_base_object[:3, :3], p))
+
+
+def _same(a: PlaceTarget, b: PlaceTarget) -> bool:
+    return bool(np.linalg.norm(a.position[:2] - b.position[:2]) < 1e-6) and abs(a.yaw_offset - b.yaw_offset) < 1e-6
