@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion import moves
+from openarm_motion.approach import ApproachFailedError, ApproachPlan, ApproachRequest
 from openarm_motion.arm import Arm, Situation
 from openarm_motion.collision import CollisionScene
 from openarm_motion.failure import Alternative, PlanFailedError
@@ -23,6 +24,10 @@ Array = NDArray[np.float64]
 _RINGS = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22)
 #: Time for the search of one candidate, s.
 _SEARCH = 0.3
+#: Time for what is near to the target of an approach, s.
+_APPROACH = 0.5
+#: Configurations of a pose that are looked at.
+_LOOKS = 16
 #: Steps back from a configuration towards the start.
 _STEPS = 20
 
@@ -43,6 +48,23 @@ def explained(plan: Callable[[], Trajectory], instead: Callable[[], Alternative 
         raise PlanFailedError(error.code, error.message, error.stage, error.contact, found) from error
 
 
+def explained_approach(
+    plan: Callable[[], ApproachPlan], arm: Arm, now: Situation, request: ApproachRequest
+) -> ApproachPlan:
+    """The same for an approach: what is near to the target that got furthest.
+
+    Raises:
+        OpenArmError: that of `plan`.
+    """
+    try:
+        return plan()
+    except ApproachFailedError as error:
+        target = next(target for target in request.targets if target.id == error.furthest.id)
+        around = Around(request.obstacles, request.attached)
+        error.alternative = near_pose(arm, now, around, target.pose, budget=_APPROACH)
+        raise
+
+
 def near_pose(
     arm: Arm, now: Situation, around: Around, pose: Array, *, free_orientation: bool = False, budget: float = 1.0
 ) -> Alternative | None:
@@ -60,7 +82,8 @@ def near_pose(
             return None
         solve = arm.inverse.position_solutions if free_orientation else arm.inverse.solutions
         found = solve(target, arm.config.planning.joint_margin, now.start)
-        goals = [s.q for s in found if not scene.collides(s.q)]
+        # of a whole turn of the elbow, some of every part
+        goals = [s.q for s in found[:: max(1, len(found) // _LOOKS)] if not scene.collides(s.q)]
         q = _planned(arm, scene, now, np.array(goals[:8])) if goals else None
         if q is not None:
             there = arm.kinematics.fk(q)

@@ -2,14 +2,14 @@
 """Choose and plan one of several approaches: free path, straight line to a target, straight line away from it.
 
 For each target every configuration is followed along both lines on its own branch, and kept when limits and clearance
-hold all the way; then one search runs from the start to the beginnings of all that were kept. What is refused says why.
-Base frame, m, rad.
+hold all the way; then one search runs from the start to the beginnings of all that were kept. All three parts are timed
+and looked at densely before they are handed out. What is refused says why. Base frame, m, rad.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +17,16 @@ from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_motion.approach_request import ApproachRequest, Refused, Target
 from openarm_motion.arm import Arm, Situation, first_contact, segment_time
 from openarm_motion.cartesian import Line, line_contact, solve_line
+from openarm_motion.certificate import Certificate, certify
 from openarm_motion.collision import Box, CollisionScene
+from openarm_motion.failure import PlanFailedError
 from openarm_motion.inverse import Solution
 from openarm_motion.trajectory import Trajectory
+
+__all__ = ["ApproachFailedError", "ApproachPlan", "ApproachRequest", "Refused", "Target", "plan_approach"]
 
 Array = NDArray[np.float64]
 
@@ -29,60 +34,24 @@ Array = NDArray[np.float64]
 _COMFORT = 0.3
 #: Targets looked at for a start configuration before the search is tried.
 _GOALS = 24
-
-
-@dataclass(frozen=True, eq=False)
-class Target:
-    """One way to reach a place with the tool: lines from `pose` + `approach_offset` to `pose` to `retreat_offset`.
-
-    Attributes:
-        id: Returned in refusals.
-        pose: (4, 4) of the tool.
-        approach_offset: (3,) base frame.
-        retreat_offset: (3,) base frame.
-        score: A higher one is preferred.
-    """
-
-    id: str
-    pose: Array
-    approach_offset: Array
-    retreat_offset: Array
-    score: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class ApproachRequest:
-    """What `plan_approach` is asked.
-
-    Attributes:
-        targets: Any of them will do.
-        obstacles: Boxes beside the robot and the table, base frame.
-        attached: Boxes held by the arm, tool frame.
-        touchable: Ids of obstacles that the fingers may touch on the straight parts.
-        attached_after: The touchable obstacles are carried on the retreat (a grasp).
-        detached_after: The held boxes are left behind on the retreat (a place).
-    """
-
-    targets: tuple[Target, ...]
-    obstacles: tuple[Box, ...] = ()
-    attached: tuple[Box, ...] = ()
-    touchable: frozenset[str] = frozenset()
-    attached_after: bool = False
-    detached_after: bool = False
-
-
-@dataclass(frozen=True)
-class Refused:
-    """Why a target was not chosen."""
-
-    id: str
-    code: Code
-    message: str
+#: How far a target got, the furthest first.
+_CODES = (Code.NO_PLAN, Code.IN_COLLISION, Code.UNREACHABLE)
+_STAGES = ("certificate", "search", "line", "goal")
 
 
 @dataclass(frozen=True, eq=False)
 class ApproachPlan:
-    """A plan for target number `chosen`; `held_after` are the boxes that the arm holds at its end, tool frame."""
+    """A plan for target number `chosen`.
+
+    Attributes:
+        chosen: Index of the target.
+        transfer: Free path to the beginning of the approach.
+        approach: Straight line to the target.
+        retreat: Straight line away from it.
+        refusals: Why others were not chosen.
+        held_after: Boxes that the arm holds at the end, tool frame.
+        certificates: What the three parts were looked at with, in their order.
+    """
 
     chosen: int
     transfer: Trajectory
@@ -90,14 +59,15 @@ class ApproachPlan:
     retreat: Trajectory
     refusals: tuple[Refused, ...]
     held_after: tuple[Box, ...]
+    certificates: tuple[Certificate, Certificate, Certificate]
 
 
-class ApproachFailedError(OpenArmError):
-    """No target could be planned; `refusals` has the reason of each."""
+class ApproachFailedError(PlanFailedError):
+    """No target could be planned; stage and pair are of the one that got furthest, `refusals` has all reasons."""
 
-    def __init__(self, code: Code, message: str, refusals: tuple[Refused, ...]) -> None:
-        super().__init__(code, message)
-        self.refusals = refusals
+    def __init__(self, furthest: Refused, message: str, refusals: tuple[Refused, ...]) -> None:
+        super().__init__(furthest.code, message, furthest.stage, furthest.contact)
+        self.furthest, self.refusals = furthest, refusals
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +100,12 @@ def plan_approach(
         OpenArmError: INVALID_ARGUMENT, for a request without targets or with an unknown touchable id; IN_COLLISION,
             when the arm starts in collision; CANCELLED.
     """
-    _check(request)
+    request.check()
     end = time.monotonic() + arm.config.planning.time_limit
     checks = _Checks(arm, now, request)
     refusals: list[Refused] = []
     tried = 0
-    groups = list(_by_score(request.targets, arm.config.planning.score_step))
+    groups = list(request.by_score(arm.config.planning.score_step))
     for k, group in enumerate(groups):
         candidates: list[_Candidate] = []
         for index in group:
@@ -152,24 +122,9 @@ def plan_approach(
         candidates = sorted(candidates, key=lambda c: c.cost)[:_GOALS]
         report("planning", tried)
         left = max(end - time.monotonic(), 0.1)
-        try:
-            goals = np.array([candidate.approach.q[0] for candidate in candidates])
-            free = arm.plan_certified(checks.free, now, goals, left if k == len(groups) - 1 else 0.5 * left)
-        except OpenArmError as error:
-            if error.code not in (Code.NO_PLAN, Code.IN_COLLISION):
-                raise
-            ids = dict.fromkeys(request.targets[c.target].id for c in candidates)
-            refusals += [Refused(id, error.code, error.message) for id in ids]
-            continue
-        best = candidates[free.path.goal]
-        return ApproachPlan(
-            chosen=best.target,
-            transfer=free.trajectory,
-            approach=arm.time_line(best.approach, now.scale),
-            retreat=arm.time_line(best.retreat, now.scale),
-            refusals=tuple(refusals),
-            held_after=checks.held_after(request.targets[best.target].pose),
-        )
+        plan = checks.planned(candidates, left if k == len(groups) - 1 else 0.5 * left, refusals)
+        if plan is not None:
+            return plan
     raise _failed(arm, tuple(refusals))
 
 
@@ -213,6 +168,43 @@ class _Checks:
         T = se3.inverse(pose)
         return (*self._request.attached, *(Box(box.id, T @ box.T, box.size) for box in self._carried))
 
+    def planned(self, candidates: list[_Candidate], time_limit: float, refusals: list[Refused]) -> ApproachPlan | None:
+        """A plan to one of the candidates, or None; why not is added to the refusals.
+
+        Raises:
+            OpenArmError: CANCELLED, or anything else that is not for the lack of a plan.
+        """
+        arm, now, targets = self._arm, self._now, self._request.targets
+        end = time.monotonic() + time_limit
+        left = list(candidates)
+        while left:
+            try:
+                goals = np.array([candidate.approach.q[0] for candidate in left])
+                free = arm.plan_certified(self.free, now, goals, max(end - time.monotonic(), 0.1))
+            except OpenArmError as error:
+                if error.code not in (Code.NO_PLAN, Code.IN_COLLISION):
+                    raise
+                ids = dict.fromkeys(targets[c.target].id for c in left)
+                refusals += [Refused.of(id, error, error.message, "search") for id in ids]
+                return None
+            best = left.pop(free.path.goal)
+            pose = targets[best.target].pose
+            self._arrange(pose)
+            approach, retreat = (arm.time_line(line, now.scale) for line in (best.approach, best.retreat))
+            what = "approach"
+            try:
+                to = certify(self._approach, approach)
+                what = "retreat"
+                away = certify(self._retreat, retreat)
+            except PlanFailedError as error:
+                id = targets[best.target].id
+                refusals.append(Refused.of(id, error, f"{id}: on the {what}, {error.message}"))
+                continue
+            held = self.held_after(pose)
+            proof = (free.certificate, to, away)
+            return ApproachPlan(best.target, free.trajectory, approach, retreat, tuple(refusals), held, proof)
+        return None
+
     def candidates(self, index: int) -> tuple[list[_Candidate], Refused | None]:
         """The best configurations for a target, or why there is none."""
         arm, target = self._arm, self._request.targets[index]
@@ -225,11 +217,11 @@ class _Checks:
         limits = arm.limits(self._now.scale)
         ordered = sorted(solutions, key=lambda s: self._cost(s, segment_time(self._now.start, s.q, limits)))
         kept: list[_Candidate] = []
-        faults: list[OpenArmError] = []
+        faults: list[PlanFailedError] = []
         for solution in ordered:
             try:
                 approach, retreat = self._lines(target, solution)
-            except OpenArmError as error:
+            except PlanFailedError as error:
                 faults.append(error)
                 continue
             travel = segment_time(self._now.start, approach.q[0], limits)
@@ -238,16 +230,15 @@ class _Checks:
                 break
         if kept:
             return kept, None
-        # a collision got further than a line that can't be followed, so it says more
-        worst = next((fault for fault in faults if fault.code == Code.IN_COLLISION), faults[0])
+        worst = min(faults, key=_far)
         text = f"{target.id}: {worst.message} ({len(faults)} configurations tried)"
-        return [], Refused(target.id, worst.code, text)
+        return [], Refused.of(target.id, worst, text)
 
     def _lines(self, target: Target, solution: Solution) -> tuple[Line, Line]:
         """Both lines of a configuration at the target, free of collision.
 
         Raises:
-            OpenArmError: UNREACHABLE or IN_COLLISION.
+            PlanFailedError: UNREACHABLE or IN_COLLISION.
         """
         arm = self._arm
         margin = arm.config.planning.joint_margin
@@ -256,12 +247,15 @@ class _Checks:
         away, back = there.copy(), there.copy()
         back[:3, 3] += target.approach_offset
         away[:3, 3] += target.retreat_offset
-        approach = solve_line(arm.inverse, solution, there, back, margin).reversed()
-        retreat = solve_line(arm.inverse, solution, there, away, margin)
+        try:
+            approach = solve_line(arm.inverse, solution, there, back, margin).reversed()
+            retreat = solve_line(arm.inverse, solution, there, away, margin)
+        except OpenArmError as error:
+            raise PlanFailedError(error.code, error.message, "line") from error
         for scene, line, what in ((self._approach, approach, "approach"), (self._retreat, retreat, "retreat")):
             contact = line_contact(scene, line)
             if contact is not None:
-                raise OpenArmError(Code.IN_COLLISION, f"on the {what} {contact}")
+                raise PlanFailedError(Code.IN_COLLISION, f"on the {what} {contact}", "line", contact)
         _require(self.free, approach.q[0], "before the approach")
         return approach, retreat
 
@@ -288,42 +282,17 @@ class _Checks:
 def _require(scene: CollisionScene, q: Array, where: str) -> None:
     contact = first_contact(scene, q)
     if contact is not None:
-        raise OpenArmError(Code.IN_COLLISION, f"{where} {contact}")
+        raise PlanFailedError(Code.IN_COLLISION, f"{where} {contact}", "goal", contact)
 
 
-def _check(request: ApproachRequest) -> None:
-    if not request.targets:
-        raise OpenArmError(Code.INVALID_ARGUMENT, "no targets, expected at least one")
-    known = {box.id for box in request.obstacles}
-    unknown = sorted(request.touchable - known)
-    if unknown:
-        there = ", ".join(sorted(known)) or "none"
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"touchable {', '.join(unknown)} not among the obstacles: {there}")
-    if request.attached_after and request.detached_after:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT, "attached_after_approach and detached_after_approach exclude each other"
-        )
-    for target in request.targets:
-        numbers = np.concatenate([target.pose.ravel(), target.approach_offset, target.retreat_offset, [target.score]])
-        if not np.all(np.isfinite(numbers)):
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"target {target.id!r} has numbers that are not finite")
-
-
-def _by_score(targets: tuple[Target, ...], step: float) -> Iterator[list[int]]:
-    """Indices of targets whose scores are within `step` of the best of their group, best group first."""
-    order = sorted(range(len(targets)), key=lambda i: -targets[i].score)
-    while order:
-        least = targets[order[0]].score - step
-        group = [i for i in order if targets[i].score >= least]
-        yield group
-        order = order[len(group) :]
+def _far(fault: PlanFailedError | Refused) -> tuple[int, int]:
+    """Less is further: a collision got further than a line that can't be followed, so it says more."""
+    return _CODES.index(fault.code), _STAGES.index(fault.stage)
 
 
 def _failed(arm: Arm, refusals: tuple[Refused, ...]) -> ApproachFailedError:
     """The furthest that any target got is the code; its sentence stands for the others."""
-    for code in (Code.NO_PLAN, Code.IN_COLLISION, Code.UNREACHABLE):
-        of_code = [refusal for refusal in refusals if refusal.code == code]
-        if of_code:
-            others = f" ({len(refusals) - 1} other targets refused)" if len(refusals) > 1 else ""
-            return ApproachFailedError(code, f"{arm.name} arm: {of_code[0].message}{others}", refusals)
-    return ApproachFailedError(Code.INTERNAL, f"{arm.name} arm: no target was refused and none was planned", refusals)
+    furthest = min(refusals, key=_far)
+    ids = {refused.id for refused in refusals}
+    others = f" ({len(ids) - 1} other targets refused)" if len(ids) > 1 else ""
+    return ApproachFailedError(furthest, f"{arm.name} arm: {furthest.message}{others}", refusals)

@@ -59,12 +59,12 @@ class CollisionScene:
         self._solids: dict[str, Solid] = {}
         self._balls: dict[int, tuple[Array, float]] = {}
         self._towards: dict[frozenset[str], NDArray[np.int64]] = {}
-        self.levers = robot.levers
         pairs, required = self._pairs()
         for i, j in pairs:
             self._geometry.addCollisionPair(pin.CollisionPair(i, j))
         self._pair_index = pairs
         self._required = np.array(required)
+        self._measure()
         own, others = robot.arm.fixed | robot.arm.moving, {*robot.links, *self.carried}
         self._arms = np.array([self._names[j] in others and self._names[j] not in own for _, j in pairs])
         self._data = robot.model.createData()
@@ -212,6 +212,12 @@ class CollisionScene:
         held = self._held_name(id) in self._boxes
         index = self._boxes[self._held_name(id) if held else id]
         self._geometry.geometryObjects[index].placement = pin.SE3(self._robot.kinematics.tip @ T if held else T)
+        self._measure()
+
+    def _measure(self) -> None:
+        """Set how far points are from the joints' axes, what is held included."""
+        held = [self._geometry.geometryObjects[self._boxes[self._held_name(b.id)]] for b in self._around.held]
+        self.levers: Array = np.max([self._robot.levers, *(self._robot.levers_of(o) for o in held)], axis=0)
 
     def set_state(self, state: Mapping[str, float]) -> None:
         """Move the robot's other joints."""
@@ -265,18 +271,11 @@ class CollisionScene:
         if seen is None:
             return np.empty(0, np.int64)
         self._colliding(q)
-        edge, centres, found = seen.lattice.resolution, seen.centres, set[int]()
-        cell = coal.Box(edge, edge, edge)
-        request = coal.DistanceRequest()
+        found = set[int]()
         for k in pairs:
             i = self._pair_index[k][0]
-            place, shape = self._geometry_data.oMg[i], self._geometry.geometryObjects[i].geometry
-            middle, radius = self._ball(i)
-            for c in np.flatnonzero(np.linalg.norm(centres - middle, axis=1) < radius + edge):
-                there = coal.Transform3s(np.eye(3), centres[c])
-                here = coal.Transform3s(place.rotation, place.translation)
-                if coal.distance(shape, here, cell, there, request, coal.DistanceResult()) < 2.0 * _LESS:
-                    found.add(int(c))
+            place = coal.Transform3s(self._geometry_data.oMg[i].rotation, self._geometry_data.oMg[i].translation)
+            found |= seen.touched(self._geometry.geometryObjects[i].geometry, place, self._ball(i), 2.0 * _LESS)
         return np.array(sorted(found), np.int64)
 
     def _contact(self, k: int) -> Contact:
@@ -304,7 +303,6 @@ class CollisionScene:
         tool = robot.joints[-1]
         held = [self._add(self._held_name(box.id), tool, robot.kinematics.tip @ box.T, box) for box in around.held]
         for h in held:
-            self.levers = np.maximum(self.levers, robot.levers_of(self._geometry.geometryObjects[h]))
             for i, link in enumerate(robot.links):
                 if link not in robot.arm.hand and (around.own or link not in own):
                     pairs.append((h, i))

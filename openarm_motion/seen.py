@@ -85,6 +85,18 @@ class SeenMap:
         """The map without some of its cells."""
         return replace(self, indices=np.delete(self.indices, rows, axis=0))
 
+    def touched(
+        self, shape: coal.CollisionGeometry, place: coal.Transform3s, ball: tuple[Array, float], near: float
+    ) -> set[int]:
+        """Rows of the cells within `near` of a shape at a place; `ball` is the centre (3,) and radius about it, m."""
+        edge, centres, found = self.lattice.resolution, self.centres, set[int]()
+        cell, request = coal.Box(edge, edge, edge), coal.DistanceRequest()
+        for c in np.flatnonzero(np.linalg.norm(centres - ball[0], axis=1) < ball[1] + edge + near):
+            there = coal.Transform3s(np.eye(3), centres[c])
+            if coal.distance(shape, place, cell, there, request, coal.DistanceResult()) < near:
+                found.add(int(c))
+        return found
+
     def at(self, p: Array) -> tuple[float, float, float]:
         """The middle of the cell nearest to a point (3,), m."""
         nearest = self.centres[int(np.argmin(np.linalg.norm(self.centres - p, axis=1)))]

@@ -11,10 +11,14 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_motion.alternative import explained_approach
 from openarm_motion.approach import ApproachFailedError, ApproachRequest, Target, plan_approach
 from openarm_motion.arm import Arm
+from openarm_motion.cartesian import Line
+from openarm_motion.certificate import dense_times
 from openarm_motion.collision import Box, box_from
 from openarm_motion.planner import OmplPlanner, PlannedPath, PlanQuery
+from openarm_motion.trajectory import Trajectory
 
 TABLE_Z = 0.40
 UP = np.array([0.0, 0.0, 0.12])
@@ -102,6 +106,43 @@ def test_every_moment_of_a_plan_is_free_of_what_it_must_not_touch(right: Arm, ho
         assert not held.collides(q)
 
 
+def test_n11_both_lines_carry_a_certificate_and_one_that_fails_it_is_not_handed_out(
+    right: Arm, home: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = ApproachRequest(
+        targets(0.26, -0.22, 0.05, 0.3),
+        (cube(0.26, -0.22, 0.05, 0.3),),
+        touchable=frozenset({"cube"}),
+        attached_after=True,
+    )
+    plan = plan_approach(right, right.situation(home), request)
+    for part, look in zip((plan.transfer, plan.approach, plan.retreat), plan.certificates, strict=True):
+        held = plan.held_after if part is plan.retreat else ()
+        assert look.states == len(dense_times(part, right.scene(home, held=held).levers, look.travel))
+        assert look.travel <= 0.004
+
+    timed, dips = right.time_line, iter([True, False, False, True])
+
+    def dipping(line: Line, scale: float) -> Trajectory:
+        """Goes deeper between its ends than the line that was looked at; for two of the lines."""
+        way = timed(line, scale)
+        if not next(dips, False):
+            return way
+        low = right.kinematics.fk(way.at(way.duration / 2)[0][0])
+        low[2, 3] -= 0.10
+        below = right.inverse.nearest(low, way.at(way.duration / 2)[0][0], position_only=False).q
+        u = np.sin(np.pi * way.t / way.duration)[:, None] ** 2
+        return replace(way, q=(1.0 - u) * way.q + u * below)
+
+    monkeypatch.setattr(right, "time_line", dipping)
+    again = plan_approach(right, right.situation(home), request)
+    refused = [one for one in again.refusals if one.stage == "certificate"]
+    assert len(refused) == 2
+    assert all(one.code == Code.IN_COLLISION and one.contact for one in refused)
+    assert "on the approach, after " in refused[0].message
+    assert "on the retreat, after " in refused[1].message
+
+
 def test_a_place_leaves_the_object_and_draws_back_with_open_fingers(right: Arm, home: dict[str, float]) -> None:
     state = right.with_gripper(home, 0.025)
     held = Box("cube", np.eye(4), np.array([0.05, 0.05, 0.05]))
@@ -155,6 +196,35 @@ def test_refusals_say_why(right: Arm, home: dict[str, float]) -> None:
     assert caught.value.code == Code.IN_COLLISION
     assert caught.value.message.startswith("right arm: buried: ")
     assert "1 other targets refused" in caught.value.message
+    assert caught.value.stage == "goal"
+    assert caught.value.contact is not None
+    assert caught.value.contact.second == "table"
+
+
+def test_a_failed_approach_names_stage_pair_and_the_nearest_place_that_can_be_reached(
+    right: Arm, home: dict[str, float]
+) -> None:
+    now = right.situation(home)
+    lid = box_from("lid", (0.26, -0.22, TABLE_Z + 0.07), (0.16, 0.16, 0.02))
+    request = ApproachRequest((grasp("under", 0.26, -0.22, 0.05, 0.0),), (lid,))
+    with pytest.raises(ApproachFailedError) as caught:
+        explained_approach(lambda: plan_approach(right, now, request), right, now, request)
+    error = caught.value
+    assert (error.code, error.stage) == (Code.IN_COLLISION, "goal")
+    assert error.contact is not None
+    assert error.contact.second == "lid"
+    found = error.alternative
+    assert found is not None
+    assert found.distance == pytest.approx(np.linalg.norm(found.pose[:3, 3] - request.targets[0].pose[:3, 3]))
+    assert not right.scene(home, (lid,)).collides(found.q)
+    assert 0.02 <= found.distance <= 0.25
+
+    kerb = box_from("kerb", (0.26, -0.38, TABLE_Z + 0.03), (0.30, 0.02, 0.06))
+    low = replace(grasp("low", 0.26, -0.22, 0.05, 0.0), retreat_offset=np.array([0.0, -0.15, 0.0]))
+    with pytest.raises(ApproachFailedError) as caught:
+        plan_approach(right, now, ApproachRequest((low,), (kerb,)))
+    assert (caught.value.code, caught.value.stage) == (Code.IN_COLLISION, "line")
+    assert "on the retreat" in caught.value.message
 
 
 def test_an_object_in_the_way_refuses_only_the_targets_that_it_blocks(right: Arm, home: dict[str, float]) -> None:
