@@ -7,6 +7,9 @@ any frame.
 
 from __future__ import annotations
 
+import importlib
+from typing import Any, Literal
+
 import cv2
 import numpy as np
 from numba import njit
@@ -38,6 +41,9 @@ class FilterConfig(Config):
     neighbours: int = Field(default=20, ge=2, le=200, description="how many nearest points count for that")
     deviations: float = Field(
         default=2.0, gt=0.0, le=10.0, description="standard deviations above the mean that are too far"
+    )
+    outliers_by: Literal["scipy", "open3d"] = Field(
+        default="scipy", description="whose search finds outliers, by the same rule; open3d where it is installed"
     )
 
     @field_validator("median")
@@ -174,15 +180,49 @@ def statistical_inliers(points: Points, neighbours: int = 20, deviations: float 
     return np.asarray((means > 0.0) & (means < limit))
 
 
+def open3d_inliers(points: Points, neighbours: int = 20, deviations: float = 2.0) -> NDArray[np.bool_]:
+    """`statistical_inliers` as open3d computes them.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, without open3d.
+    """
+    geometry, utility = _open3d()
+    cloud = geometry.PointCloud(utility.Vector3dVector(points.astype(np.float64)))
+    kept = np.zeros(len(points), bool)
+    if len(points) < 3:
+        return ~kept
+    kept[np.asarray(cloud.remove_statistical_outlier(min(neighbours, len(points)), deviations)[1], np.int64)] = True
+    return kept
+
+
+def _open3d() -> tuple[Any, Any]:
+    """The modules `geometry` and `utility` of open3d."""
+    try:
+        open3d = importlib.import_module("open3d")
+    except ImportError as error:
+        raise OpenArmError(
+            Code.ENVIRONMENT,
+            f"filter.outliers_by is open3d, which can't be imported ({error}); "
+            "install it (pip install 'openarm-vision[cloud]'), or set filter.outliers_by to scipy",
+        ) from error
+    return open3d.geometry, open3d.utility
+
+
 class CloudFilter:
     """The filters of a configuration.
 
     Args:
         config: Which ones.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, when open3d is asked for and missing.
     """
 
     def __init__(self, config: FilterConfig) -> None:
         self._config = config
+        self._inliers = open3d_inliers if config.outliers_by == "open3d" else statistical_inliers
+        if config.outliers and config.outliers_by == "open3d":
+            _open3d()
 
     @property
     def thins(self) -> bool:
@@ -200,5 +240,5 @@ class CloudFilter:
         if self._config.voxel > 0.0:
             points = voxel_filter(points, self._config.voxel)
         if self._config.outliers:
-            points = points[statistical_inliers(points, self._config.neighbours, self._config.deviations)]
+            points = points[self._inliers(points, self._config.neighbours, self._config.deviations)]
         return points

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -121,14 +123,21 @@ def test_the_rule_is_that_of_open3d() -> None:
     np.testing.assert_array_equal(statistical_inliers(points, 10, 1.0), mean < mean.mean() + mean.std(ddof=1))
 
 
+@pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="the extra `cloud` (open3d) is not installed")
 def test_open3d_agrees() -> None:
-    """Runs where the extra `cloud` is installed: `pytest tests/openarm_perception/test_filters.py -k open3d`."""
-    o3d = pytest.importorskip("open3d")
-    rng = np.random.default_rng(3)
-    points = rng.normal(size=(2000, 3)).astype(np.float32)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points.astype(np.float64)))
-    _, kept = cloud.remove_statistical_outlier(20, 2.0)
-    assert np.count_nonzero(statistical_inliers(points) != np.isin(np.arange(2000), kept)) <= 1
+    """Named command, where open3d is installed: `pytest tests/openarm_perception/test_filters.py -k open3d`."""
+    points = np.random.default_rng(3).normal(size=(2000, 3)).astype(np.float32)
+    ours, theirs = (FilterConfig(outliers=True, outliers_by=by) for by in ("scipy", "open3d"))
+    kept, expected = CloudFilter(ours).points(points), CloudFilter(theirs).points(points)
+    assert 1500 < len(kept) < 2000
+    assert abs(len(kept) - len(expected)) <= 1
+    assert len(np.intersect1d(kept[:, 0], expected[:, 0])) >= len(kept) - 1
+
+
+@pytest.mark.skipif(importlib.util.find_spec("open3d") is not None, reason="open3d is installed")
+def test_open3d_that_is_asked_for_and_missing_is_named() -> None:
+    with pytest.raises(OpenArmError, match=r"filter.outliers_by is open3d.*openarm-vision\[cloud\]"):
+        CloudFilter(FilterConfig(outliers=True, outliers_by="open3d"))
 
 
 def test_all_filters_together() -> None:
