@@ -82,6 +82,7 @@ class NodeSpec(Config):
     ready_timeout: float = Field(default=60.0, gt=0, description="s")
     needs: tuple[str, ...] = Field(default=(), description="nodes that must be ready before this one is started")
     restart: Restart = Restart()
+    essential: bool = Field(default=True, description="false: once it was ready, the graph goes on when it is given up")
     large_messages: bool = Field(default=False, description="publishes images or clouds: a large Fast DDS segment")
     segment_mib: int = Field(default=32, ge=1, le=1024, description="MiB of /dev/shm for large messages")
     shared_mib: float = Field(default=0.0, ge=0.0, le=1024.0, description="MiB of /dev/shm that it takes by itself")
@@ -308,14 +309,14 @@ def _in_lockstep(graph: Graph, where: str) -> Graph:
                 Code.CONFIG_INVALID,
                 f"{where}:lockstep.{key}: unknown node {unknown[0]!r}; nodes are {', '.join(graph.nodes)}",
             )
-    nodes = dict(graph.nodes)
+    nodes, never = dict(graph.nodes), Restart(policy="never")
     for name in (leader, *participants):
         params = {**nodes[name].params, "lockstep": True}
         if name == leader:
             params["barrier.participants"] = list(participants)
         # The order of sets of strings differs from process to process unless it is asked not to.
         env = {"PYTHONHASHSEED": "0", **nodes[name].env}
-        nodes[name] = nodes[name].model_copy(update={"params": params, "env": env, "restart": Restart(policy="never")})
+        nodes[name] = nodes[name].model_copy(update={"params": params, "env": env, "restart": never, "essential": True})
     return graph.model_copy(update={"nodes": nodes})
 
 

@@ -7,7 +7,7 @@ import sys
 import time
 from collections import deque
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -15,31 +15,33 @@ from openarm_bringup import runs
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
+if TYPE_CHECKING:
+    import psutil
+
 
 def ps(*, seconds: float = 0.5) -> Outcome:
-    """List the running graphs and their nodes, with the CPU and memory of each.
+    """List the running graphs and their nodes, with the CPU and memory of each (and of what it has started).
 
     Args:
         seconds: How long the CPU is measured.
     """
-    import psutil
-
     records = runs.running()
     if not records:
         return Outcome(True, "no graph is running; start one with `openarm up`", data={"graphs": []})
-    processes: dict[int, psutil.Process] = {}
+    processes: dict[int, list[psutil.Process]] = {}
     for pid in (node.pid for record in records for node in record.nodes.values()):
-        if pid is not None and psutil.pid_exists(pid):
-            processes[pid] = psutil.Process(pid)
-            processes[pid].cpu_percent()
+        if pid is not None:
+            processes[pid] = _family(pid)
     time.sleep(seconds)  # the time over which the CPU is measured
     graphs: list[dict[str, Any]] = []
     lines: list[str] = []
     for record in records:
-        nodes = {name: {**node.model_dump(), **_usage(processes, node.pid)} for name, node in record.nodes.items()}
-        graphs.append({**record.model_dump(), "nodes": nodes})
-        state = "ready" if record.ready else "not ready"
-        lines.append(f"{record.graph}: {state}, domain {record.domain}, supervisor {record.pid}, {record.run_dir}")
+        usage = {name: _usage(processes.get(node.pid or 0, [])) for name, node in record.nodes.items()}
+        nodes = {name: {**node.model_dump(), **usage[name]} for name, node in record.nodes.items()}
+        graphs.append({**record.model_dump(), "health": record.health, "nodes": nodes})
+        lines.append(
+            f"{record.graph}: {record.health}, domain {record.domain}, supervisor {record.pid}, {record.run_dir}"
+        )
         lines.append(f"  {'node':<24}{'state':<10}{'pid':>8}{'cpu %':>8}{'MiB':>8}{'restarts':>10}")
         for name, node in nodes.items():
             lines.append(
@@ -49,18 +51,31 @@ def ps(*, seconds: float = 0.5) -> Outcome:
     return Outcome(True, data={"graphs": graphs}, text="\n".join(lines))
 
 
-def _usage(processes: dict[int, Any], pid: int | None) -> dict[str, float]:
+def _family(pid: int) -> list[psutil.Process]:
+    """A process and its children, with the CPU measured from now on; empty when it has ended."""
     import psutil
 
     try:
-        if pid in processes:
-            return {
-                "cpu_percent": processes[pid].cpu_percent(),
-                "rss_mib": processes[pid].memory_info().rss / 2**20,
-            }
+        parent = psutil.Process(pid)
+        members = [parent, *parent.children(recursive=True)]
+        for member in members:
+            member.cpu_percent()
     except psutil.NoSuchProcess:
-        pass  # it ended while we looked; shown like one that does not run
-    return {"cpu_percent": 0.0, "rss_mib": 0.0}
+        return []
+    return members
+
+
+def _usage(members: list[psutil.Process]) -> dict[str, float]:
+    import psutil
+
+    usage = {"cpu_percent": 0.0, "rss_mib": 0.0}
+    for member in members:
+        try:
+            usage["cpu_percent"] += member.cpu_percent()
+            usage["rss_mib"] += member.memory_info().rss / 2**20
+        except psutil.NoSuchProcess:
+            continue  # it ended while we looked; shown like one that does not run
+    return usage
 
 
 def logs(
@@ -78,7 +93,7 @@ def logs(
         lines: How many lines from the end to begin with.
         run: Name of a run below runs/.
     """
-    folder = _log_folder(run)
+    folder = _log_folder(run, node)
     names = sorted(path.stem for path in folder.glob("*.log"))
     if node is None:
         return Outcome(True, f"logs in {folder}: {', '.join(names)}", data={"folder": str(folder), "logs": names})
@@ -103,11 +118,13 @@ def logs(
             return Outcome(True, data={"log": str(path)})
 
 
-def _log_folder(run: str) -> Path:
+def _log_folder(run: str, node: str | None) -> Path:
+    """The newest graph that runs and has the node, else the folder of the run."""
     if run == "latest":
         records = runs.running()
-        if records:
-            return Path(records[-1].run_dir) / "logs"
+        having = [record for record in records if node in record.nodes] or records
+        if having:
+            return Path(having[-1].run_dir) / "logs"
     folder = runs.runs_root() / run / "logs"
     if not folder.is_dir():
         existing = sorted(path.name for path in runs.runs_root().glob("*/logs/.."))[-5:]

@@ -98,6 +98,11 @@ class Keeper:
         running = self.process is not None and self.process.returncode is None
         return self.process.pid if running and self.process else None
 
+    @property
+    def dispensable(self) -> bool:
+        """Whether the graph goes on when it is given up: one that was never ready shows a fault of the graph itself."""
+        return self._was_ready and not self.spec.essential
+
     async def keep(self, needs: Sequence[Keeper]) -> None:
         """Start the node whenever its needs are ready, until it has ended for good.
 

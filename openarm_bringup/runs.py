@@ -46,6 +46,14 @@ class RunRecord(Config):
     nodes: dict[str, NodeRecord]
 
     @property
+    def health(self) -> str:
+        """In a word or two: ready, not ready, or without which nodes it goes on."""
+        failed = [name for name, node in self.nodes.items() if node.state == "failed"]
+        if failed:
+            return f"degraded, without {', '.join(failed)}"
+        return "ready" if self.ready else "not ready"
+
+    @property
     def alive(self) -> bool:
         """Whether its supervisor still runs (and not another process with its number)."""
         try:
@@ -125,14 +133,14 @@ def the_running(domain: int | None = None) -> RunRecord:
         domain: Tells several running graphs apart; None = ROS_DOMAIN_ID if it is set, else the only one.
 
     Raises:
-        OpenArmError: NOT_READY, when none runs; INVALID_ARGUMENT, when several do.
+        OpenArmError: NOT_READY, when none runs; INVALID_ARGUMENT, when several do, in different domains.
     """
     if domain is None and os.environ.get("ROS_DOMAIN_ID", "").isdecimal():
         domain = int(os.environ["ROS_DOMAIN_ID"])
     records = running()
     matching = [record for record in records if domain is None or record.domain == domain]
-    if len(matching) == 1:
-        return matching[0]
+    if len({record.domain for record in matching}) == 1:
+        return matching[-1]  # several graphs of one domain are one graph to whoever asks
     listed = "; ".join(f"{r.graph} in domain {r.domain} (pid {r.pid})" for r in records)
     if not matching:
         hint = f"; running: {listed}" if listed else ""

@@ -135,7 +135,7 @@ class Supervisor:
         """Wait for `ask_stop`, or until a node was given up.
 
         Raises:
-            OpenArmError: why a node was given up.
+            OpenArmError: why a node was given up that the graph can't do without.
         """
         stopping = asyncio.create_task(self._shared.stop_asked.wait())
         await asyncio.wait([stopping, self._trouble], return_when=asyncio.FIRST_COMPLETED)
@@ -192,7 +192,11 @@ class Supervisor:
         if error is None:
             return
         keeper.state = NodeState.FAILED
-        self._changed(keeper.name, NodeState.FAILED, error.message if isinstance(error, OpenArmError) else repr(error))
+        told = error.message if isinstance(error, OpenArmError) else repr(error)
+        if keeper.dispensable and isinstance(error, OpenArmError):
+            self._changed(keeper.name, NodeState.FAILED, f"the graph goes on without it: {told}")
+            return
+        self._changed(keeper.name, NodeState.FAILED, told)
         if not self._trouble.done():
             self._trouble.set_exception(error)
             self._trouble.exception()  # marked as seen: nobody may be waiting

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 
 from openarm_bringup import cli, graph_cli, runs
@@ -141,6 +142,47 @@ def test_ps_and_logs_find_a_running_graph(capsys: pytest.CaptureFixture[str]) ->
     assert runs.the_running().domain == 5
     with pytest.raises(OpenArmError, match=r"no graph is running in domain 6; running: toy in domain 5"):
         runs.the_running(6)
+
+
+def test_several_graphs_are_told_apart_by_domain_and_one_that_lost_a_node_is_degraded(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Two supervisors in one domain make one graph; ones in different domains have to be chosen from."""
+    others = [subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(60)"]) for _ in range(2)]
+    try:
+        for process, domain, state in zip(others, (5, 7), ("failed", "ready"), strict=True):
+            runs.write_record(
+                runs.RunRecord(
+                    graph=f"part_{domain}",
+                    pid=process.pid,
+                    pid_created=psutil.Process(process.pid).create_time(),
+                    domain=domain,
+                    discovery="localhost",
+                    run_dir=str(tmp_path / str(domain)),
+                    started=f"2026-01-01T00:00:0{domain}",
+                    ready=state == "ready",
+                    nodes={f"eye_{domain}": runs.NodeRecord(state=state), "arm": runs.NodeRecord(state="ready")},
+                )
+            )
+            (tmp_path / str(domain) / "logs").mkdir(parents=True)
+            (tmp_path / str(domain) / "logs" / f"eye_{domain}.log").write_text(f"I am eye {domain}\n")
+        assert cli.run(["ps", "--seconds", "0.05"]) == 0
+        text = capsys.readouterr().out
+        assert "part_5: degraded, without eye_5, domain 5" in text
+        assert "part_7: ready, domain 7" in text
+        with pytest.raises(OpenArmError, match=r"several graphs are running: part_5 in domain 5 .* choose one"):
+            runs.the_running()
+        assert runs.the_running(5).graph == "part_5"
+        first = runs.the_running(5)
+        runs.write_record(first.model_copy(update={"pid": os.getpid(), "pid_created": psutil.Process().create_time()}))
+        assert runs.the_running(5).domain == 5
+        assert cli.run(["logs", "eye_5"]) == 0
+        assert capsys.readouterr().out == "I am eye 5\n"
+    finally:
+        for process in others:
+            process.kill()
+            process.wait()
+        runs.remove_record(os.getpid())
 
 
 def test_record_of_another_process_with_the_same_number_is_not_alive() -> None:

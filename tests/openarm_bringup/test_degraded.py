@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Degraded mode: a graph goes on without a node that can be spared, and not without one that can't."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from openarm_bringup import runs
+from openarm_bringup.graph import NodeSpec, Ready, Restart
+from openarm_bringup.keeper import NodeState
+from openarm_common.errors import OpenArmError
+
+sys.path.insert(0, str(Path(__file__).parent))
+from test_supervisor import running, toy
+
+
+@pytest.fixture(autouse=True)
+def own_state_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "xdg").mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "xdg"))
+
+
+def test_a_node_that_can_be_spared_is_given_up_and_the_rest_goes_on(tmp_path: Path) -> None:
+    """Degraded: the eye is lost for good, the arm stays under control, and `ps` says so."""
+    nodes = {
+        "eye": toy(tmp_path, "eye", restart=Restart(policy="never"), essential=False),
+        "arm": toy(tmp_path, "arm", restart=Restart(policy="never")),
+    }
+
+    async def body() -> OpenArmError:
+        async with running(tmp_path, nodes) as run:
+            await run.supervisor.wait_ready()
+            waiting = asyncio.create_task(run.supervisor.wait_stop_asked())
+            os.kill(run.supervisor.pid("eye"), signal.SIGKILL)
+            await run.until(lambda: run.seen("eye")[-1] == NodeState.FAILED)
+            (record,) = runs.running()
+            assert record.health == "degraded, without eye"
+            assert run.supervisor.states()["arm"] == NodeState.READY
+            assert not waiting.done()
+            assert "goes on without it" in run.events[-1].detail
+            os.kill(run.supervisor.pid("arm"), signal.SIGKILL)
+            with pytest.raises(OpenArmError) as caught:
+                await waiting
+            return caught.value
+
+    assert asyncio.run(body()).message.startswith("arm ended by signal 9")
+
+
+def test_a_node_that_can_be_spared_still_has_to_come_up_once(tmp_path: Path) -> None:
+    command = ("python", "-c", "raise SystemExit('no such scene')")
+    broken = NodeSpec(command=command, ready=(Ready(service="/x"),), essential=False)
+
+    async def body() -> None:
+        async with running(tmp_path, {"broken": broken}) as run:
+            with pytest.raises(OpenArmError, match="no such scene"):
+                await run.supervisor.wait_ready()
+
+    asyncio.run(body())
