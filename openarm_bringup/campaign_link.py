@@ -15,6 +15,7 @@ from openarm_bringup.campaign_robot import SimRobot
 from openarm_common.cameras import load_cameras
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.held import HeldBox
 from openarm_common.housings import with_housings
 from openarm_common.robot_state import RobotStateBuffer
 from openarm_grasp import effects
@@ -30,6 +31,7 @@ from openarm_motion.arm import Arm, Situation
 from openarm_motion.checks import Motion, check_against_others, check_trajectory
 from openarm_motion.collision import Box, box_from
 from openarm_motion.config import MotionConfig
+from openarm_motion.memory import HeldMemory
 from openarm_motion.trajectory import Trajectory
 from openarm_sim_bridge.actuation import End, TrajectoryOutcome
 from openarm_sim_bridge.gripper import GripperGoal, GripperOutcome
@@ -62,6 +64,7 @@ class DirectLink:
         self._config = config
         table = robot.scene.table
         self._arms = arms_behind(table.top_z, table.centre, table.extents)
+        self._held = HeldMemory()
         self._running: dict[str, tuple[Motion, int]] = {}
         self.planning_s: list[float] = []
         self.warnings: list[str] = []
@@ -187,7 +190,7 @@ class DirectLink:
         Raises:
             OpenArmError: With the planner's code.
         """
-        arm = self._arms[effect.arm]
+        arm, request = self._arms[effect.arm], request_of(effect)
         after = effect.after if isinstance(effect, effects.PlanPlace) else None
         start = after.q[-1] if isinstance(after, Trajectory) else ()
         now = self._situation(arm, start)
@@ -196,10 +199,12 @@ class DirectLink:
             if self.plans_to_fail > 0:
                 self.plans_to_fail -= 1
                 raise OpenArmError(Code.NO_PLAN, f"{arm.name} arm: no path, on purpose")
-            plan = plan_approach(arm, now, request_of(effect))
+            plan = plan_approach(arm, now, request)
         finally:
             self.planning_s.append(time.perf_counter() - began)
             await self.pass_time(PLANNING_S)
+        self._held.expect(arm.name, (plan.transfer, plan.approach), request.attached)
+        self._held.expect(arm.name, (plan.retreat,), plan.held_after)
         return Planned(plan.chosen, plan.transfer, plan.approach, plan.retreat, self.planning_s[-1])
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
@@ -244,6 +249,9 @@ class DirectLink:
             if name != arm.name
         ]
         check_against_others(arm, motion, state, others)
+        held = self._held.expected(arm.name, motion)
+        if held is not None:
+            self._hold(arm, held)
         follower = robot.controller.arms[arm.name]
         ends: list[TrajectoryOutcome] = []
         checked = follower.check(FollowedTrajectory(tuple(plan.names), plan.t, plan.q, plan.v, plan.a))
@@ -279,8 +287,15 @@ class DirectLink:
             trajectory = plan(self._situation(arm))
         except OpenArmError as error:
             raise OpenArmError(error.code, f"{what}: {error.message}") from error
+        self._hold(arm, ())
         await self.pass_time(PLANNING_S)
         await self.follow(arm.name, trajectory, what)
+
+    def _hold(self, arm: Arm, boxes: Sequence[Box]) -> None:
+        """Note what an arm holds, as the motion node does, for those who look at it."""
+        if self._held.hold(arm.name, boxes):
+            by_link = ((self._arms[name].kinematics.tool_link, held) for name, held in self._held.held.items())
+            self.robot.held = tuple(HeldBox(b.id, link, b.T, tuple(b.size)) for link, held in by_link for b in held)
 
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Move the fingers; whether they arrived or push against something."""

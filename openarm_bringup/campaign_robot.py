@@ -19,16 +19,19 @@ from openarm_bringup.judge import Sample
 from openarm_common import se3
 from openarm_common.cameras import CameraConfig, load_cameras
 from openarm_common.config import Config, load_config
+from openarm_common.depth_view import DepthView
 from openarm_common.description import RobotDescription
 from openarm_common.errors import OpenArmError
+from openarm_common.held import HeldBox
 from openarm_common.resources import config_dir
 from openarm_common.robot_state import RobotStateBuffer
 from openarm_common.scene import Scene
 from openarm_grasp.observation import Detection, Frame
 from openarm_perception.depth import DepthImage, DepthLimits
-from openarm_perception.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.localize import Localizer, LocalizerConfig
 from openarm_perception.pipeline import Pipeline
+from openarm_perception.robot import RobotConfig, RobotFinder
 from openarm_sim_bridge.actuation import TrajectoryConfig
 from openarm_sim_bridge.camera_faults import CameraFaults
 from openarm_sim_bridge.cameras import SnapshotRenderer
@@ -98,6 +101,8 @@ class SimRobot:
         self._rng = np.random.default_rng([seed, 77])
         self._arriving: deque[tuple[int, Frame]] = deque()
         self.frames: deque[Frame] = deque(maxlen=64)
+        #: What the hands hold, as the planner believes; the detector takes it for a part of the robot.
+        self.held: tuple[HeldBox, ...] = ()
         self._looking = ""
         self._detected_ns = -(10**12)
         self._table_z = scene.table.top_z
@@ -191,13 +196,25 @@ class SimRobot:
         self.images[name] = (self.t_ns, rgb, depth)
         try:
             T_base_camera = self._camera_pose(camera, stamp_ns)
+            optics = self.camera_faults.intrinsics(name, camera.intrinsics)
+            view = DepthView(depth, optics, T_base_camera, camera.near, camera.far)
             perceived = _pipeline(name, self._table_z).run(
-                rgb, depth, self.camera_faults.intrinsics(name, camera.intrinsics), T_base_camera
+                rgb, depth, optics, T_base_camera, self._robot_in(view, stamp_ns)
             )
         except OpenArmError:
             return None  # as the detector: the frame is skipped, the next may do
-        found = (Detection(d.label, d.score, d.T_base_object, np.array(d.size)) for d in perceived.located)
+        found = (Detection(d.label, d.score, d.T_base_object, np.array(d.size)) for d in perceived.boxes)
         return Frame(stamp_ns, tuple(found))
+
+    def _robot_in(self, view: DepthView, stamp_ns: int) -> Mask | None:
+        """Pixels of the robot and what it holds; None in a gap of the joint states, as the detector has it."""
+        newest_ns, _ = self.states.latest()
+        try:
+            # the detector waits for joint states of an image's stamp; here they have not come yet
+            joints = self.states.joints_at(min(stamp_ns, newest_ns))
+        except OpenArmError:
+            return None
+        return _finder().find(view, joints, self.held)[0]
 
     def draw(self, name: str) -> tuple[NDArray[np.uint8], DepthImage]:
         """Colour and depth (mm) that a camera sees now."""
@@ -232,6 +249,11 @@ class SimRobot:
 def shared_renderer() -> SnapshotRenderer:
     """One renderer a process; it takes every model."""
     return SnapshotRenderer(load_cameras())
+
+
+@cache
+def _finder() -> RobotFinder:
+    return RobotFinder(RobotDescription.load(), RobotConfig())
 
 
 @cache

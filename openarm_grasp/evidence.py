@@ -16,13 +16,17 @@ from numpy.typing import NDArray
 
 from openarm_common.errors import Code
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.observation import Detection, Frame
+from openarm_grasp.observation import Detection, Frame, sticks_out
 
 Array = NDArray[np.float64]
 
 
 #: Largest turn of a placed object from the yaw that was asked for, rad.
 YAW_TOLERANCE = float(np.radians(15.0))
+#: An object that is placed is as high as before; one that differs by more lies on its side, m.
+UPRIGHT_WITHIN = 0.006
+#: What is farther from an object is another one, or the hand hides it, m.
+_ELSEWHERE = 0.10
 #: Edges of a footprint that differ by less are taken for equal, m; what is round looks so, too.
 SQUARE_WITHIN = 0.006
 
@@ -76,15 +80,17 @@ class Sight(Enum):
     RISEN = "risen"
     GONE = "gone from its place"
     STILL_THERE = "still there"
+    ASKEW = "held elsewhere than planned"
     BLIND = "no frame"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A judgement with its reason in a sentence."""
+    """A judgement with its reason in a sentence; after a `final` one another try would not help."""
 
     code: Code
     reason: str
+    final: bool = False
 
     @property
     def ok(self) -> bool:
@@ -123,29 +129,68 @@ def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> tu
 
 
 def judge_sight(
-    before: Detection, frames: Sequence[Frame], config: HeldConfig, *, match_radius: float
+    before: Detection,
+    frames: Sequence[Frame],
+    config: HeldConfig,
+    *,
+    match_radius: float,
+    others: Sequence[Detection] = (),
 ) -> tuple[Sight, str]:
     """Whether the camera still sees the object at its old place, sees it higher, or not there any more.
 
     Args:
         before: The object as it was before the grasp.
-        frames: Taken after the lift; the newest that says anything counts.
+        frames: Taken after the lift, straight up; the newest counts.
         config: Thresholds.
         match_radius: Horizontal distance that counts as the old place, m.
+        others: What else stood there; those like the object are not taken for it.
     """
     if not frames:
         return Sight.BLIND, "no camera frame after the lift"
-    same = [d for d in frames[-1].detections if d.label == before.label]
+    twins = [d for d in others if d.label == before.label]
+    same = [
+        d
+        for d in frames[-1].detections
+        if d.label == before.label and all(_apart(d, twin) > match_radius for twin in twins)
+    ]
     if not same:
         return Sight.GONE, f"{before.label!r} has gone from its place"
     # The top counts: a detector may take the visible part of a lifted object for a box that reaches down to the table.
-    risen = max(d.top - before.top for d in same)
+    highest = max(same, key=lambda d: d.top)
+    risen = highest.top - before.top
     if risen >= config.rise:
-        return Sight.RISEN, f"{before.label!r} is seen {risen * 1e3:.0f} mm higher"
-    distance = min(float(np.linalg.norm((d.p_base - before.p_base)[:2])) for d in same)
+        text = f"{before.label!r} is seen {risen * 1e3:.0f} mm higher"
+        off = sticks_out(highest, before)
+        if off > config.askew:
+            limit = f"expected at most {config.askew * 1e3:.0f} mm"
+            return Sight.ASKEW, f"{text}, {off * 1e3:.0f} mm out of where the hand should hold it, {limit}"
+        return Sight.RISEN, text
+    distance = min(_apart(d, before) for d in same)
     if distance <= match_radius:
         return Sight.STILL_THERE, f"{before.label!r} still stands at its place ({distance * 1e3:.0f} mm from it)"
     return Sight.GONE, f"{before.label!r} has left its place ({distance * 1e3:.0f} mm)"
+
+
+def _apart(a: Detection, b: Detection) -> float:
+    return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
+
+
+def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) -> tuple[bool, str]:
+    """Whether the object still stands where it was seen, as far as the hand above it lets the camera see.
+
+    Args:
+        before: The object as it was seen before.
+        frames: Taken since; the newest counts.
+        config: Thresholds.
+    """
+    near = (d for d in frames[-1].detections if d.label == before.label) if frames else ()
+    nearest = min(near, key=lambda d: _apart(d, before), default=None)
+    if nearest is None or _apart(nearest, before) > _ELSEWHERE:
+        return True, "the hand hides the object"
+    off, limit = sticks_out(nearest, before) * 1e3, config.moved * 1e3
+    if off > limit:
+        return False, f"{before.label!r} has moved: it reaches {off:.0f} mm out of where it stood, expected {limit:.0f}"
+    return True, f"{before.label!r} still stands there"
 
 
 def judge_lift(grip: tuple[Grip, str], sight: tuple[Sight, str]) -> Verdict:
@@ -159,16 +204,22 @@ def judge_lift(grip: tuple[Grip, str], sight: tuple[Sight, str]) -> Verdict:
 
 
 def judge_place(
-    label: str, p_target: Array, frames: Sequence[Frame], tolerance: float, yaw: float | None = None
+    label: str,
+    p_target: Array,
+    frames: Sequence[Frame],
+    tolerance: float,
+    yaw: float | None = None,
+    height: float | None = None,
 ) -> Verdict:
     """Whether the camera sees the object at the place target after the arm has left.
 
     Args:
         label: Of the object.
-        p_target: (3,) where its footprint centre shall stand, base frame, m; z is not judged.
+        p_target: (3,) where its footprint centre shall stand, base frame, m; z is that of the table.
         frames: Taken after the arm has left.
         tolerance: Largest horizontal distance, m.
         yaw: Of its x axis, where one was asked for, rad; what looks square or round is not judged by it.
+        height: Of the object as it stood, m: one of another height lies on its side. None: it is not judged.
     """
     if not frames:
         return Verdict(Code.STALE_DATA, "no camera frame after the place")
@@ -180,6 +231,10 @@ def judge_place(
     text = f"{label!r} stands {distance * 1e3:.0f} mm from its target"
     if distance > tolerance:
         return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
+    top = nearest.top - float(p_target[2])
+    if height is not None and abs(top - height) > UPRIGHT_WITHIN:
+        was = f"it is {top * 1e3:.0f} mm high there and was {height * 1e3:.0f} mm"
+        return Verdict(Code.PLACE_FAILED, f"{label!r} has fallen over: {was}", final=True)
     if yaw is not None and abs(float(nearest.size[0] - nearest.size[1])) > SQUARE_WITHIN:
         off = abs((nearest.yaw - yaw + np.pi / 2.0) % np.pi - np.pi / 2.0)
         text += f", turned {np.degrees(off):.0f}° from what was asked"

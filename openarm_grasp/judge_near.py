@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pre-grasp judged: the way there, the second look from there, and the correction that it asks for.
+"""The pre-grasp judged: the way there, the second look from there, the correction that it asks for, and the way down.
 
 The camera over the table says roughly where the object is; the camera on the hand, a hand's breadth away, says it
 better. Whatever keeps the second look from helping, the grasp goes on with what is known. Base frame, m.
@@ -15,7 +15,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.candidates import GraspCandidate, propose
 from openarm_grasp.effects import Frames, Outcome, Planned
-from openarm_grasp.evidence import Verdict
+from openarm_grasp.evidence import Evidence, Verdict, judge_still
 from openarm_grasp.memory import Memory, Surroundings
 from openarm_grasp.observation import Detection, Frame, find, on_table
 from openarm_grasp.states import Event
@@ -42,6 +42,27 @@ def move_to_pregrasp(m: Memory, outcome: Outcome, t_ns: int, around: Surrounding
         hand.near = "look"
         return Event.MORE, f"the open hand is before the object; looking with the {near.camera} camera"
     return Event.DONE, "the open hand is before the object"
+
+
+def move_to_grasp(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
+    """A last look, because the camera on the hand is not everywhere and time has passed; then the straight way down.
+
+    A hand that stops short has met the object.
+    """
+    if not m.hand.looked:
+        if not outcome.ok:
+            return fail(m, outcome.code, outcome.message)
+        m.hand.looked = True
+        still, reason = judge_still(m.need_sighting().target, outcome.last(Frames).frames, around.config.held)
+        return (Event.MORE, reason) if still else fail(m, Code.GRASP_MISSED, reason)
+    m.hand.at_object = True
+    if not outcome.ok:
+        return fail(m, outcome.code, outcome.message)
+    error, limit = outcome.last(Evidence).tcp_error, around.config.held.max_tcp_error
+    if error > limit:
+        text = f"the hand stopped {error * 1e3:.1f} mm from the grasp, expected at most {limit * 1e3:.0f} mm"
+        return fail(m, Code.HAND_COLLISION, text)
+    return Event.DONE, f"the hand is at the grasp, off by {error * 1e3:.1f} mm"
 
 
 def _seen_from_near(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:

@@ -18,7 +18,7 @@ from openarm_grasp import recipes
 from openarm_grasp.candidates import propose
 from openarm_grasp.effects import Frames, Outcome, Planned, Reach
 from openarm_grasp.evidence import Evidence, Grip, Verdict, judge_grip, judge_lift, judge_place, judge_sight
-from openarm_grasp.judge_near import Judgement, fail, move_to_pregrasp
+from openarm_grasp.judge_near import Judgement, fail, move_to_grasp, move_to_pregrasp
 from openarm_grasp.memory import Kept, Memory, Surroundings
 from openarm_grasp.observation import Detection, Frame, Sighting, find, labels_in_view, on_table
 from openarm_grasp.place import check_position, free_spots, place_targets
@@ -60,7 +60,12 @@ def transform(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> J
     limits, table = around.config.detect, around.table
     try:
         sighting = find(
-            m.seen.frames, m.request.label, match_radius=limits.match_radius, agree_within=limits.agree_within
+            m.seen.frames,
+            m.request.label,
+            match_radius=limits.match_radius,
+            agree_within=limits.agree_within,
+            at=m.request.object_at,
+            leave=m.request.leave,
         )
         target = on_table(sighting.target, table.top_z)
     except OpenArmError as error:
@@ -71,6 +76,8 @@ def transform(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> J
         return _missed_round(m, Code.STALE_DATA, text, around)
     others = _standing(sighting.others, table.top_z)
     m.sighting = Sighting(target, others, sighting.t_ns, sighting.spread)
+    if m.height is None or any(d.label == target.label for d in others):
+        m.height = float(target.size[2])
     if m.request.place is not None:
         check_position(m.request.place, target, others, table.x, table.y)
     m.arms = arm_order(m.request.arm, float(target.p_base[1]), around.config.approach.overlap_half_width)
@@ -92,6 +99,7 @@ def _place_what_is_held(m: Memory, kept: Kept, t_ns: int, around: Surroundings) 
         return _missed_round(m, Code.STALE_DATA, text, around)
     others = _standing((d for d in newest.detections if d.label != kept.target.label), around.table.top_z)
     m.sighting, m.candidate = Sighting(kept.target, others, newest.t_ns, 0.0), kept.candidate
+    m.height = float(kept.target.size[2])
     _offer_places(m, around)
     return Event.SKIP, f"the {m.arm} hand holds {m.label!r}; {len(m.place_offered)} ways to place it"
 
@@ -189,18 +197,6 @@ def _offer_places(m: Memory, around: Surroundings, *, origin: bool = False) -> N
 
 
 # --- grasping
-def move_to_grasp(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
-    """A hand that stops short has met the object."""
-    m.hand.at_object = True
-    if not outcome.ok:
-        return fail(m, outcome.code, outcome.message)
-    error, limit = outcome.last(Evidence).tcp_error, around.config.held.max_tcp_error
-    if error > limit:
-        text = f"the hand stopped {error * 1e3:.1f} mm from the grasp, expected at most {limit * 1e3:.0f} mm"
-        return fail(m, Code.HAND_COLLISION, text)
-    return Event.DONE, f"the hand is at the grasp, off by {error * 1e3:.1f} mm"
-
-
 def close_gripper(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
     """Gap, effort and rest say whether something of the right width is between the fingers."""
     if not outcome.ok:
@@ -220,7 +216,8 @@ def lift(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgem
     held = around.config.held
     grip = judge_grip(outcome.last(Evidence), held, was_held=True)
     frames = outcome.last(Frames).frames
-    sight = judge_sight(m.need_sighting().target, frames, held, match_radius=around.config.detect.match_radius)
+    s, radius = m.need_sighting(), around.config.detect.match_radius
+    sight = judge_sight(s.target, frames, held, match_radius=radius, others=s.others)
     verdict = judge_lift(grip, sight)
     if not verdict.ok:
         m.hand.holding = grip[0] is Grip.HELD
@@ -289,20 +286,23 @@ def reset(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judge
     else:
         frames, tolerance = outcome.last(Frames).frames, around.config.place.tolerance
         m.residual = _beside_the_place(m, frames)
-        verdict = judge_place(m.label, m.need_place_target().position, frames, tolerance, m.request.place_yaw)
+        p_target = m.need_place_target().position
+        verdict = judge_place(m.label, p_target, frames, tolerance, m.request.place_yaw, m.height)
         if verdict.ok:
             m.failure = None
             return Event.DONE, f"{verdict.reason}, placed by the {m.arm} arm"
         m.failure = verdict
     failure = m.failure or Verdict(Code.INTERNAL, "RESET without a failure")
-    last = m.attempt >= around.config.limits.max_attempts or (hand.putting_back and not hand.try_again)
-    return (Event.END if last else Event.AGAIN), failure.reason
+    useless = failure.final or (hand.putting_back and not hand.try_again)
+    again = not useless and m.attempt < around.config.limits.max_attempts
+    return (Event.AGAIN if again else Event.END), failure.reason
 
 
 def _beside_the_place(m: Memory, frames: Sequence[Frame]) -> tuple[NDArray[np.float64], float] | None:
     """Where the camera sees the placed object beside where the hand let it go, along the hand's opening axis."""
     target = m.need_place_target()
-    seen = [d.p_base - target.position for d in frames[-1].detections if d.label == m.label] if frames else []
+    found = (d for d in (frames[-1].detections if frames else ()) if d.label == m.label and d.measured)
+    seen = [d.p_base - target.position for d in found]
     if not seen:
         return None
     axis = target.T_base_tcp[:2, 1] / np.linalg.norm(target.T_base_tcp[:2, 1])
@@ -324,7 +324,9 @@ def _no_way_home(m: Memory, outcome: Outcome) -> Judgement:
 def start_over(m: Memory, came_from: State) -> None:
     """Look again; after a physical attempt with the next number, the failed grasp marked, the object's name kept."""
     if came_from is State.RESET:
-        m.request = replace(m.request, label=m.label, phase="all" if m.kept else m.request.phase)
+        at = m.request.object_at and tuple(m.need_sighting().target.p_base[:2].tolist())
+        phase = "all" if m.kept else m.request.phase
+        m.request = replace(m.request, label=m.label, phase=phase, object_at=at)
         m.used = m.used | {m.candidate.id} if m.candidate else m.used
         m.attempt += 1
         m.detect_rounds = m.plans_failed = 0

@@ -20,6 +20,9 @@ from openarm_common.errors import Code, OpenArmError
 
 Array = NDArray[np.float64]
 
+#: An object that is meant by its position stands no farther from it than this, m.
+SAME_PLACE = 0.05
+
 
 @dataclass(frozen=True)
 class Detection:
@@ -27,7 +30,8 @@ class Detection:
 
     Attributes:
         label: Class, for example "red".
-        score: Confidence, 0 to 1.
+        score: Confidence, 0 to 1; 0: in view, but not measured. Such a box is around what is seen: in the way, but no
+            target.
         T_base_object: (4, 4) pose of the box centre, yaw only.
         size: (3,) full edges, m.
     """
@@ -56,6 +60,11 @@ class Detection:
     def yaw(self) -> float:
         """Angle of the object's x axis about the base z, rad."""
         return float(np.arctan2(self.T_base_object[1, 0], self.T_base_object[0, 0]))
+
+    @property
+    def measured(self) -> bool:
+        """Whether the box is the object's, and not only around what is seen of it."""
+        return self.score > 0.0
 
 
 @dataclass(frozen=True)
@@ -103,31 +112,40 @@ def labels_in_view(frames: Sequence[Frame]) -> list[str]:
     return sorted({d.label for frame in frames for d in frame.detections})
 
 
-def find(frames: Sequence[Frame], label: str, *, match_radius: float, agree_within: float) -> Sighting:
+def find(
+    frames: Sequence[Frame],
+    label: str,
+    *,
+    match_radius: float,
+    agree_within: float,
+    at: Sequence[float] | None = None,
+    leave: Sequence[Sequence[float]] = (),
+) -> Sighting:
     """Follow one object through all frames and average it.
 
     Args:
         frames: At least one, oldest first.
-        label: What to look for; "" takes the detection with the highest score.
+        label: What to look for; "" takes any.
         match_radius: Detections nearer than this are one object, m.
         agree_within: Largest distance between the positions of one object in consecutive frames, m.
+        at: (x, y) where it stands, m; None takes the detection with the highest score.
+        leave: (x, y) of objects that are not meant, m.
 
     Raises:
-        OpenArmError: NOTHING_DETECTED, when no frame holds anything; UNKNOWN_OBJECT, naming what is in view;
-            STALE_DATA, when the object was not in the newest frame and two thirds of all, or moved between them.
+        OpenArmError: NOTHING_DETECTED, when no frame holds anything, or what is meant cannot be measured;
+            UNKNOWN_OBJECT, naming what is in view; STALE_DATA, when the object was not in the newest frame and two
+            thirds of all, or moved between them.
     """
     seen = labels_in_view(frames)
-    wanted = [d for d in frames[-1].detections if not label or d.label == label]
     if not seen:
         raise OpenArmError(Code.NOTHING_DETECTED, f"nothing is in view (asked for {label or 'any object'!r})")
     if label and label not in seen:
         raise OpenArmError(Code.UNKNOWN_OBJECT, f"no {label!r} in view; in view: {', '.join(seen)}")
-    if not wanted:
-        raise OpenArmError(Code.STALE_DATA, f"{label or 'the object'!r} was in view, but not in the newest frame")
-    anchor = max(wanted, key=lambda d: d.score)
+    anchor = _anchor(frames[-1], label, at, leave)
     track: list[Detection] = []
     for frame in frames:
-        near = [d for d in frame.detections if d.label == anchor.label and _distance(d, anchor) <= match_radius]
+        fit = [d for d in frame.detections if d.label == anchor.label and d.measured]
+        near = [d for d in fit if _distance(d, anchor) <= match_radius]
         track += [min(near, key=lambda d: _distance(d, anchor))] if near else []
     # A detector may miss a thing in one frame; in most of them it must be in its place.
     if 3 * len(track) < 2 * len(frames):
@@ -146,6 +164,48 @@ def find(frames: Sequence[Frame], label: str, *, match_radius: float, agree_with
     target = average(track)
     spread = max(_distance(d, target) for d in track)
     return Sighting(target, _others(frames, target, match_radius), frames[-1].t_ns, spread)
+
+
+def _anchor(frame: Frame, label: str, at: Sequence[float] | None, leave: Sequence[Sequence[float]]) -> Detection:
+    """The detection that is meant."""
+    name = label or "the object"
+    fitting = [d for d in frame.detections if not label or d.label == label]
+    if not fitting:
+        raise OpenArmError(Code.STALE_DATA, f"{name!r} was in view, but not in the newest frame")
+    meant = [d for d in fitting if all(_from(d, p) > SAME_PLACE for p in leave)]
+    if not meant:
+        raise OpenArmError(
+            Code.UNKNOWN_OBJECT, f"no {name!r} in view besides {len(fitting)} that shall stay where they are"
+        )
+    if at is not None:
+        near = [d for d in meant if _from(d, at) <= SAME_PLACE]
+        if not near:
+            there = ", ".join(_text(d.p_base) for d in meant)
+            limit = f"within {SAME_PLACE * 1e3:.0f} mm of ({at[0]:.3f}, {at[1]:.3f}) m"
+            raise OpenArmError(Code.UNKNOWN_OBJECT, f"no {name!r} {limit}; it is seen at {there}")
+        meant = [min(near, key=lambda d: _from(d, at))]
+    measured = [d for d in meant if d.measured]
+    if not measured:
+        where = _text(meant[0].p_base)
+        raise OpenArmError(
+            Code.NOTHING_DETECTED,
+            f"{name!r} is in view at about {where}, but cannot be measured: something hides its outline, or the border"
+            " of the image cuts it",
+        )
+    return max(measured, key=lambda d: d.score)
+
+
+def sticks_out(seen: Detection, stood: Detection) -> float:
+    """How far what is seen reaches out of the footprint of an object as it stood, m; 0 when it lies within.
+
+    The middles of its edges are looked at: the corners of a box around something round are no part of it.
+    """
+    half = seen.size[:2] / 2.0
+    middles = np.array([[half[0], 0.0], [-half[0], 0.0], [0.0, half[1]], [0.0, -half[1]]])
+    points = middles @ seen.T_base_object[:2, :2].T + seen.p_base[:2]
+    local = (points - stood.p_base[:2]) @ stood.T_base_object[:2, :2]
+    beyond = np.maximum(np.abs(local) - stood.size[:2] / 2.0, 0.0)
+    return float(np.linalg.norm(beyond, axis=1).max())
 
 
 def average(track: Sequence[Detection]) -> Detection:
@@ -193,7 +253,9 @@ def _others(frames: Sequence[Frame], target: Detection, match_radius: float) -> 
     found: list[Detection] = []
     for frame in reversed(frames):
         for d in frame.detections:
-            if all(_distance_xy(d, known) > match_radius for known in (target, *found)):
+            # The middle of what is seen of an object may lie near another one.
+            rivals = (k for k in (target, *found) if k.label == d.label or (k.measured and d.measured))
+            if all(_distance_xy(d, known) > match_radius for known in rivals):
                 found.append(d)
     return tuple(found)
 
@@ -204,6 +266,10 @@ def _distance(a: Detection, b: Detection) -> float:
 
 def _distance_xy(a: Detection, b: Detection) -> float:
     return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
+
+
+def _from(d: Detection, p: Sequence[float]) -> float:
+    return float(np.hypot(d.p_base[0] - p[0], d.p_base[1] - p[1]))
 
 
 def _text(p: Array) -> str:

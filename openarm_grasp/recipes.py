@@ -85,7 +85,9 @@ def move_to_pregrasp(m: Memory, around: Surroundings) -> Effects:
 
 
 def move_to_grasp(m: Memory, around: Surroundings) -> Effects:
-    """The straight last part, then see where the hand came to."""
+    """See that the object still stands there; then the straight last part, and where the hand came to."""
+    if not m.hand.looked:
+        return (Observe(1),)
     c = m.need_candidate()
     go = Execute(m.arm, m.need_grasp_plan().approach, "move to the grasp")
     return (go, Measure(m.arm, c.width, c.T_base_tcp))

@@ -9,7 +9,7 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import Code
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.evidence import Evidence, Grip, Sight, judge_grip, judge_lift, judge_place, judge_sight
+from openarm_grasp.evidence import Evidence, Grip, Sight, judge_grip, judge_lift, judge_place, judge_sight, judge_still
 from openarm_grasp.observation import Detection, Frame
 
 HELD = HeldConfig()
@@ -72,6 +72,7 @@ def test_what_was_held_and_is_not_is_lost(gap, effort):
         ([Frame(1, (seen(top=0.47),))], Sight.STILL_THERE),
         ([Frame(1, (seen(x=0.27),))], Sight.STILL_THERE),
         ([Frame(1, (seen(x=0.36),))], Sight.GONE),
+        ([Frame(1, (seen(x=0.28, top=0.56),))], Sight.ASKEW),
         ([Frame(1, ()), Frame(2, (seen(),))], Sight.STILL_THERE),
     ],
 )
@@ -113,3 +114,33 @@ def test_a71_without_an_object_nothing_is_held():
 def test_p09_a_place_counts_when_the_camera_sees_it_within_2_cm(frames, code):
     verdict = judge_place("red", np.array([0.26, -0.2, 0.4]), frames, 0.02)
     assert verdict.code is code
+
+
+def test_p08_a_twin_elsewhere_is_not_taken_for_the_lifted_object() -> None:
+    """A taller object of the same label stands beside: it proves nothing, and the one that is gone is gone."""
+    twin = seen(x=0.40, top=0.50, height=0.10)
+    assert judge_sight(seen(), [Frame(1, (twin,))], HELD, match_radius=0.03)[0] is Sight.ASKEW
+    assert judge_sight(seen(), [Frame(1, (twin,))], HELD, match_radius=0.03, others=(twin,))[0] is Sight.GONE
+
+
+@pytest.mark.parametrize(
+    ("found", "still"),
+    [
+        ((), True),  # the hand hides it
+        ((seen(x=0.27),), True),
+        ((seen(x=0.28),), False),
+        ((seen(x=0.40),), True),  # another one
+        ((seen("blue", x=0.28),), True),
+    ],
+)
+def test_n03_an_object_that_has_moved_is_noticed_before_the_hand_goes_down(found, still) -> None:
+    assert judge_still(seen(), [Frame(1, found)], HELD)[0] is still
+
+
+@pytest.mark.parametrize(
+    ("height", "code"), [(0.05, Code.OK), (0.054, Code.OK), (0.06, Code.PLACE_FAILED), (0.04, Code.PLACE_FAILED)]
+)
+def test_p09_what_has_fallen_over_is_not_placed_and_no_other_try_would_help(height, code) -> None:
+    verdict = judge_place("red", np.array([0.26, -0.2, 0.4]), [Frame(1, (seen(),))], 0.02, height=height)
+    assert verdict.code is code
+    assert verdict.final == (code is not Code.OK)

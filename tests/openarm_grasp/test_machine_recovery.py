@@ -53,6 +53,30 @@ def test_a_hand_that_stops_short_has_met_the_object(world):
     assert not world.times(world.grips(opening=False))
 
 
+def test_n03_a70_an_object_that_moves_before_the_hand_goes_down_is_not_touched(world, box):
+    moved = []
+
+    def nudge(effect):
+        if world.machine.state is State.MOVE_TO_GRASP and not moved:
+            moved.append(world.objects.update(red=box("red", 0.30, -0.2)))
+
+    world.faults.append(nudge)
+    outcome = world.grasp()
+    assert outcome.success, outcome.message
+    assert outcome.attempts == 2
+    assert len(world.times(world.executes("approach"))) == 1  # the first hand did not go down
+    assert world.done(fx.PlanGrasp)[1].candidates[0].T_base_tcp[0, 3] == pytest.approx(0.30)
+
+
+def test_p09_an_object_that_has_fallen_over_is_told(world, box):
+    """It stands at its target, lower than it was: nothing that the hand could try again would right it."""
+    world.objects["red"] = box("red", 0.26, -0.2, size=0.06)
+    outcome = world.grasp()  # the scripted hand puts down cubes of 50 mm
+    assert outcome.code is Code.PLACE_FAILED
+    assert "has fallen over: it is 50 mm high there and was 60 mm" in outcome.message
+    assert outcome.attempts == 1
+
+
 def test_p08_held_but_still_seen_in_its_place_is_put_back(world):
     """The hand has something, but the camera says it is not the object: no success, and nothing is dropped."""
     real = world.carry_out

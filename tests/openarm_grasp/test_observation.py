@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.observation import Detection, Frame, average, find, in_base, on_table
+from openarm_grasp.observation import Detection, Frame, average, find, in_base, on_table, sticks_out
 
 
 def seen(label="red", x=0.26, y=-0.2, z=0.425, yaw=0.0, size=(0.04, 0.06, 0.05), score=0.9) -> Detection:
@@ -21,8 +21,8 @@ def frames(*detections: tuple[Detection, ...]) -> list[Frame]:
     return [Frame(i * 100_000_000, d) for i, d in enumerate(detections)]
 
 
-def look(seq, label="red"):
-    return find(seq, label, match_radius=0.03, agree_within=0.003)
+def look(seq, label="red", **kwargs):
+    return find(seq, label, match_radius=0.03, agree_within=0.003, **kwargs)
 
 
 def test_agreeing_frames_are_averaged_and_others_kept():
@@ -107,3 +107,39 @@ def test_frames_move_to_the_base_frame_at_their_stamps():
     moved = in_base(frames((seen(z=0.025),), (seen(z=0.025),)), lookup)
     assert asked == [0, 100_000_000]
     assert moved[1].detections[0].p_base[2] == pytest.approx(0.425)
+
+
+def test_of_several_alike_the_one_at_a_position_is_meant() -> None:
+    both = (seen(x=0.2, score=0.9), seen(x=0.3, score=0.8))
+    assert look(frames(both), at=(0.31, -0.2)).target.p_base[0] == pytest.approx(0.3)
+    assert look(frames(both)).target.p_base[0] == pytest.approx(0.2)
+    with pytest.raises(OpenArmError, match=r"within 50 mm of \(0.400, -0.200\) m; it is seen at") as error:
+        look(frames(both), at=(0.4, -0.2))
+    assert error.value.code is Code.UNKNOWN_OBJECT
+
+
+def test_p03_what_shall_stay_is_not_picked_again() -> None:
+    both = (seen(x=0.2), seen(x=0.3, score=0.8))
+    assert look(frames(both), leave=((0.21, -0.2),)).target.p_base[0] == pytest.approx(0.3)
+    with pytest.raises(OpenArmError, match="besides 2 that shall stay") as error:
+        look(frames(both), leave=((0.21, -0.2), (0.3, -0.2)))
+    assert error.value.code is Code.UNKNOWN_OBJECT
+
+
+def test_what_is_not_measured_is_in_the_way_but_no_target() -> None:
+    hidden = seen("blue", x=0.28, score=0.0)
+    assert [d.label for d in look(frames((seen(), hidden))).others] == ["blue"]
+    with pytest.raises(OpenArmError, match="cannot be measured") as error:
+        look(frames((seen(), hidden)), "blue")
+    assert error.value.code is Code.NOTHING_DETECTED
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.6])
+def test_how_far_something_reaches_out_of_its_place(yaw) -> None:
+    stood = seen(yaw=yaw)
+    shift = se3.make(p=(*(se3.rot_z(yaw)[:2, 0] * 0.02), 0.0))
+    moved = Detection("red", 0.9, shift @ stood.T_base_object, stood.size)
+    assert sticks_out(stood, stood) == 0.0
+    assert sticks_out(moved, stood) == pytest.approx(0.02)
+    # the corners of a box around something round are no part of it
+    assert sticks_out(seen(size=(0.04, 0.04, 0.05), yaw=0.8), seen(size=(0.04, 0.04, 0.05))) == 0.0
