@@ -73,13 +73,19 @@ def with_mounts(
 def calibrated(camera: CameraConfig, mount_seed: int) -> Result:
     """Calibrate a camera at true mounts of a seed."""
     with tempfile.TemporaryDirectory() as name:
-        bench = _Bench(camera, mount_seed, Path(name))
+        bench = Bench(camera, mount_seed, Path(name))
         bench.fill(np.random.default_rng(mount_seed))
         return calibrate(bench.samples)
 
 
-class _Bench:
-    """One camera of the simulated robot with a board in front of it, without dynamics."""
+class Bench:
+    """One camera of the simulated robot with a board in front of it, without dynamics.
+
+    Args:
+        camera: Which.
+        seed: Of the true mounts.
+        folder: For the board's files.
+    """
 
     def __init__(self, camera: CameraConfig, seed: int, folder: Path) -> None:
         self._camera, self._board, self._description = camera, CircleGrid(), RobotDescription.load()
@@ -111,8 +117,8 @@ class _Bench:
         self.samples = SampleSet(head, self._description)
         self._optics = np.array(numbers[2:])
 
-    def fill(self, rng: np.random.Generator) -> None:
-        """Take samples.
+    def fill(self, rng: np.random.Generator, count: int = _SAMPLES) -> None:
+        """Take `count` samples.
 
         Raises:
             OpenArmError: From the detector, when the board is hardly ever seen.
@@ -120,7 +126,7 @@ class _Bench:
         lower, upper = self._description.limits(self.samples.joint_names)
         middle = self._middle()
         missed = 0
-        while len(self.samples) < _SAMPLES:
+        while len(self.samples) < count:
             joints = self._joints(np.clip(middle + rng.uniform(-_SPREAD, _SPREAD, len(middle)), lower, upper))
             if not self._seen(joints) or not self._free(joints):
                 continue
