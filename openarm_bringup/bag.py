@@ -64,6 +64,18 @@ def _constants(message: type[Any]) -> list[str]:
     return [f"{kinds[type(value)]} {name}={value!r}" for name, value in values.items() if type(value) in kinds]
 
 
+def nested_types(message: type[Any]) -> list[str]:
+    """Names, such as `std_msgs/msg/Header`, of the types of a message's fields that are messages themselves."""
+    found: list[str] = []
+    for kind in message.get_fields_and_field_types().values():
+        match = _ARRAY.match(kind)
+        base = (match["seq"] or match["arr"]) if match else kind
+        if "/" in base:
+            package, _, short = base.partition("/")
+            found.append(f"{package}/msg/{short.removeprefix('msg/')}")
+    return found
+
+
 class Types:
     """Definitions of the messages that are met, by name such as `sensor_msgs/msg/Image`."""
 
@@ -79,12 +91,8 @@ class Types:
         if name in self.store.types:
             return
         message = message_class(name)
-        for kind in message.get_fields_and_field_types().values():
-            match = _ARRAY.match(kind)
-            base = (match["seq"] or match["arr"]) if match else kind
-            if "/" in base:
-                package, _, short = base.partition("/")
-                self.add(f"{package}/msg/{short.removeprefix('msg/')}")
+        for inner in nested_types(message):
+            self.add(inner)
         self.store.register(get_types_from_msg(definition(message), name))
 
 

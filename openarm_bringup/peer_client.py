@@ -16,14 +16,14 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from tf2_msgs.msg import TFMessage
 
 from openarm_bringup.message_client import to_data, unknown
 from openarm_common.convert import transform_to_matrix
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import QOS_STATIC_TF, QOS_TF
+from openarm_common.node import QOS_STATIC_TF, QOS_TF, offered_qos
 
 #: Others are known after this long without news, s; while nobody is, they may still come.
 _QUIET_S = 0.6
@@ -105,14 +105,7 @@ class Peer:
 
     def offered(self, topic: str) -> QoSProfile:
         """The quality of service with which everything of a topic is heard."""
-        profiles = [info.qos_profile for info in self.node.get_publishers_info_by_topic(topic)]
-        reliable = bool(profiles) and all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
-        latched = bool(profiles) and all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
-        return QoSProfile(
-            depth=100,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        )
+        return offered_qos(self.node, topic, 100)
 
     def action_client(self, kind: Any, name: str) -> Any:
         """A client of an action whose server answers.

@@ -12,6 +12,7 @@ from cyclopts import Parameter
 
 from openarm_bringup.graph import Discovery, Graph, load_graph
 from openarm_bringup.outcome import Outcome, failure
+from openarm_bringup.viz import app_link, with_viz
 from openarm_common.errors import Code, OpenArmError
 
 STYLES = {"ready": "green", "failed": "bold red", "backoff": "yellow", "exited": "yellow", "stopped": "dim"}
@@ -26,6 +27,8 @@ def up(
     mount_seed: str | None = None,
     domain: int | None = None,
     discovery: Discovery | None = None,
+    viz: Annotated[bool, Parameter(negative=())] = False,
+    viz_port: int = 8765,
 ) -> Outcome:
     """Start the nodes of a graph, and stop them at Ctrl-C (a second Ctrl-C hurries).
 
@@ -37,6 +40,8 @@ def up(
         mount_seed: Seed of the true camera mounts, or "none" for the nominal ones.
         domain: ROS_DOMAIN_ID; the environment's, or 0, when not given.
         discovery: Whom the nodes meet; localhost when the graph says nothing else.
+        viz: Show every topic and service to Foxglove, at an address that is printed.
+        viz_port: TCP port for that.
     """
     overrides = {"scene": scene, "seed": seed, "mount_seed": mount_seed, "domain": domain, "discovery": discovery}
     loaded = load_graph(graph, overrides=overrides, sets=set_)
@@ -44,10 +49,13 @@ def up(
     from openarm_common.scene import load_scene
 
     load_scene(loaded.scene, loaded.seed)  # a scene that does not fit is refused before anything starts
-    return asyncio.run(_up(loaded, new_run_dir()))
+    address = ""
+    if viz:
+        loaded, address = with_viz(loaded, viz_port)
+    return asyncio.run(_up(loaded, new_run_dir(), address))
 
 
-async def _up(graph: Graph, run_dir: Path) -> Outcome:
+async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
     from rich.console import Console
 
     from openarm_bringup.environment import domain_id
@@ -73,6 +81,9 @@ async def _up(graph: Graph, run_dir: Path) -> Outcome:
                 f"[bold green]{graph.name} is ready[/bold green] after {data['ready_s']:.1f} s: "
                 f"domain {data['domain']}, logs in {run_dir / 'logs'}; Ctrl-C stops it"
             )
+            if viz_address:
+                text = f"Foxglove: open the connection {viz_address}\n  or {app_link(viz_address)}"
+                console.print(text, markup=False, soft_wrap=True)
             await supervisor.wait_stop_asked()
             data["states"] = supervisor.states()
     except OpenArmError as error:

@@ -15,17 +15,18 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
-from rcl_interfaces.msg import ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from openarm_common.config import Config, validate
+from openarm_common.config import AT_RUN_TIME, Config, validate
 from openarm_common.description import RobotDescription
 from openarm_common.errors import OpenArmError
 from openarm_common.lockstep_node import LockstepNode
@@ -67,12 +68,27 @@ QOS_LATCHED = _profile(1, latched=True)
 QOS_STATIC_TF = _profile(100, latched=True)
 
 
+def offered_qos(node: Node, topic: str, depth: int) -> QoSProfile:
+    """The quality of service with which everything that is published on a topic now is heard.
+
+    Args:
+        node: Who asks.
+        topic: Absolute name; without a publisher, best effort and volatile.
+        depth: Messages that may wait.
+    """
+    profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
+    dependable = bool(profiles) and all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    latched = bool(profiles) and all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    return _profile(depth, reliable=dependable, latched=latched)
+
+
 class BaseNode(LockstepNode, Generic[ConfigT]):
     """A node with validated parameters, /diagnostics and a worker pool; it can take part in a lock-step.
 
     Args:
         name: Node name.
-        model: Configuration model; every field becomes a read-only ROS parameter (nested models joined by dots).
+        model: Configuration model; every field becomes a ROS parameter (nested models joined by dots), read-only but
+            for those that are marked `AT_RUN_TIME`.
         kwargs: Passed to `rclpy.node.Node`.
 
     Raises:
@@ -109,6 +125,31 @@ class BaseNode(LockstepNode, Generic[ConfigT]):
         status.level = DiagnosticStatus.OK if ok else DiagnosticStatus.ERROR
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         self.__status = status
+
+    def accept_changes(self, take: Callable[[ConfigT], None]) -> None:
+        """Let the parameters that are marked `AT_RUN_TIME` change: `take` gets the new configuration before it holds.
+
+        What the model or `take` refuse with an OpenArmError stays as it was; who asked is told why.
+        """
+
+        def change(parameters: list[Parameter[Any]]) -> SetParametersResult:
+            data = self.config.model_dump()
+            for parameter in parameters:
+                *groups, key = parameter.name.split(".")
+                place = data
+                for group in groups:
+                    place = place.get(group, {})
+                if key in place:  # else it is none of the model's, such as use_sim_time
+                    place[key] = parameter.value
+            try:
+                config = validate(type(self.config), data, f"parameters of {self.get_fully_qualified_name()}")
+                take(config)
+            except OpenArmError as error:
+                return SetParametersResult(successful=False, reason=error.message)
+            self.config = config
+            return SetParametersResult(successful=True)
+
+        self.add_on_set_parameters_callback(change)
 
     def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Any:
         """Run `fn` in a worker thread; await the returned rclpy future (which carries no type) in a coroutine callback.
@@ -165,7 +206,9 @@ def _declare(node: Node, model: type[BaseModel], prefix: str) -> dict[str, Any]:
             data[key] = _declare(node, field.annotation, name + ".")
             continue
         descriptor = ParameterDescriptor(
-            description=field.description or "", additional_constraints=_constraints(field), read_only=True
+            description=field.description or "",
+            additional_constraints=_constraints(field),
+            read_only=field.json_schema_extra != AT_RUN_TIME,
         )
         # Types are checked by the model, which says more (and takes 1 for 1.0) than rcl does.
         descriptor.dynamic_typing = True

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The graph as Foxglove sees it: channels, raw messages, services; and who may connect."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+import threading
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import aiohttp
+import pytest
+
+pytest.importorskip("foxglove", reason="needs foxglove-sdk: .venv/bin/uv pip install foxglove-sdk")
+
+PROTOCOL = "foxglove.sdk.v1"
+
+
+class Foxglove:
+    """A node with a websocket client of it, which runs in a thread while the node is spun."""
+
+    def __init__(self, ros) -> None:
+        from rclpy.parameter import Parameter
+
+        from openarm_bringup.foxglove_node import FoxgloveNode
+
+        self.ros = ros
+        self.node = ros.add(FoxgloveNode(parameter_overrides=[Parameter("port", value=0)]))
+
+    def address(self, token: str | None = None) -> str:
+        return f"ws://127.0.0.1:{self.node.port}/?token={self.node.token if token is None else token}"
+
+    def run(self, work: Callable[[aiohttp.ClientSession], Awaitable[Any]], seconds: float = 20.0) -> Any:
+        outcome: list[Any] = []
+
+        async def main() -> None:
+            async with aiohttp.ClientSession() as session, asyncio.timeout(seconds):
+                outcome.append(await work(session))
+
+        def guarded() -> None:
+            try:
+                asyncio.run(main())
+            except Exception as error:
+                outcome.append(error)
+
+        thread = threading.Thread(target=guarded)
+        thread.start()
+        self.ros.spin_until(lambda: not thread.is_alive(), seconds + 5.0, "the client to end")
+        if isinstance(outcome[0], Exception):
+            raise outcome[0]
+        return outcome[0]
+
+
+@pytest.fixture
+def foxglove(ros) -> Foxglove:
+    return Foxglove(ros)
+
+
+async def advertised(socket: aiohttp.ClientWebSocketResponse, op: str, key: str, name: str) -> dict[str, Any]:
+    """Wait until a topic or a service is advertised."""
+    async for message in socket:
+        if message.type is aiohttp.WSMsgType.TEXT:
+            data = json.loads(message.data)
+            for one in data.get(key, []) if data["op"] == op else []:
+                if name in (one.get("topic"), one.get("name")):
+                    return one
+    raise AssertionError(f"{name} was not advertised")
+
+
+async def message_of(socket: aiohttp.ClientWebSocketResponse, subscription: int) -> bytes:
+    """Payload of the next message of a subscription: opcode 1, its id, a stamp, the message."""
+    async for message in socket:
+        if message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 1:
+            _, number, _ = struct.unpack_from("<BIQ", message.data)
+            if number == subscription:
+                return message.data[13:]
+    raise AssertionError("the connection ended before a message came")
+
+
+def test_a_topic_is_advertised_with_its_definition_and_its_messages_come_byte_for_byte(ros, foxglove: Foxglove) -> None:
+    """Twice, for the second client of a latched topic gets the message too."""
+    from geometry_msgs.msg import PointStamped
+    from rclpy.serialization import serialize_message
+
+    from openarm_common.node import QOS_LATCHED
+
+    message = PointStamped()
+    message.header.frame_id = "table_frame"  # of a length that needs no padding, whose bytes are anything
+    message.point.x = 0.25
+    publisher = ros.node.create_publisher(PointStamped, "/somewhere", QOS_LATCHED)
+    publisher.publish(message)
+
+    async def look(session: aiohttp.ClientSession) -> None:
+        sockets = []
+        for _ in range(2):
+            socket = await session.ws_connect(foxglove.address(), protocols=[PROTOCOL], max_msg_size=0)
+            sockets.append(socket)
+            channel = await advertised(socket, "advertise", "channels", "/somewhere")
+            assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg")
+            assert channel["schemaName"] == "geometry_msgs/msg/PointStamped"
+            for part in ("std_msgs/Header header\n", "MSG: builtin_interfaces/Time\n", "float64 z\n"):
+                assert part in channel["schema"]
+            wish = {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel["id"]}]}
+            await socket.send_json(wish)
+            assert await message_of(socket, 7) == serialize_message(message)
+        for socket in sockets:
+            await socket.close()
+
+    assert publisher.get_subscription_count() == 0  # lazily: nobody has asked yet
+    foxglove.run(look)
+    ros.spin_until(lambda: publisher.get_subscription_count() == 0, 10.0, "the subscription ends with the clients")
+
+
+def test_a_service_is_called_from_foxglove(ros, foxglove: Foxglove) -> None:
+    from openarm_interfaces.srv import Grasp
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    def grasp(request: Grasp.Request, response: Grasp.Response) -> Grasp.Response:
+        response.message = f"asked for {request.label}"
+        return response
+
+    ros.node.create_service(Grasp, "/grasp", grasp)
+
+    async def call(session: aiohttp.ClientSession) -> bytes:
+        async with session.ws_connect(foxglove.address(), protocols=[PROTOCOL], max_msg_size=0) as socket:
+            service = await advertised(socket, "advertiseServices", "services", "/grasp")
+            assert service["type"] == "openarm_interfaces/srv/Grasp"
+            assert "bool dry_run" in service["request"]["schema"]
+            head = struct.pack("<BIII", 2, service["id"], 1, 3) + b"cdr"
+            await socket.send_bytes(head + serialize_message(Grasp.Request(label="red")))
+            async for message in socket:
+                if message.type is aiohttp.WSMsgType.BINARY and message.data[0] == 3:
+                    return message.data[13 + 3 :]
+                assert "serviceCallFailure" not in str(message.data), message.data
+        raise AssertionError("no answer")
+
+    answer = deserialize_message(foxglove.run(call), Grasp.Response)
+    assert answer.message == "asked for red"
+
+
+@pytest.mark.parametrize(
+    ("token", "headers", "why"),
+    [
+        ("", {}, "no token"),
+        ("x" * 32, {}, "wrong token"),
+        (None, {"Origin": "https://evil.example"}, "may not ask"),
+        (None, {"Host": "evil.example:8765"}, "was called 'evil.example'"),
+    ],
+)
+def test_who_may_not_is_refused(foxglove: Foxglove, token: str | None, headers: dict[str, str], why: str) -> None:
+    async def knock(session: aiohttp.ClientSession) -> tuple[int, str]:
+        url = foxglove.address(token).replace("ws:", "http:")
+        async with session.get(url, headers=headers) as response:
+            return response.status, (await response.json())["message"]
+
+    status, message = foxglove.run(knock)
+    assert status == 403
+    assert why in message
+
+
+def test_foxglove_s_own_page_may_connect_with_the_token(foxglove: Foxglove) -> None:
+    async def knock(session: aiohttp.ClientSession) -> Any:
+        headers = {"Origin": "https://app.foxglove.dev"}
+        async with session.ws_connect(foxglove.address(), protocols=[PROTOCOL], headers=headers) as socket:
+            assert socket.protocol == PROTOCOL
+            return await socket.receive_json()
+
+    info = foxglove.run(knock)
+    assert info["op"] == "serverInfo"
+    assert "services" in info["capabilities"]
