@@ -6,6 +6,7 @@ Positions are in the base frame, m; the same set and seed always give the same t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import Scene, random_scene
+from openarm_common.scene import PALETTE, SPACING, Scene, random_scene
 
 #: A fault of the campaign's own: as many plans as the parameter `times` says find no way.
 PLAN_FAILS = "plan_fails"
@@ -52,6 +53,7 @@ class Task:
         mount_seed: Of the true camera mounts; None: nominal.
         place: (x, y) of the footprint centre that is asked for, base frame, m; None: chosen by the suite.
         posture: Joints that start elsewhere than at home, rad by name.
+        clear: Labels that come more than once are so many objects: what was placed stays where it is.
         route: By which it must come to its place, as `GraspOutcome.route`; "": any.
     """
 
@@ -66,6 +68,7 @@ class Task:
     mount_seed: int | None = None
     place: tuple[float, float] | None = None
     posture: Mapping[str, float] = field(default_factory=dict[str, float])
+    clear: bool = False
     route: str = ""
 
     @property
@@ -83,10 +86,23 @@ def nominal(seed: int) -> Task:
 
 
 def clutter(seed: int) -> Task:
-    """Five or six objects, all asked for, nearest to the middle first."""
+    """Five to eight objects, all asked for; where there are more than colours, two of a colour are two tasks."""
     rng = np.random.default_rng([seed, 2])
-    scene = random_scene(seed, count=int(rng.integers(5, 7)))
-    return Task("clutter", seed, scene, tuple(item.label for item in scene.objects), kind="clutter")
+    scene = crowded_scene(seed, int(rng.integers(5, 9)))
+    return Task("clutter", seed, scene, tuple(item.label for item in scene.objects), kind="clutter", clear=True)
+
+
+def crowded_scene(seed: int, count: int) -> Scene:
+    """Objects of a random scene, more than there are colours: those beyond get the colours anew."""
+    whole = random_scene(seed, count=min(count, len(PALETTE)))
+    objects, k = list(whole.objects), 0
+    while len(objects) < count:
+        k += 1
+        for twin in random_scene(seed + k * 1_000_000, count=len(PALETTE)).objects:
+            far = all(math.dist(twin.position[:2], item.position[:2]) >= SPACING for item in objects)
+            if len(objects) < count and far:
+                objects.append(twin.model_copy(update={"name": f"{twin.name}_{k + 1}"}))
+    return whole.model_copy(update={"objects": tuple(objects), "name": f"crowded_{seed}"})
 
 
 def sets() -> Mapping[str, Callable[[int], Task]]:

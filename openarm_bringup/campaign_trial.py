@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ from openarm_grasp.effects import GraspOutcome, GraspRequest
 from openarm_grasp.legs import run_task
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
-from openarm_grasp.orders import Order
+from openarm_grasp.orders import Ask, Order
 from openarm_grasp.performer import Performer
 from openarm_grasp.routing import ARMS
 from openarm_sim_bridge.faults import checked_fault
@@ -86,6 +87,7 @@ class Trials:
         self._rules = JudgeConfig()
         self._keep = campaign_record.Keeper(self.robot, folder) if folder is not None else None
         self._faulty = False
+        self._stands: tuple[float, ...] = ()
 
     def run(self) -> dict[str, Any]:
         """Carry out the task and return its row."""
@@ -101,30 +103,38 @@ class Trials:
         return row
 
     def _all_in_turn(self) -> list[Trial]:
-        """Grasp what is asked for; what others block is asked for again when they have been placed."""
-        labels = self._task.labels
-        if len(set(labels)) < len(labels):  # the same object more than once
-            return [self._grasp(label) for label in labels]
-        order, last = Order(labels), dict[str, Trial]()
+        """Grasp what is asked for; what others hide or block is asked for again when they have been placed."""
+        labels, clear = self._task.labels, self._task.clear
+        if not clear and len(set(labels)) < len(labels):  # the same object more than once
+            return [self._grasp(Ask(label)) for label in labels]
+        order, placed, open_ = Order(labels, each=Counter(labels)), list[Trial](), dict[str, Trial]()
         while ask := order.next():
-            last[ask.label] = self._grasp(ask.label)
-            order.done(ask, Code(last[ask.label].code), last[ask.label].message)
-        return list(last.values())
+            trial = self._grasp(ask)
+            order.done(ask, Code(trial.code), trial.message, self._stands)
+            if trial.claimed:
+                placed.append(trial)
+                continue
+            open_[ask.label] = trial
+            if trial.attempts and not clear:  # three attempts are what a scene may take
+                order.failed[ask.label] = trial.message
+        missing = Counter(labels) - Counter(trial.label for trial in placed)
+        return [*placed, *(open_[label] for label in missing.elements())]
 
-    def _grasp(self, label: str) -> Trial:
+    def _grasp(self, ask: Ask) -> Trial:
         robot, task = self.robot, self._task
         began, first = time.monotonic(), len(self.steps)
         for track in robot.tracks.values():
             track.clear()
         robot.pass_time(0.1)
-        request = GraspRequest(label, task.arm, task.place)
+        request = GraspRequest(ask.label, task.arm, task.place, leave=ask.leave)
         result: GraspOutcome | OpenArmError
         try:
             result = self.link.run(run_task(self.machine, self.performer, self.link, request, self._tell))
         except OpenArmError as error:
             result = error
         wall_s = time.monotonic() - began
-        outcome = result if isinstance(result, GraspOutcome) else GraspOutcome(result.code, result.message, label)
+        outcome = result if isinstance(result, GraspOutcome) else GraspOutcome(result.code, result.message, ask.label)
+        self._stands = outcome.place_position
         target, verdict = self._judge(outcome)
         steps = self.steps[first:]
         ends = [*(step.t_ns for step in steps[1:]), robot.t_ns]
@@ -133,7 +143,7 @@ class Trials:
             scene=task.scene.name,
             scene_hash=scene_hash(task.scene),
             target=target,
-            label=label,
+            label=ask.label,
             arm=outcome.arm,
             attempts=outcome.attempts,
             claimed=outcome.success,

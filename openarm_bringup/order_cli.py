@@ -42,11 +42,11 @@ def order(
     with GraspClient() as client:
         while ask := work.next():
             try:
-                result = client.pick(ask.label, place=ask.place, timeout=timeout)
+                result = client.pick(ask.label, place=ask.place, leave=ask.leave, timeout=timeout)
             except KeyboardInterrupt:
                 data = {"placed": work.placed, "results": results}
                 return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED, data)
-            work.done(ask, result.code, result.message)
+            work.done(ask, result.code, result.message, result.place_position)
             results.append({"label": ask.label, "place": ask.place, "code": result.code, "message": result.message})
             console.print(f"{ask.label}: {result.code}: {result.message}", markup=False)
             if result.code in (Code.CANCELLED, Code.ROBOT_LOST, Code.NOT_READY):

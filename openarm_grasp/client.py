@@ -22,7 +22,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from openarm_common.convert import xyz
+from openarm_common.convert import point, xyz
 from openarm_common.errors import Code, OpenArmError
 
 OnFeedback = Callable[[GraspStatus], None]
@@ -46,6 +46,8 @@ class GraspResult:
         attempts: Physical attempts.
         place_position: (x, y, z) of the target on the table, base frame, m.
         duration: s of robot time.
+        route: "direct"; "hand_over": by way of the middle, with both arms; "push": pushed into reach; "" when it was
+            not placed.
     """
 
     success: bool
@@ -57,6 +59,7 @@ class GraspResult:
     attempts: int
     place_position: tuple[float, float, float]
     duration: float
+    route: str = ""
 
     def raise_for_code(self) -> Self:
         """Return the result of a success.
@@ -118,6 +121,8 @@ class GraspClient:
         arm: str = "auto",
         place: Sequence[float] | None = None,
         place_yaw: float | None = None,
+        object_at: Sequence[float] | None = None,
+        leave: Sequence[Sequence[float]] = (),
         phase: str = "all",
         dry_run: bool = False,
         time_limit: float = 0.0,
@@ -132,6 +137,8 @@ class GraspClient:
             place: (x, y) or (x, y, z) of the footprint centre, base frame, m; z is not read. None lets a free spot be
                 chosen.
             place_yaw: Of the object's x axis about the base z where it is put down, rad; None: as the hand likes.
+            object_at: (x, y) near which the object stands, base frame, m, when there are several alike.
+            leave: (x, y) of objects that stay where they are.
             phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
             dry_run: Plan and report, do not move.
             time_limit: s of robot time; then it ends with TIMEOUT, the hand keeping what it holds. 0: none.
@@ -154,6 +161,9 @@ class GraspClient:
             goal.has_place_position = True
             goal.place_position.x, goal.place_position.y = float(place[0]), float(place[1])
             goal.place_position.z = float(place[2]) if len(place) == 3 else 0.0
+        if object_at is not None:
+            goal.has_object_position, goal.object_position = True, point((object_at[0], object_at[1], 0.0))
+        goal.leave = [point((p[0], p[1], 0.0)) for p in leave]
         self._callback_error = None
         if not self._client.wait_for_server(timeout_sec=self._timeout):
             raise OpenArmError(
@@ -250,4 +260,5 @@ def _result(message: Pick.Result) -> GraspResult:
         attempts=message.attempts,
         place_position=(x, y, z),
         duration=message.duration,
+        route=message.route,
     )

@@ -40,7 +40,17 @@ def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
     place = (p.x, p.y, p.z) if message.has_place_position else None
     yaw = message.place_yaw if message.has_place_yaw else None
     phase = message.phase or "all"
-    return GraspRequest(message.label, message.arm or "auto", place, message.dry_run, phase, yaw, message.timeout)
+    return GraspRequest(
+        label=message.label,
+        arm=message.arm or "auto",
+        place=place,
+        dry_run=message.dry_run,
+        phase=phase,
+        place_yaw=yaw,
+        timeout=message.timeout,
+        object_at=(message.object_position.x, message.object_position.y) if message.has_object_position else None,
+        leave=tuple((p.x, p.y) for p in message.leave),
+    )
 
 
 def fill_answer(answer: Grasp.Response | Pick.Result, outcome: GraspOutcome) -> None:
@@ -54,6 +64,7 @@ def fill_answer(answer: Grasp.Response | Pick.Result, outcome: GraspOutcome) -> 
     answer.attempts = outcome.attempts
     answer.place_position = point(outcome.place_position)
     answer.duration = outcome.duration
+    answer.route = outcome.route
 
 
 def status_msg(machine: GraspMachine, t_ns: int) -> GraspStatus:
@@ -193,13 +204,14 @@ def home_goal(arm: str, named: str, effect: GoHome, velocity_scale: float) -> Mo
         kind=MoveArm.Goal.NAMED,
         named=named,
         obstacles=[box_to_msg(box) for box in effect.obstacles],
+        hand_empty=True,
         velocity_scale=velocity_scale,
     )
 
 
 def linear_goal(effect: MoveLinear, velocity_scale: float) -> MoveArm.Goal:
     """A straight line of the TCP."""
-    goal = MoveArm.Goal(arm=effect.arm, kind=MoveArm.Goal.LINEAR, velocity_scale=velocity_scale)
+    goal = MoveArm.Goal(arm=effect.arm, kind=MoveArm.Goal.LINEAR, velocity_scale=velocity_scale, hand_empty=True)
     goal.pose.header.frame_id = BASE_FRAME
     goal.pose.pose = matrix_to_pose(effect.T_base_tcp)
     return goal

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -18,8 +18,12 @@ from pydantic import Field, model_validator
 from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
 
-#: With these another place in a bin may be had, and an object may be reached when others have been taken away.
+Place: TypeAlias = tuple[float, float]
+
+#: With these another place in a bin may be had.
 _BLOCKED = (Code.IN_COLLISION, Code.UNREACHABLE, Code.NO_PLAN)
+#: Nothing changes these. With any other, what others hid or blocked may be had when they have been taken away.
+_FINAL = (Code.TOO_WIDE, Code.INVALID_ARGUMENT, Code.CANCELLED, Code.ROBOT_LOST, Code.NOT_READY)
 #: There is no more of it in view.
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 
@@ -80,10 +84,17 @@ def load_bins(path: Path) -> Bins:
 
 @dataclass(frozen=True)
 class Ask:
-    """What to ask for next; `place` is (x, y), or None for a free spot."""
+    """What to ask for next.
+
+    Attributes:
+        label: Of the object.
+        place: (x, y) where it shall stand; None: a free spot.
+        leave: (x, y) of objects of that label that have been placed already.
+    """
 
     label: str
-    place: tuple[float, float] | None = None
+    place: Place | None = None
+    leave: tuple[Place, ...] = ()
 
 
 @dataclass
@@ -93,18 +104,21 @@ class Order:
     Attributes:
         labels: In this order; each is asked for until none of it is left, as often as `each` says at most.
         bins: Where they go; None: to free spots.
-        each: Most objects of one label.
+        each: Most objects of one label, or of each label.
         placed: Labels that were placed, in order.
         failed: What could not be done: label and reason.
     """
 
     labels: Sequence[str]
     bins: Bins | None = None
-    each: int = 1
+    each: int | Mapping[str, int] = 1
     placed: list[str] = field(default_factory=list[str])
     failed: dict[str, str] = field(default_factory=dict[str, str])
     _used: dict[str, int] = field(default_factory=dict[str, int])
     _blocked: dict[str, tuple[int, str]] = field(default_factory=dict[str, tuple[int, str]])
+    _stand: dict[str, tuple[tuple[float, float], ...]] = field(
+        default_factory=dict[str, tuple[tuple[float, float], ...]]
+    )
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -122,35 +136,43 @@ class Order:
     def next(self) -> Ask | None:
         """What to ask for now; None when the order has ended."""
         for label in dict.fromkeys(self.labels):
-            if label in self.failed or self.placed.count(label) >= self.each:
+            if label in self.failed or self.placed.count(label) >= self._most(label):
                 continue
             if label in self._blocked and self._blocked[label][0] == len(self.placed):
                 continue  # nothing has been taken away since
+            stand = self._stand.get(label, ())
             if self.bins is None:
-                return Ask(label)
+                return Ask(label, None, stand)
             name = self.bins.of(label)
             slots = self.bins.bins[name].slots(self.bins.spacing)
             at = self._used.get(name, 0)
             if at < len(slots):
-                return Ask(label, slots[at])
+                return Ask(label, slots[at], stand)
             self.failed[label] = f"bin {name!r} is full: it has {len(slots)} places"
         self.failed |= {label: why for label, (_, why) in self._blocked.items()}
         return None
 
-    def done(self, ask: Ask, code: Code, message: str) -> None:
-        """Note what came of a request."""
-        self._blocked.pop(ask.label, None)
-        if self.bins is not None and (code is Code.OK or (code in _BLOCKED and ask.place is not None)):
-            name = self.bins.of(ask.label)
+    def done(self, ask: Ask, code: Code, message: str, where: Sequence[float] = ()) -> None:
+        """Note what came of a request; `where` (x, y) is where the object stands now, when it was placed."""
+        label = ask.label
+        self._blocked.pop(label, None)
+        next_slot = code is Code.OK or (code in _BLOCKED and ask.place is not None)
+        if self.bins is not None and next_slot:
+            name = self.bins.of(label)
             self._used[name] = self._used.get(name, 0) + 1
         if code is Code.OK:
-            self.placed.append(ask.label)
-        elif code in _GONE and ask.label in self.placed:
-            self.failed[ask.label] = ""  # there is no more of it, which is what was asked for
-        elif code not in _BLOCKED:
-            self.failed[ask.label] = f"{code}: {message}"
-        elif self.bins is None:
-            self._blocked[ask.label] = (len(self.placed), f"{code}: {message}")
+            self.placed.append(label)
+            if len(where) >= 2:
+                self._stand[label] = (*self._stand.get(label, ()), (float(where[0]), float(where[1])))
+        elif code in _FINAL:
+            self.failed[label] = f"{code}: {message}"
+        elif self.bins is None or not next_slot:
+            # No more of it in view, when some was placed, is what was asked for.
+            why = "" if code in _GONE and label in self.placed else f"{code}: {message}"
+            self._blocked[label] = (len(self.placed), why)
+
+    def _most(self, label: str) -> int:
+        return self.each if isinstance(self.each, int) else self.each.get(label, 1)
 
     @property
     def outcome(self) -> str:

@@ -108,3 +108,22 @@ def test_what_stays_blocked_failed_with_its_reason():
     carry_out(order, {Ask("red"): Code.NO_PLAN, Ask("blue"): Code.NO_PLAN})
     assert order.faults() == {"red": "NO_PLAN: as told", "blue": "NO_PLAN: as told"}
     assert order.outcome == "FAILED"
+
+
+def test_p03_what_an_order_has_placed_it_does_not_pick_again():
+    order = Order(("red",), each={"red": 2})
+    order.done(order.next(), Code.OK, "", (0.3, -0.2, 0.4))
+    assert order.next() == Ask("red", None, ((0.3, -0.2),))
+    order.done(order.next(), Code.OK, "", (0.2, -0.2, 0.4))
+    assert order.next() is None
+    assert order.outcome == "SUCCESS"
+
+
+def test_what_others_hide_is_asked_for_again_when_they_are_gone():
+    order = Order(("red", "blue"))
+    order.done(Ask("red"), Code.NOTHING_DETECTED, "something hides its outline")
+    order.done(Ask("blue"), Code.OK, "", (0.3, 0.2, 0.4))
+    assert order.next() == Ask("red")
+    order.done(Ask("red"), Code.TOO_WIDE, "for good")
+    assert order.next() is None
+    assert order.faults() == {"red": "TOO_WIDE: for good"}
