@@ -79,8 +79,8 @@ class Table(Config):
 class SceneObject(Config):
     """A free body in one plain colour.
 
-    `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height; a sphere's
-    diameter three times.
+    `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height; a
+    sphere's diameter three times.
     `position` is x, y, or x, y, z of the centre; without z the object stands on the table.
     """
 

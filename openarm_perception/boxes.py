@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From an image to the input of a network and from its output back to boxes in the image.
+
+Boxes are left, top, right, bottom in pixels of which each covers one unit: a box around the single pixel (u, v) is
+u, v, u + 1, v + 1. Images keep their proportions: they are scaled to fit the input, the rest is filled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+_FILL = 114
+
+
+@dataclass(frozen=True)
+class Letterbox:
+    """How an image lies in the input of a network; pixels.
+
+    Attributes:
+        width: Of the input.
+        height: Of the input.
+        left: Where the image begins.
+        top: Where the image begins.
+        inner: (width, height) that the image takes.
+        scale: (x, y) input pixels per image pixel; they differ by the rounding of `inner`.
+    """
+
+    width: int
+    height: int
+    left: int
+    top: int
+    inner: tuple[int, int]
+    scale: tuple[float, float]
+
+    @classmethod
+    def fit(cls, image: tuple[int, int], size: tuple[int, int]) -> Letterbox:
+        """Of an image (width, height) in an input (width, height)."""
+        scale = min(size[0] / image[0], size[1] / image[1])
+        inner = (max(1, round(image[0] * scale)), max(1, round(image[1] * scale)))
+        exact = (inner[0] / image[0], inner[1] / image[1])
+        return cls(*size, (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2, inner, exact)
+
+    def place(self, rgb: Image) -> Image:
+        """The input (height, width, 3) of an image (h, w, 3)."""
+        if rgb.shape[1::-1] != self.inner:
+            kind = cv2.INTER_AREA if self.scale[0] < 1.0 else cv2.INTER_LINEAR
+            rgb = cast(Image, cv2.resize(rgb, self.inner, interpolation=kind))
+        if self.inner == (self.width, self.height):
+            return rgb
+        out = np.full((self.height, self.width, 3), _FILL, np.uint8)
+        out[self.top : self.top + self.inner[1], self.left : self.left + self.inner[0]] = rgb
+        return out
+
+    def into(self, boxes: Array) -> Array:
+        """Boxes (n, 4) of the image in the input."""
+        return boxes * (*self.scale, *self.scale) + (self.left, self.top, self.left, self.top)
+
+    def back(self, boxes: Array) -> Array:
+        """Boxes (n, 4) of the input in the image, cut where the image ends."""
+        size = self.inner[0] / self.scale[0], self.inner[1] / self.scale[1]
+        out = (boxes - (self.left, self.top, self.left, self.top)) / (*self.scale, *self.scale)
+        return out.clip(0.0, (*size, *size))
+
+
+def blob(rgb: Image) -> NDArray[np.float32]:
+    """What a network takes, (1, 3, h, w) 0 to 1, of an image (h, w, 3)."""
+    out = np.empty((1, 3, *rgb.shape[:2]), np.float32)
+    np.multiply(rgb.transpose(2, 0, 1), np.float32(1.0 / 255.0), out=out[0])
+    return out
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What a network found: classes (n,), scores (n,), 0 to 1, boxes (n, 4); best first."""
+
+    classes: NDArray[np.int64]
+    scores: Array
+    boxes: Array
+
+
+def decode(output: NDArray[np.float32], threshold: float, max_overlap: float, limit: int = 100) -> Candidates:
+    """Boxes of a network's output without the weaker ones of the same thing.
+
+    Args:
+        output: (4 + classes, n): cx, cy, width, height in pixels, then a score per class.
+        threshold: Least score.
+        max_overlap: Of the same class, what overlaps a better box by more (intersection over union) is dropped; of
+            another class, what overlaps halfway from there to 1.
+        limit: Most boxes.
+    """
+    scores = output[4:].max(axis=0)
+    cells = np.nonzero(scores >= threshold)[0]
+    cells = cells[np.argsort(-scores[cells], kind="stable")][: 20 * limit]
+    found = output[:, cells].astype(np.float64)
+    classes, best = found[4:].argmax(axis=0), scores[cells].astype(np.float64)
+    boxes = np.concatenate([found[:2] - found[2:4] / 2.0, found[:2] + found[2:4] / 2.0]).T
+    left = np.ones(len(cells), np.bool_)
+    kept: list[int] = []
+    for i in range(len(cells)):
+        if not left[i]:
+            continue
+        kept.append(i)
+        if len(kept) == limit:
+            break
+        shared = overlap(boxes[i], boxes)
+        left &= shared <= np.where(classes == classes[i], max_overlap, 0.5 + 0.5 * max_overlap)
+    return Candidates(classes[kept], best[kept], boxes[kept])
+
+
+def overlap(box: Array, others: Array) -> Array:
+    """Intersection over union (n,) of a box (4,) with others (n, 4)."""
+    size = (np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])).clip(0.0)
+    common = size[:, 0] * size[:, 1]
+    total = np.prod(box[2:] - box[:2]) + np.prod(others[:, 2:] - others[:, :2], axis=1) - common
+    return common / np.maximum(total, 1e-12)
