@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
 from openarm_common.errors import Code, OpenArmError
 
@@ -38,6 +38,10 @@ def load_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise OpenArmError(Code.CONFIG_INVALID, f"{path} holds a {type(data).__name__}, expected a mapping of keys")
     return data  # pyright: ignore[reportUnknownVariableType]
+
+
+#: `json_schema_extra` of a field that may change while a node runs.
+AT_RUN_TIME: dict[str, JsonValue] = {"at_run_time": True}
 
 
 def validate(model: type[ConfigT], data: dict[str, Any], where: str) -> ConfigT:
