@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from openarm_bringup.campaign_tasks import PLAN_FAILS, FaultPlan, Task, nominal
+from openarm_bringup.campaign_tasks import MISSES, PLAN_FAILS, FaultPlan, Task, nominal
 from openarm_common.errors import Code
 from openarm_common.scene import Scene, SceneObject
 
@@ -87,7 +87,7 @@ def _too_wide(task: Task, rng: np.random.Generator) -> Task:
 
 
 def _far(task: Task, rng: np.random.Generator) -> Task:
-    x, y = round(float(rng.uniform(0.50, 0.53)), 3), round(float(rng.choice((-1, 1)) * rng.uniform(0.30, 0.36)), 3)
+    x, y = round(float(rng.uniform(0.51, 0.53)), 3), round(float(rng.choice((-1, 1)) * rng.uniform(0.37, 0.40)), 3)
     far = _target(task).model_copy(update={"shape": "box", "size": (0.05, 0.05, 0.05), "position": (x, y)})
     return replace(task, scene=_objects(task, far), codes=_NO_WAY)
 
@@ -105,7 +105,19 @@ def _walled(task: Task, rng: np.random.Generator) -> Task:
     ):  # fmt: skip
         size = (long_x, long_y, 0.055)
         walls.append(SceneObject(name=f"{color}_wall", shape="box", size=size, color=color, position=(x + dx, y + dy)))
-    return replace(task, scene=_objects(task, low, *walls), codes=_NO_WAY)
+    # where the walls hide its outline, it cannot be measured
+    return replace(task, scene=_objects(task, low, *walls), codes=(*_NO_WAY, Code.NOTHING_DETECTED))
+
+
+def _corridor(task: Task, rng: np.random.Generator) -> Task:
+    """A tall screen stands between the object and where the arm comes from."""
+    side = float(rng.choice((-1.0, 1.0)))
+    x, y = float(rng.uniform(0.20, 0.28)), side * float(rng.uniform(0.15, 0.25))
+    item = _target(task).model_copy(update={"position": (x, y)})
+    color = "green" if item.color != "green" else "purple"
+    size, place = (0.16, 0.03, round(float(rng.uniform(0.16, 0.24)), 3)), (x, y + side * 0.13)
+    screen = SceneObject(name="screen", shape="box", size=size, color=color, position=place, mass=2.0)
+    return replace(task, scene=_objects(task, item, screen))
 
 
 def _heavy(task: Task, rng: np.random.Generator) -> Task:
@@ -150,7 +162,8 @@ def _arm_in_the_way(task: Task, rng: np.random.Generator) -> Task:
 KINDS: Mapping[str, Maker] = MappingProxyType(
     {
         # what must be recovered from
-        "detection_missed": _fault("camera_drop", camera="overhead", share=(0.4, 0.7)),
+        "detection_missed": _fault(MISSES, share=(0.2, 0.5)),
+        "frames_dropped": _fault("camera_drop", camera="overhead", share=(0.4, 0.7)),
         "frames_late": _fault("camera_delay", camera="overhead", seconds=(0.1, 0.25)),
         "stamps_off": _fault("stamp_offset", camera="overhead", ms=(20.0, 100.0)),
         "light_changed": _fault("light_changed", scale=(0.5, 1.4)),
@@ -163,6 +176,7 @@ KINDS: Mapping[str, Maker] = MappingProxyType(
         "joint_states_gap": _fault("joint_state_gap", ms=(100.0, 300.0), every=2.0),
         "two_alike": _two_alike,
         "arms_in_the_way": _arm_in_the_way,
+        "corridor_blocked": _corridor,
         "intrinsics_off": _fault("intrinsics_bias", camera="overhead", focal=(-0.01, 0.01)),
         # what may be recovered from, and must be told truly when not
         "mount_knocked": _fault("mount_knocked", Code.OK, *_ASTRAY, *_NO_WAY, camera="overhead", mm=10.0, deg=1.0),

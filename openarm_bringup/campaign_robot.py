@@ -97,6 +97,8 @@ class SimRobot:
         self.tracks: dict[str, list[Sample]] = {item.name: [] for item in scene.objects}
         self.trace: deque[tuple[int, Array, Array]] = deque(maxlen=int(_TRACE_S * 1e9) // self.world.period_ns)
         self.images: dict[str, tuple[int, NDArray[np.uint8], DepthImage]] = {}
+        #: Share of the frames in which the detector misses an object, on purpose.
+        self.missed = 0.0
         self._mounts = dict(mounts or {})
         self._rng = np.random.default_rng([seed, 77])
         self._arriving: deque[tuple[int, Frame]] = deque()
@@ -203,7 +205,8 @@ class SimRobot:
             )
         except OpenArmError:
             return None  # as the detector: the frame is skipped, the next may do
-        found = (Detection(d.label, d.score, d.T_base_object, np.array(d.size)) for d in perceived.boxes)
+        seen = (d for d in perceived.boxes if not self.missed or self._rng.random() >= self.missed)
+        found = (Detection(d.label, d.score, d.T_base_object, np.array(d.size)) for d in seen)
         return Frame(stamp_ns, tuple(found))
 
     def _robot_in(self, view: DepthView, stamp_ns: int) -> Mask | None:

@@ -16,8 +16,10 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import PALETTE, SPACING, Scene, random_scene
 
-#: A fault of the campaign's own: as many plans as the parameter `times` says find no way.
+#: Faults of the campaign's own: as many plans as the parameter `times` says find no way,
 PLAN_FAILS = "plan_fails"
+#: and the detector misses each object in a `share` of the frames.
+MISSES = "detection_missed"
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class FaultPlan:
     """Something that goes wrong.
 
     Attributes:
-        name: Of `openarm_sim_bridge.faults`, or `PLAN_FAILS`.
+        name: Of `openarm_sim_bridge.faults`, `PLAN_FAILS` or `MISSES`.
         parameters: Of it.
         when: State that is entered when it begins; "" begins with the scene.
         until_attempt: It is cleared when this attempt begins; 0: never.

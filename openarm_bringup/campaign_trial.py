@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from openarm_bringup import campaign_record
 from openarm_bringup.campaign_link import DirectLink
 from openarm_bringup.campaign_robot import SimRobot, SimulatedSenses
-from openarm_bringup.campaign_tasks import PLAN_FAILS, Task
+from openarm_bringup.campaign_tasks import MISSES, PLAN_FAILS, Task
 from openarm_bringup.judge import JudgeConfig, Sample, Verdict, at_rest, judge
 from openarm_bringup.report import scene_hash
 from openarm_bringup.trial import Trial
@@ -186,6 +186,9 @@ class Trials:
         self._faulty = True
         if fault.name == PLAN_FAILS:
             self.link.plans_to_fail = int(fault.parameters["times"])
+            return
+        if fault.name == MISSES:
+            self.robot.missed = float(fault.parameters["share"])
             return
         for seed in range(self._task.seed, self._task.seed + _DIRECTIONS):
             try:

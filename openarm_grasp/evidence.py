@@ -140,7 +140,7 @@ def judge_sight(
 
     Args:
         before: The object as it was before the grasp.
-        frames: Taken after the lift, straight up; the newest counts.
+        frames: Taken after the lift, straight up; a detector may miss what it still sees in the next.
         config: Thresholds.
         match_radius: Horizontal distance that counts as the old place, m.
         others: What else stood there; those like the object are not taken for it.
@@ -150,7 +150,8 @@ def judge_sight(
     twins = [d for d in others if d.label == before.label]
     same = [
         d
-        for d in frames[-1].detections
+        for frame in frames
+        for d in frame.detections
         if d.label == before.label and all(_apart(d, twin) > match_radius for twin in twins)
     ]
     if not same:
@@ -216,14 +217,16 @@ def judge_place(
     Args:
         label: Of the object.
         p_target: (3,) where its footprint centre shall stand, base frame, m; z is that of the table.
-        frames: Taken after the arm has left.
+        frames: Taken after the arm has left; the newest that shows the object counts.
         tolerance: Largest horizontal distance, m.
         yaw: Of its x axis, where one was asked for, rad; what looks square or round is not judged by it.
         height: Of the object as it stood, m: one of another height lies on its side. None: it is not judged.
     """
     if not frames:
         return Verdict(Code.STALE_DATA, "no camera frame after the place")
-    same = [d for d in frames[-1].detections if d.label == label]
+    same = next(
+        (found for frame in reversed(frames) if (found := [d for d in frame.detections if d.label == label])), ()
+    )
     if not same:
         return Verdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
     nearest = min(same, key=lambda d: float(np.linalg.norm((d.p_base - p_target)[:2])))

@@ -52,6 +52,7 @@ class Hand:
         retreats: Ways home that failed.
         near: How far the second look has come: "", "look", "plan", "go".
         looked: The camera has looked again before the hand goes down.
+        looks: Rounds of frames that were looked at after the place.
     """
 
     holding: bool = False
@@ -64,6 +65,7 @@ class Hand:
     retreats: int = 0
     near: str = ""
     looked: bool = False
+    looks: int = 0
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,8 @@ from openarm_grasp.states import State
 
 Array = NDArray[np.float64]
 
+#: Frames that must not show the object in its old place after the lift: a detector may miss it in one.
+_LIFT_FRAMES = 2
 #: In the last recipe of PLACE, the object is free once this many effects are done (the way down, and opening).
 RELEASED_AFTER = 2
 
@@ -108,7 +110,7 @@ def lift(m: Memory, around: Surroundings) -> Effects:
     """Straight up, then ask hand and camera."""
     go = Execute(m.arm, m.need_grasp_plan().retreat, "lift", carrying=True)
     measure = Measure(m.arm, m.need_candidate().width, settle=around.config.timing.settle_limit)
-    return (go, measure, Observe(1))
+    return (go, measure, Observe(_LIFT_FRAMES))
 
 
 def place(m: Memory, around: Surroundings) -> Effects:

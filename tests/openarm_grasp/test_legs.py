@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp import effects as fx
 from openarm_grasp.legs import run_task
@@ -24,6 +25,7 @@ class TwoArms:
     def __init__(self, world: Any) -> None:
         self.world = world
         self.deadline_ns = 0
+        self.description = RobotDescription.load()
         self.notes: list[str] = []
         self.stopped: Code | None = None
         #: The arms grasp nothing that stands further away than this, m; a hand may push it from there.

@@ -9,6 +9,7 @@ import pytest
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp import effects as fx
+from openarm_grasp.observation import Frame
 from openarm_grasp.states import State
 
 
@@ -66,6 +67,22 @@ def test_n03_a70_an_object_that_moves_before_the_hand_goes_down_is_not_touched(w
     assert outcome.attempts == 2
     assert len(world.times(world.executes("approach"))) == 1  # the first hand did not go down
     assert world.done(fx.PlanGrasp)[1].candidates[0].T_base_tcp[0, 3] == pytest.approx(0.30)
+
+
+def test_n03_a_placed_object_that_the_detector_misses_is_looked_for_again(world):
+    real, missed = world.frames, []
+
+    def frames(count):
+        if world.machine.state is State.RESET and not missed:
+            missed.append(count)
+            world.pass_time(0.1 * count)
+            return fx.Frames(tuple(Frame(world.t_ns, ()) for _ in range(count)), "base")
+        return real(count)
+
+    world.frames = frames
+    outcome = world.grasp()
+    assert outcome.success, outcome.message
+    assert (outcome.attempts, missed) == (1, [3])
 
 
 def test_p09_an_object_that_has_fallen_over_is_told(world, box):
