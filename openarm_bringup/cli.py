@@ -16,7 +16,7 @@ import cyclopts
 from cyclopts import App, Parameter
 
 from openarm_bringup import runs
-from openarm_bringup.outcome import Outcome, failure
+from openarm_bringup.outcome import FOR_PEOPLE, Outcome, failure
 from openarm_common.errors import Code, OpenArmError
 
 HELP = """Eyes and hands for the OpenArm robot.
@@ -82,6 +82,7 @@ def build_app() -> App:
 def run(argv: Sequence[str]) -> int:
     """Run one command line and return its exit code."""
     tokens, sink = take_json(argv)
+    FOR_PEOPLE.set(sink != "-")
     app = build_app()
     try:
         result = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import deque
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from openarm_bringup import runs
-from openarm_bringup.outcome import Outcome
+from openarm_bringup.outcome import Outcome, show
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
@@ -106,12 +105,11 @@ def logs(
             return Outcome(
                 True, data={"log": str(path), "lines": [line.rstrip("\n") for line in last]}, text="".join(last)
             )
-        sys.stdout.writelines(last)
+        show("".join(last))
         try:
             while True:
                 more = log.read()
-                sys.stdout.write(more)
-                sys.stdout.flush()
+                show(more)
                 if not more:
                     time.sleep(0.2)
         except KeyboardInterrupt:

@@ -3,11 +3,16 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any
 
 from openarm_common.errors import Code, OpenArmError
+
+#: Whether stdout is for people; not where it is for the one JSON document of `--json`.
+FOR_PEOPLE: ContextVar[bool] = ContextVar("FOR_PEOPLE", default=True)
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,13 @@ class Outcome:
     def as_json(self) -> dict[str, Any]:
         """Return what `--json` writes."""
         return {"success": self.success, "code": str(self.code), "message": self.message, **self.data}
+
+
+def show(text: str) -> None:
+    """Print something at once, of a command that goes on; with `--json` on stdout nothing is printed."""
+    if FOR_PEOPLE.get():
+        sys.stdout.write(text)
+        sys.stdout.flush()
 
 
 def failure(error: OpenArmError, **data: Any) -> Outcome:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import suppress
 from itertools import pairwise
 from typing import Annotated, Any
 
 import yaml
 from cyclopts import App, Parameter
 
-from openarm_bringup.outcome import Outcome
+from openarm_bringup.outcome import Outcome, show
 from openarm_bringup.pick_cli import meet_graph
 from openarm_common.errors import Code, OpenArmError
 
@@ -82,15 +83,15 @@ def echo(
             if count:
                 messages.append(data)
             if not count or len(messages) <= count:
-                sys.stdout.write(yaml.safe_dump(data, sort_keys=False, default_flow_style=None) + "---\n")
-                sys.stdout.flush()
+                show(yaml.safe_dump(data, sort_keys=False, default_flow_style=None) + "---\n")
             heard[0] += 1
 
         heard = [0]
         peer.node.create_subscription(interface(kind), found, take, peer.offered(found))
         if not peer.spin_until(lambda: heard[0] > 0, timeout):
             raise OpenArmError(Code.TIMEOUT, f"{found} was silent for {timeout:g} s")
-        peer.spin_until(lambda: count and heard[0] >= count, float("inf"))
+        with suppress(KeyboardInterrupt):  # the way to end it
+            peer.spin_until(lambda: count and heard[0] >= count, float("inf"))
     return Outcome(True, data={"topic": found, "type": kind, "messages": messages[:count]})
 
 
@@ -250,7 +251,7 @@ def send(
     from openarm_bringup.message_client import fill, interface, to_data
     from openarm_bringup.peer_client import Peer, find
 
-    def show(message: Any) -> None:
+    def tell(message: Any) -> None:
         if feedback:
             data = to_data(message.feedback, _LONGEST)
             sys.stderr.write(yaml.safe_dump(data, sort_keys=False, default_flow_style=None) + "---\n")
@@ -259,7 +260,7 @@ def send(
         found, kind = find("action", name, peer.actions())
         filled = fill(interface(kind).Goal(), _parse(goal))
         client = peer.action_client(interface(kind), found)
-        handle = peer.result(client.send_goal_async(filled, feedback_callback=show), 10.0, found)
+        handle = peer.result(client.send_goal_async(filled, feedback_callback=tell), 10.0, found)
         if not handle.accepted:
             return Outcome(False, f"{found} refused the goal", Code.INVALID_ARGUMENT, {"action": found})
         future = handle.get_result_async()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from rclpy.action import ActionServer
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from openarm_bringup import param_cli, ros_cli, tf_cli
+from openarm_bringup import cli, param_cli, ros_cli, tf_cli
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF
 
@@ -73,6 +74,8 @@ def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsy
     echoed = ros_cli.echo("status", count=1)  # latched: it was published long before
     assert echoed.data["messages"] == [{"data": "ready"}]
     assert "data: ready" in capsys.readouterr().out
+    assert cli.run(["topic", "echo", "status", "-n", "1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["messages"] == [{"data": "ready"}], "JSON, and nothing else"
     assert 20.0 < ros_cli.hz("/ticks", seconds=1.0).data["rate_hz"] < 80.0
     assert ros_cli.pub("/talk", "{data: hello}", count=2, rate=20.0).success
     deadline = time.monotonic() + 5.0
