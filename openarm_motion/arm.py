@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.blending import time_blended, time_quintic
+from openarm_motion.blending import timings
 from openarm_motion.cartesian import Line
 from openarm_motion.certificate import Certificate, certify
 from openarm_motion.collision import Box, CollisionScene, Contact, Surroundings
@@ -29,7 +29,7 @@ from openarm_motion.kinematics import ArmKinematics
 from openarm_motion.planner import PlannedPath, Planner, PlanQuery, never
 from openarm_motion.planners import make_planner
 from openarm_motion.seen import NOTHING, Known
-from openarm_motion.trajectory import JointLimits, Trajectory, profile, time_path, time_polyline
+from openarm_motion.trajectory import JointLimits, Trajectory, profile, time_path
 
 Array = NDArray[np.float64]
 
@@ -196,9 +196,11 @@ class Arm:
             touchable: Ids of boxes that the fingers may touch.
             straight: Clearance of straight parts instead of free paths.
             gripper: Position of the finger joints instead of the present one, m.
-            known: Bodies of the planning scene, as certain as the table, and the map.
+            known: Bodies of the planning scene, as certain as the table, the map, and the distance of the arms.
         """
         clearance = self.config.straight if straight else self.config.clearance
+        if known.apart > clearance.arms:
+            clearance = clearance.model_copy(update={"arms": known.apart})
         certain = (*self.static, *known.solids)
         fixed = frozenset(body.id for body in certain)
         return CollisionScene(
@@ -300,15 +302,9 @@ class Arm:
         )
 
     def timings(self, path: PlannedPath, scale: float) -> Iterator[Trajectory]:
-        """Timed free paths, the best first; the last one is at rest in the corners, where nothing leaves the path."""
-        asked = (self.names, path.waypoints, self.limits(scale), self.config.planning.period)
-        timing = self.config.planning.timing
-        if timing == "quintic":
-            yield time_quintic(*asked)
-            return
-        if timing == "blended" and len(path.waypoints) > 2:
-            yield time_blended(*asked)
-        yield time_polyline(*asked)
+        """Timed free paths, the best first; see `blending.timings`."""
+        search = self.config.planning
+        return timings(search.timing, self.names, path.waypoints, self.limits(scale), search.period)
 
     def time_line(self, line: Line, scale: float) -> Trajectory:
         """Timed straight line."""

@@ -44,6 +44,12 @@ class Course:
     motion: Motion
     held: Sequence[Box] = ()
 
+    @classmethod
+    def standing(cls, arm: Arm, state: Mapping[str, float], held: Sequence[Box] = ()) -> Course:
+        """An arm that stays where it is."""
+        q = np.array([[state[name] for name in arm.names]])
+        return cls(arm, Motion(arm.names, np.zeros(1), q), held)
+
 
 def least_wait(
     mine: Course,
@@ -58,7 +64,7 @@ def least_wait(
 
     Args:
         mine: The arm that is to set out, its motion beginning now.
-        others: Arms under way.
+        others: The other arms.
         state: Present positions of the robot's joints.
         longest: It may rest no longer, s.
         stopped: Whether to give up.
@@ -122,7 +128,8 @@ class _Pair:
         self._scene = self._made(mine, state, _SEEN, carried)
         self._levers = [self._made(other, state, _SEEN).levers for other in others]
         self._put(0.0, mine.motion.q[0])
-        links = frozenset[str]().union(*(other.arm.robot.arm.moving for other in others)) | self._scene.carried
+        arm = mine.arm.robot.arm
+        links = frozenset(mine.arm.robot.links) - arm.fixed - arm.moving | self._scene.carried
         gap = self._scene.gap(mine.motion.q[0], links)
         self.overlaps = gap <= 0.0
         if 0.0 < gap < _SEEN:

@@ -9,13 +9,14 @@ was planned: it needs a certificate of its own. s, rad, rad/s, rad/s², rad/s³.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_motion.trajectory import SPACING, JointLimits, Profile, Trajectory, joined, straight_profile
+from openarm_motion.trajectory import SPACING, JointLimits, Profile, Trajectory, joined, straight_profile, time_polyline
 
 Array = NDArray[np.float64]
 
@@ -47,6 +48,30 @@ class _Segment:
             np.where(under, a, 0.0)[:, None] * self.difference,
             np.where(under, j, 0.0)[:, None] * self.difference,
         )
+
+
+def timings(
+    how: Literal["blended", "stops", "quintic"],
+    names: Sequence[str],
+    waypoints: Array,
+    limits: JointLimits,
+    period: float,
+) -> Iterator[Trajectory]:
+    """Timed polylines, the best first; the last one is at rest in the corners, where nothing leaves the path.
+
+    Args:
+        how: Corners rounded where that is possible, or with a stop, or quintic with a stop.
+        names: Joints.
+        waypoints: (m, n) rad.
+        limits: What no joint exceeds.
+        period: Greatest time between two samples, s.
+    """
+    if how == "quintic":
+        yield time_quintic(names, waypoints, limits, period)
+        return
+    if how == "blended" and len(waypoints) > 2:
+        yield time_blended(names, waypoints, limits, period)
+    yield time_polyline(names, waypoints, limits, period)
 
 
 def time_blended(names: Sequence[str], waypoints: Array, limits: JointLimits, period: float = 0.02) -> Trajectory:

@@ -25,6 +25,7 @@ from openarm_motion.checks import Motion, check_trajectory
 from openarm_motion.config import MotionConfig
 from openarm_motion.executor import Follower
 from openarm_motion.goals import goal_configurations, posture, yielding
+from openarm_motion.memory import HeldMemory
 from openarm_motion.situation_client import Situations
 from openarm_motion.solids import Box
 from openarm_motion.together import BothGoals, BothPlan, plan_any, plan_staggered, plan_together
@@ -50,6 +51,7 @@ class BothExecutor:
         followers: Of each arm.
         arms: By name.
         situations: What requests start from.
+        held: What the hands hold.
     """
 
     def __init__(
@@ -59,9 +61,10 @@ class BothExecutor:
         arms: Mapping[str, Arm],
         followers: Mapping[str, Follower],
         situations: Situations,
+        held: HeldMemory,
     ) -> None:
         self._node, self._states, self._arms = node, states, arms
-        self._followers, self._situations = followers, situations
+        self._followers, self._situations, self._held = followers, situations, held
 
     def arms_of(self, goal: MoveArms.Goal) -> tuple[Arm, Arm]:
         """The two arms of a goal.
@@ -93,7 +96,10 @@ class BothExecutor:
                 Code.INVALID_ARGUMENT, f"strategy is {goal.strategy}; valid: ANY 0, TOGETHER 1, STAGGERED 2"
             )
         obstacles = convert.boxes_from_msg(goal.obstacles)
-        held = tuple(convert.boxes_from_msg(target.attached) for target in goal.targets)
+        held = tuple(
+            self._held.on_request(target.arm, convert.boxes_from_msg(target.attached), target.hand_empty)[0]
+            for target in goal.targets
+        )
         await self._situations.fresh()
         prepared = self._situations.prepare_both(
             arms, goal.velocity_scale, stopped, obstacles, held, goal.expected_scene_version
@@ -134,8 +140,8 @@ class BothExecutor:
         start = ns_to_stamp(stamp_ns + int(_HEAD_START * 1e9))
         motions: list[Motion] = []
         for arm, message in zip(arms, trajectories, strict=True):
-            names, t, q, v, _ = trajectory_from_msg(message)
-            motions.append(check_trajectory(arm, names, t, q, v, state))
+            names, t, q, v, a = trajectory_from_msg(message)
+            motions.append(check_trajectory(arm, names, t, q, v, state, a))
             message.header.stamp = start
         faults: list[OpenArmError] = []
         feedback, shares = MoveArms.Feedback(stage="executing"), [0.0] * len(motions)

@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 
 #: Share of the clearance that must be left between the looks of the search.
 _SHARE = 0.5
-#: The same to the other arm: 20 mm of 25.
-_ARMS = 0.8
+#: The same to the other arm: 27 mm of 30, so that there is room for it when that one sets out.
+_ARMS = 0.9
 #: No point of the arm moves further between two looks, m.
 _TRAVEL = 0.004
 

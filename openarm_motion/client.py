@@ -90,8 +90,9 @@ class MotionClient(BackgroundNode):
         Args:
             arm: For example "left".
             q: The goal.
-            options: `obstacles` and `attached` (boxes), `scale` of the velocity, `plan_only`, `scene_version` that the
-                scene must have, `on_feedback(stage, progress)`.
+            options: `obstacles` and `attached` (boxes; without `attached` what the hand is known to hold, `hand_empty`
+                drops it), `scale` of the velocity, `plan_only`, `max_wait` s for another arm under way,
+                `scene_version` that the scene must have, `on_feedback(stage, progress)`.
 
         Raises:
             OpenArmError: NOT_READY, without a motion node; TIMEOUT. Everything else is in the result.
@@ -116,9 +117,19 @@ class MotionClient(BackgroundNode):
         """Straight line of the tool to a pose (4, 4) in a frame; options and errors as `move_to_joints`."""
         return self._move(MoveArm.Goal(arm=arm, kind=MoveArm.Goal.LINEAR, pose=stamped(pose, frame)), **options)
 
-    def execute(self, arm: str, plan: MotionResult, on_progress: Callable[[float], None] | None = None) -> MotionResult:
-        """Carry out what was planned with `plan_only`; refused when the scene has changed since."""
-        goal = ExecuteTrajectory.Goal(arm=arm, scene_version=plan.scene_version)
+    def execute(
+        self,
+        arm: str,
+        plan: MotionResult,
+        on_progress: Callable[[float], None] | None = None,
+        *,
+        max_wait: float = 0.0,
+    ) -> MotionResult:
+        """Carry out what was planned with `plan_only`; refused when the scene has changed since.
+
+        With `max_wait` it rests first until another arm under way leaves room, for so many seconds at most.
+        """
+        goal = ExecuteTrajectory.Goal(arm=arm, scene_version=plan.scene_version, max_wait=max_wait)
         goal.trajectory = convert.trajectory_msg(plan.trajectories[0])
         deliver = None if on_progress is None else (lambda feedback: on_progress(feedback.progress))
         result = self.do(ExecuteTrajectory, "/motion/execute", goal, timeout=_LONG, on_feedback=deliver)
@@ -180,13 +191,16 @@ class MotionClient(BackgroundNode):
         *,
         obstacles: Sequence[Box] = (),
         attached: Sequence[Box] = (),
+        hand_empty: bool = False,
         scale: float = 0.0,
         plan_only: bool = False,
+        max_wait: float = 0.0,
         scene_version: int = 0,
         on_feedback: Callable[[str, float], None] | None = None,
     ) -> MotionResult:
         goal.obstacles = [convert.box_msg(box) for box in obstacles]
         goal.attached = [convert.box_msg(box) for box in attached]
+        goal.hand_empty, goal.max_wait = hand_empty, max_wait
         goal.velocity_scale, goal.plan_only, goal.expected_scene_version = scale, plan_only, scene_version
         deliver = None if on_feedback is None else (lambda message: on_feedback(message.stage, message.progress))
         result = self.do(MoveArm, "/motion/move", goal, timeout=_LONG, on_feedback=deliver)

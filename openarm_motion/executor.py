@@ -17,6 +17,7 @@ from rclpy.action import ActionClient
 from rclpy.task import Future
 from trajectory_msgs.msg import JointTrajectory
 
+from openarm_common.convert import stamp_to_ns
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import BaseNode
 from openarm_common.tf import RobotStateListener
@@ -71,6 +72,10 @@ class Follower:
         self._client = ActionClient(node, FollowJointTrajectory, self._topic)
         self.running: Running | None = None
 
+    def set_out(self, motion: Motion, begin_ns: int = 0) -> None:
+        """Count as under way from a moment on, robot time; 0 is now."""
+        self.running = Running(motion, begin_ns or self._states.buffer.latest()[0])
+
     async def follow(
         self,
         message: JointTrajectory,
@@ -81,7 +86,7 @@ class Follower:
         """Send a trajectory and return when the arm has arrived.
 
         Args:
-            message: The trajectory, as it goes to the controller.
+            message: The trajectory, as it goes to the controller; it begins at its stamp, or at once when that is 0.
             motion: The same for the checks.
             cancelled: Whether to stop; the controller then holds.
             progress: Called with 0 to 1 while the arm moves.
@@ -91,9 +96,9 @@ class Follower:
                 EXECUTION_FAILED, with the controller's reason or the joint that did not arrive; TIMEOUT; CANCELLED.
         """
         watch = Watch(self._node, self._states)
+        self.set_out(motion, stamp_to_ns(message.header.stamp))
         try:
             await self._require_ready(watch)
-            self.running = Running(motion, self._states.buffer.latest()[0])
             await self._send(watch, message, motion, cancelled, progress)
             await self._arrive(watch, motion, cancelled)
         finally:
@@ -126,6 +131,8 @@ class Follower:
         handle: Any = sent.result()
         if not handle.accepted:
             raise OpenArmError(Code.EXECUTION_FAILED, f"{self._topic} rejected the trajectory")
+        if not stamp_to_ns(message.header.stamp):
+            self.set_out(motion)  # it begins when it is accepted
         result = handle.get_result_async()
         limit_ns = (motion.duration + self._arm.config.execution.overtime) * 1e9
         cancelling: Future | None = None
@@ -134,7 +141,7 @@ class Follower:
             nonlocal cancelling
             self._raise_if_lost(watch)
             elapsed = self._elapsed_ns()
-            progress(min(1.0, elapsed * 1e-9 / max(motion.duration, 1e-3)))
+            progress(min(1.0, max(0.0, elapsed * 1e-9 / max(motion.duration, 1e-3))))
             if elapsed > limit_ns:
                 raise OpenArmError(
                     Code.TIMEOUT,

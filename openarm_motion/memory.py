@@ -10,6 +10,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from openarm_common.errors import Code, OpenArmError
 from openarm_motion.checks import Motion
 from openarm_motion.collision import Box
 from openarm_motion.trajectory import Trajectory
@@ -29,6 +30,28 @@ class HeldMemory:
     def held(self) -> Mapping[str, tuple[Box, ...]]:
         """Boxes in the tool frame by arm; arms that hold nothing are left out."""
         return MappingProxyType({arm: boxes for arm, boxes in self._held.items() if boxes})
+
+    def on_request(self, arm: str, attached: Sequence[Box], hand_empty: bool) -> tuple[tuple[Box, ...], str]:
+        """What an arm holds on a motion that is asked for, and what the answer says of it.
+
+        Args:
+            arm: The arm.
+            attached: What the request says it holds; nothing said is what it is known to hold.
+            hand_empty: The request says that it holds nothing.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when the request says both.
+        """
+        if attached and hand_empty:
+            ids = ", ".join(box.id for box in attached)
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"attached names {ids}, and hand_empty is true; expected one of them"
+            )
+        known = self._held.get(arm, ())
+        if attached or hand_empty or not known:
+            return tuple(attached), ""
+        ids = ", ".join(box.id for box in known)
+        return known, f", with {ids} in the hand as before (hand_empty: true if it holds nothing any more)"
 
     def hold(self, arm: str, boxes: Sequence[Box]) -> bool:
         """Set what an arm holds; whether that is a change."""

@@ -19,23 +19,21 @@ from openarm_interfaces.srv import ComputeIK
 from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from trajectory_msgs.msg import JointTrajectory
-from visualization_msgs.msg import MarkerArray
 
 from openarm_common.cameras import load_cameras
-from openarm_common.convert import matrix_to_pose, trajectory_from_msg
+from openarm_common.convert import matrix_to_pose
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.housings import with_housings
 from openarm_common.lockstep_node import NamedActionServer
-from openarm_common.node import QOS_LATCHED, BaseNode, run
+from openarm_common.node import BaseNode, run
 from openarm_common.tf import RobotStateListener
 from openarm_motion import convert, moves
-from openarm_motion.alternative import explained, near_joints, near_pose
+from openarm_motion.alternative import explained, explained_approach, near_joints, near_pose
 from openarm_motion.approach import ApproachFailedError, ApproachPlan, plan_approach
 from openarm_motion.arm import Arm, Situation
 from openarm_motion.both_executor import BothExecutor
-from openarm_motion.checks import check_against_others, check_trajectory
-from openarm_motion.collision import Box
 from openarm_motion.config import MotionConfig
+from openarm_motion.course_executor import CourseExecutor
 from openarm_motion.executor import Follower, Watch
 from openarm_motion.goals import posture
 from openarm_motion.memory import HeldMemory
@@ -67,12 +65,11 @@ class MotionNode(BaseNode[MotionConfig]):
         self._claimed: set[str] = set()
         self._closing = False
         self._held = HeldMemory()
-        self._attached = self.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
-        self._publish_held()
         self._preview = PreviewPublisher(self, self._arms)
-        self._situations = Situations(self, self._states, self._arms, scene, self._held)
+        self._courses = CourseExecutor(self, self._states, self._followers, self._arms, self._held)
+        self._situations = Situations(self, self._states, self._arms, scene, self._held, self._followers)
         self._scene = SceneExecutor(self, scene, self._situations)
-        self._both = BothExecutor(self, self._states, self._arms, self._followers, self._situations)
+        self._both = BothExecutor(self, self._states, self._arms, self._followers, self._situations, self._held)
         self._servers = [
             self._serve(PlanApproach, "/motion/plan_approach", self._on_plan),
             self._serve(MoveArm, "/motion/move", self._on_move),
@@ -112,7 +109,7 @@ class MotionNode(BaseNode[MotionConfig]):
         timer = self.create_timer(_FEEDBACK, lambda: handle.publish_feedback(feedback), clock=self.wall_clock)
         result = PlanApproach.Result(chosen=-1)
         try:
-            arm = self._arm(goal.arm)
+            arm, stopped = self._arm(goal.arm), self._stopper(handle)
             request = convert.request_from_msg(goal)
             if not len(goal.start):
                 await self._situations.fresh()
@@ -120,13 +117,19 @@ class MotionNode(BaseNode[MotionConfig]):
                 arm,
                 goal.start,
                 goal.velocity_scale,
-                self._stopper(handle),
+                stopped,
                 request.obstacles,
                 request.attached,
                 goal.expected_scene_version,
             )
             result.scene_version = prepared.version
-            plan: ApproachPlan = await self.in_thread(lambda: plan_approach(arm, prepared.complete(), request, report))
+
+            def work() -> ApproachPlan:
+                now = prepared.complete()
+                return explained_approach(lambda: plan_approach(arm, now, request, report), arm, now, request)
+
+            plan: ApproachPlan = await self.in_thread(work)
+            result.wait = await self._courses.wait_for(arm, plan.transfer, request.attached, stopped)
             result.success, result.code, result.message = True, Code.OK.value, f"planned{prepared.note}"
             result.chosen = plan.chosen
             result.transfer = convert.trajectory_msg(plan.transfer)
@@ -139,7 +142,7 @@ class MotionNode(BaseNode[MotionConfig]):
         except ApproachFailedError as error:
             result.code, result.message = error.code.value, error.message
             result.refusals = convert.refusals_msg(error.refusals)
-            result.failure.stage = "search" if error.code == Code.NO_PLAN else "goal"
+            result.failure = convert.failure_msg(error)
         except OpenArmError as error:
             result.code, result.message = error.code.value, error.message
             result.failure = convert.failure_msg(error)
@@ -151,12 +154,13 @@ class MotionNode(BaseNode[MotionConfig]):
     async def _on_move(self, handle: ServerGoalHandle) -> MoveArm.Result:
         goal: MoveArm.Goal = handle.request
         begin = time.monotonic()
-        result = MoveArm.Result()
+        result, holding = MoveArm.Result(), ""
         try:
             arm = self._arm(goal.arm)
             with self._claim(goal.arm, wanted=not goal.plan_only):
                 handle.publish_feedback(MoveArm.Feedback(stage="planning"))
-                around = moves.Around(convert.boxes_from_msg(goal.obstacles), convert.boxes_from_msg(goal.attached))
+                held, holding = self._held.on_request(goal.arm, convert.boxes_from_msg(goal.attached), goal.hand_empty)
+                around = moves.Around(convert.boxes_from_msg(goal.obstacles), held)
                 await self._situations.fresh()
                 prepared = self._situations.prepare(
                     arm,
@@ -172,16 +176,17 @@ class MotionNode(BaseNode[MotionConfig]):
                 trajectory: Trajectory = await self.in_thread(lambda: planner(prepared.complete()))
                 result.trajectory = convert.trajectory_msg(trajectory)
                 result.planning_time = time.monotonic() - begin
-                result.message = f"planned, {trajectory.duration:.2f} s{prepared.note}"
+                result.message = f"planned, {trajectory.duration:.2f} s{prepared.note}{holding}"
                 self._preview.show({goal.arm: (trajectory,)})
                 if not goal.plan_only:
                     self._situations.unchanged(prepared.version)
-                    self._hold(goal.arm, tuple(around.attached))
-                    await self._follow(handle, arm, result.trajectory, MoveArm.Feedback(stage="executing"))
-                    result.message = f"arrived{prepared.note}"
+                    self._courses.hold(goal.arm, held)
+                    feedback = MoveArm.Feedback(stage="executing")
+                    result.waited = await self._follow(handle, arm, result.trajectory, feedback, goal.max_wait)
+                    result.message = f"arrived{prepared.note}{holding}"
             result.success, result.code = True, Code.OK.value
         except OpenArmError as error:
-            result.code, result.message = error.code.value, error.message
+            result.code, result.message = error.code.value, error.message + holding
             result.failure = convert.failure_msg(error)
         return self._end(handle, result)
 
@@ -198,7 +203,7 @@ class MotionNode(BaseNode[MotionConfig]):
                 if not goal.plan_only:
                     self._situations.unchanged(result.scene_version)
                     for name, boxes in zip(names, held, strict=True):
-                        self._hold(name, boxes)
+                        self._courses.hold(name, boxes)
                     await self._both.follow(handle, arms, result.trajectories, self._stopper(handle))
                     result.message = f"arrived, {plan.separation * 1e3:.0f} mm apart on the way"
             result.success, result.code = True, Code.OK.value
@@ -215,7 +220,8 @@ class MotionNode(BaseNode[MotionConfig]):
             self._situations.unchanged(goal.scene_version)
             with self._claim(goal.arm, wanted=True):
                 await self._situations.fresh()
-                await self._follow(handle, arm, goal.trajectory, ExecuteTrajectory.Feedback())
+                feedback = ExecuteTrajectory.Feedback()
+                result.waited = await self._follow(handle, arm, goal.trajectory, feedback, goal.max_wait)
             result.success, result.code, result.message = True, Code.OK.value, "arrived"
         except OpenArmError as error:
             result.code, result.message = error.code.value, error.message
@@ -239,21 +245,14 @@ class MotionNode(BaseNode[MotionConfig]):
         return response
 
     # --- parts of these
-    async def _follow(self, handle: ServerGoalHandle, arm: Arm, message: JointTrajectory, feedback: Any) -> None:
-        names, t, q, v, _ = trajectory_from_msg(message)
-        stamp_ns, state = self._states.buffer.latest()
-        motion = check_trajectory(arm, names, t, q, v, state)
-        others = [f.running.rest(stamp_ns) for f in self._followers.values() if f.running is not None]
-        check_against_others(arm, motion, state, others)
-        held = self._held.expected(arm.name, motion)
-        if held is not None:
-            self._hold(arm.name, held)
-
+    async def _follow(
+        self, handle: ServerGoalHandle, arm: Arm, message: JointTrajectory, feedback: Any, max_wait: float
+    ) -> float:
         def progress(value: float) -> None:
             feedback.progress = value
             handle.publish_feedback(feedback)
 
-        await self._followers[arm.name].follow(message, motion, self._stopper(handle), progress)
+        return await self._courses.follow(arm, message, self._stopper(handle), progress, max_wait)
 
     def _planner_of(self, arm: Arm, goal: MoveArm.Goal, around: moves.Around) -> Callable[[Situation], Trajectory]:
         """The plan that a goal asks for, to be made in a thread; poses are looked up here, in the executor's thread."""
@@ -291,14 +290,6 @@ class MotionNode(BaseNode[MotionConfig]):
 
     def _stopper(self, handle: ServerGoalHandle) -> Callable[[], bool]:
         return lambda: self._closing or handle.is_cancel_requested
-
-    def _hold(self, name: str, boxes: tuple[Box, ...]) -> None:
-        if self._held.hold(name, boxes):
-            self._publish_held()
-
-    def _publish_held(self) -> None:
-        held = {name: (self._arms[name].kinematics.tool_link, boxes) for name, boxes in self._held.held.items()}
-        self._attached.publish(convert.markers_msg(held))
 
     def _serve(self, kind: Any, name: str, execute: Callable[[ServerGoalHandle], Any]) -> NamedActionServer:
         return NamedActionServer(self, kind, name, execute, cancel_callback=lambda _: CancelResponse.ACCEPT)

@@ -123,10 +123,17 @@ class SeenMap:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is around the robot, whatever a request says: bodies of the planning scene, and the map."""
+    """What is around the robot, whatever a request says.
+
+    Attributes:
+        solids: Bodies of the planning scene.
+        map: What the cameras see.
+        apart: The arms keep at least this distance from each other, m.
+    """
 
     solids: tuple[Solid, ...] = ()
     map: SeenMap | None = None
+    apart: float = 0.0
 
 
 #: An empty scene, and no map.

@@ -17,7 +17,7 @@ from openarm_common.node import BASE_FRAME, BaseNode
 from openarm_common.tf import RobotStateListener
 from openarm_motion.arm import Arm, Situation
 from openarm_motion.config import MotionConfig
-from openarm_motion.executor import Watch, stale
+from openarm_motion.executor import Follower, Watch, stale
 from openarm_motion.map_eye import Look, MapEye, unexplained
 from openarm_motion.memory import HeldMemory
 from openarm_motion.planning_scene import PlanningScene
@@ -25,6 +25,9 @@ from openarm_motion.seen import Known, carried
 from openarm_motion.solids import Box, Solid
 
 Array = NDArray[np.float64]
+
+#: Beside an arm under way plans keep this distance from where it will end, m: more than what is then proven.
+_BESIDE = 0.035
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +49,7 @@ class Situations:
         arms: By name.
         scene: Bodies.
         held: What the hands hold.
+        followers: Of each arm: what is under way.
     """
 
     def __init__(
@@ -55,7 +59,9 @@ class Situations:
         arms: Mapping[str, Arm],
         scene: PlanningScene,
         held: HeldMemory,
+        followers: Mapping[str, Follower],
     ) -> None:
+        self._followers = followers
         self._node, self._states, self._arms, self._scene, self._held = node, states, arms, scene, held
         name = node.config.map.name or str(node.context.get_domain_id())
         self._eye = MapEye(node.config.map, field_path(name), (BASE_FRAME, node.description.root))
@@ -76,6 +82,8 @@ class Situations:
     ) -> Prepared:
         """The robot as it is now; a given start is enough where the joint states are missing.
 
+        Another arm under way is taken to be where it will end.
+
         Args:
             arm: The arm that is asked.
             start: Its joints, or empty for the present ones.
@@ -93,8 +101,11 @@ class Situations:
         """
         self._scene.require(expected)
         now = self.situation(arm, start, scale, stopped)
-        solids = (*self._scene.solids, *self._others_hold(arm, now.state))
-        return self._prepared(now, solids, estimates, carried(attached, arm.kinematics.fk(now.start)))
+        ends = self._ends(arm)
+        later = {**now.state, **ends}
+        solids = (*self._scene.solids, *self._others_hold(arm, later))
+        held = carried(attached, arm.kinematics.fk(now.start))
+        return self._prepared(now, solids, estimates, held, later, _BESIDE if ends else 0.0)
 
     def prepare_both(
         self,
@@ -114,7 +125,7 @@ class Situations:
             for box in carried(boxes, arm.kinematics.fk(part.start))
         ]
         now = replace(parts[0], start=np.concatenate([part.start for part in parts]))
-        return self._prepared(now, self._scene.solids, estimates, held)
+        return self._prepared(now, self._scene.solids, estimates, held, now.state)
 
     def situation(self, arm: Arm, start: Sequence[float], scale: float, stopped: Callable[[], bool]) -> Situation:
         """Joints alone, without scene and map."""
@@ -159,7 +170,13 @@ class Situations:
         self._scene.require(version)
 
     def _prepared(
-        self, now: Situation, solids: tuple[Solid, ...], estimates: Sequence[Box], held: Sequence[Box]
+        self,
+        now: Situation,
+        solids: tuple[Solid, ...],
+        estimates: Sequence[Box],
+        held: Sequence[Box],
+        later: Mapping[str, float],
+        apart: float = 0.0,
     ) -> Prepared:
         look, config = self.look(), self._node.config.map
         certain = (*self._scene.fixed, *solids)
@@ -169,14 +186,19 @@ class Situations:
             seen = look.seen
             if seen is not None:
                 seen = unexplained(seen, config, robot, now.state, certain, [*estimates, *held])
-            return replace(now, known=Known(solids, seen))
+            return replace(now, state=later, known=Known(solids, seen, apart))
 
         # a graph without a map is as it should be; one with an old map is not
         note = f" without the map: {look.why}" if look.why and look.version else ""
         return Prepared(now, self._scene.version, note, complete)
 
+    def _ends(self, arm: Arm) -> dict[str, float]:
+        """Where the joints of the other arms under way will end."""
+        under_way = [f.running for name, f in self._followers.items() if name != arm.name and f.running is not None]
+        return {joint: x for running in under_way for joint, x in running.motion.at(running.motion.duration).items()}
+
     def _others_hold(self, arm: Arm, state: Mapping[str, float]) -> list[Box]:
-        """What the other arms hold, where they hold it now."""
+        """What the other arms hold, where they hold it in a state."""
         boxes: list[Box] = []
         for name, held in self._held.held.items():
             other = self._arms[name]

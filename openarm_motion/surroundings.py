@@ -20,7 +20,7 @@ class Clearance(Config):
         default=0.003, ge=0.0, le=0.05, description="between links of the arm, and to the robot's body, m"
     )
     world: float = Field(default=0.010, ge=0.0, le=0.1, description="arm to boxes, m")
-    arms: float = Field(default=0.025, ge=0.0, le=0.1, description="arm to the other arm, m")
+    arms: float = Field(default=0.030, ge=0.0, le=0.1, description="arm to the other arm, m")
     hand: float = Field(default=0.010, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
     touch: float = Field(
         default=0.002, ge=0.0, le=0.05, description="arm and palm to a box that the fingers may touch, m"

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.arm import Situation
 from openarm_motion.beside import Course, least_wait
+from openarm_motion.blending import timings
 from openarm_motion.both import SEPARATION, BothArms, BothScene
 from openarm_motion.certificate import certify, dense_times
 from openarm_motion.checks import Motion
 from openarm_motion.collision import Box
 from openarm_motion.failure import PlanFailedError
 from openarm_motion.fast_planner import FastPlanner
-from openarm_motion.trajectory import Trajectory, time_polyline
+from openarm_motion.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
@@ -81,24 +82,25 @@ def plan_together(both: BothArms, now: Situation, wanted: BothGoals, time_limit:
     for arm, part, start in zip(both.arms, scene.placed(now.start), both.parts(now.start), strict=True):
         arm.relax(part, start)
     goals = _pairs(scene, wanted.goals)
-    limits, period = both.limits(now.scale), both.arms[0].config.planning.period
-    least, fault = _least(scene, now.start), ""
+    limits, search = both.limits(now.scale), both.arms[0].config.planning
+    least, fault, contact = _least(scene, now.start), "", None
     for fineness in _FINENESS:
         left = max(end - time.monotonic(), 0.1)
         path = FastPlanner().plan(both.query(scene, now.start, goals, now.scale, left, now.stopped, fineness))
-        whole = time_polyline(both.names, path.waypoints, limits, period)
-        try:
-            certify(scene, whole, _TRAVEL)
-        except OpenArmError as error:
-            fault = error.message
-            continue
-        gap = separation(scene, whole)
-        if gap >= least:
-            q, v, a = (both.parts(x) for x in (whole.q, whole.v, whole.a))
-            first, second = (Trajectory(arm.names, whole.t, q[i], v[i], a[i]) for i, arm in enumerate(both.arms))
-            return BothPlan((first, second), (0.0, 0.0), gap)
-        fault = f"the arms would come within {gap * 1e3:.1f} mm of each other"
-    raise OpenArmError(Code.IN_COLLISION, f"the plan of both arms did not pass the dense look: {fault}")
+        for whole in timings(search.timing, both.names, path.waypoints, limits, search.period):
+            try:
+                certify(scene, whole, _TRAVEL)
+            except PlanFailedError as error:
+                fault, contact = error.message, error.contact
+                continue
+            gap = separation(scene, whole)
+            if gap >= least:
+                q, v, a = (both.parts(x) for x in (whole.q, whole.v, whole.a))
+                first, second = (Trajectory(arm.names, whole.t, q[i], v[i], a[i]) for i, arm in enumerate(both.arms))
+                return BothPlan((first, second), (0.0, 0.0), gap)
+            fault, contact = f"the arms would come within {gap * 1e3:.1f} mm of each other", None
+    text = f"the plan of both arms did not pass the dense look: {fault}"
+    raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
 
 
 def plan_staggered(both: BothArms, now: Situation, wanted: BothGoals, time_limit: float) -> BothPlan:

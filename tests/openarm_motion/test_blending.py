@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openarm_motion import arm as arm_module
+from openarm_motion import blending
 from openarm_motion.arm import Arm, Situation
 from openarm_motion.blending import time_blended, time_quintic
 from openarm_motion.certificate import certify
@@ -115,7 +115,7 @@ def test_a_rounded_corner_that_touches_is_done_with_a_stop(
         if scene.collides(q)
     )
     astray = time_polyline(right.names, np.stack([start, into]), right.limits(0.0))
-    monkeypatch.setattr(arm_module, "time_blended", lambda *_: astray)
+    monkeypatch.setattr(blending, "time_blended", lambda *_: astray)
     monkeypatch.setattr(right, "plan", lambda *_: path)
     plan = right.plan_certified(scene, Situation(home, start), start[None], 5.0)
     np.testing.assert_allclose(plan.trajectory.q[-1], start)

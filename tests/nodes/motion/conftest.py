@@ -22,7 +22,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
 from openarm_common.config import Config
-from openarm_common.convert import matrix_to_pose, matrix_to_transform, ns_to_stamp, trajectory_from_msg
+from openarm_common.convert import matrix_to_pose, matrix_to_transform, ns_to_stamp, stamp_to_ns, trajectory_from_msg
 from openarm_common.description import RobotDescription
 from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF, BaseNode
 from openarm_motion.node import MotionNode
@@ -83,10 +83,11 @@ class FakeRobot:
 
     async def _execute(self, side: str, handle) -> FollowJointTrajectory.Result:
         names, t, q, _, _ = trajectory_from_msg(handle.request.trajectory)
-        self.active[side] = (self.t_ns, names, t, q)
+        begin_ns = stamp_to_ns(handle.request.trajectory.header.stamp) or self.t_ns
+        self.active[side] = (begin_ns, names, t, q)
         result = FollowJointTrajectory.Result(error_code=Result.SUCCESSFUL)
-        end_ns = self.t_ns + int(t[-1] * 1e9)
-        fail_ns = self.t_ns + int(self.fail_after.get(side, 1e6) * 1e9)
+        end_ns = begin_ns + int(t[-1] * 1e9)
+        fail_ns = begin_ns + int(self.fail_after.get(side, 1e6) * 1e9)
         while self.t_ns < min(end_ns, fail_ns) and side not in self.gone and not handle.is_cancel_requested:
             await self._wake
         self.active.pop(side)

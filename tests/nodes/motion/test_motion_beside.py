@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two arms that are asked one by one and move at the same time; what a hand holds from one request to the next."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
+from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox
+
+from openarm_common import se3
+from openarm_common.convert import matrix_to_pose
+from openarm_motion.both import BothArms
+
+MIDDLE = (0.28, 0.0, 0.60)
+
+
+def to(bench, arm: str, p: tuple[float, float, float], **kwargs) -> MoveArm.Goal:
+    pose = bench.stamped(se3.make(bench.DOWN, p))
+    return MoveArm.Goal(arm=arm, kind=MoveArm.Goal.POSE, pose=pose, **{"velocity_scale": 1.0, **kwargs})
+
+
+def execute(arm: str, trajectory, max_wait: float = 30.0) -> ExecuteTrajectory.Goal:
+    return ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_wait=max_wait)
+
+
+def nearest(bench, futures, limit: float = 30.0) -> float:
+    """Wait for results; the least distance of the arms in the states meanwhile."""
+    arms = bench.node._arms
+    both = BothArms(arms["left"], arms["right"])
+    seen: list[dict[str, float]] = []
+    done = lambda: seen.append(dict(bench.robot.state)) or all(f.done() for f in futures)  # noqa: E731
+    bench.ros.spin_until(done, limit, "both arms")
+    scene = both.scene(seen[0])
+    states = np.unique([[state[name] for name in both.names] for state in seen], axis=0)
+    return min(scene.separation(q) for q in states)
+
+
+def leaving(bench) -> tuple[object, object]:
+    """The left arm is over the middle; how it goes home, slowly, and how the right one goes there, quickly."""
+    right = bench.run(bench.move_client, to(bench, "right", MIDDLE, plan_only=True))
+    assert right.success, right.message
+    result = bench.run(bench.move_client, to(bench, "left", MIDDLE))
+    assert result.success, result.message
+    left = bench.run(bench.move_client, bench.named("left", "home", plan_only=True))
+    slow = left.trajectory
+    for point in slow.points:
+        ns = 4 * (point.time_from_start.sec * 10**9 + point.time_from_start.nanosec)
+        point.time_from_start.sec, point.time_from_start.nanosec = divmod(ns, 10**9)
+        point.velocities = [v / 4 for v in point.velocities]
+        point.accelerations = [a / 16 for a in point.accelerations]
+    return slow, right.trajectory
+
+
+def test_n12_an_arm_rests_until_the_one_under_way_leaves_room(bench) -> None:
+    slow, quick = leaving(bench)
+    refused = bench.run(bench.execute_client, execute("right", quick, 0.0))
+    assert refused.code == "IN_COLLISION"
+    _, left = bench.start(bench.execute_client, execute("left", slow))
+    _, right = bench.start(bench.execute_client, execute("right", quick))
+    gap = nearest(bench, [left, right])
+    first, second = left.result().result, right.result().result
+    assert first.success, first.message
+    assert second.success, second.message
+    assert first.waited == 0.0
+    assert 0.1 < second.waited < slow.points[-1].time_from_start.sec + 1.0
+    assert gap >= 0.020
+    tip = bench.node._arms["right"].kinematics.fk(bench.q("right"))[:3, 3]
+    np.testing.assert_allclose(tip, MIDDLE, atol=2e-3)
+
+
+def test_n12_no_rest_is_long_enough_for_an_arm_that_ends_in_the_way(bench) -> None:
+    both = [bench.run(bench.move_client, to(bench, side, MIDDLE, plan_only=True)) for side in ("left", "right")]
+    _, left = bench.start(bench.execute_client, execute("left", both[0].trajectory))
+    right = bench.run(bench.execute_client, execute("right", both[1].trajectory))
+    assert right.code == "IN_COLLISION"
+    assert "openarm_left_" in right.message
+    assert "no rest before it helps" in right.message
+    assert bench.ros.result(left).result.success
+
+
+def test_n12_an_arm_holds_when_the_other_stops_in_its_way(bench) -> None:
+    slow, quick = leaving(bench)
+    bench.robot.fail_after = {"left": 0.3}
+    _, left = bench.start(bench.execute_client, execute("left", slow))
+    bench.ros.spin_until(lambda: "left" in bench.robot.active, 5.0, "the left arm to set out")
+    # sent while the left one is under way
+    _, right = bench.start(bench.execute_client, execute("right", quick))
+    gap = nearest(bench, [left, right])
+    assert left.result().result.code == "EXECUTION_FAILED"
+    result = right.result().result
+    assert result.code == "IN_COLLISION"
+    assert "left" in result.message
+    assert gap >= 0.020
+
+
+def approach(arm: str, y: float) -> PlanApproach.Goal:
+    targets: list[ApproachTarget] = []
+    for yaw in np.arange(8) * np.pi / 4:
+        rotation = se3.rotation_from_z_y((0, 0, -1), (np.cos(yaw), np.sin(yaw), 0.0))
+        target = ApproachTarget(id=f"{yaw:.1f}", pose=matrix_to_pose(se3.make(rotation, (0.27, y, 0.425))), score=1.0)
+        target.approach_offset.z, target.retreat_offset.z = 0.08, 0.12
+        targets.append(target)
+    cube = CollisionBox(id="cube", pose=matrix_to_pose(se3.make(None, (0.27, y, 0.425))))
+    cube.size.x = cube.size.y = cube.size.z = 0.05
+    return PlanApproach.Goal(
+        arm=arm,
+        targets=targets,
+        obstacles=[cube],
+        touchable=["cube"],
+        attached_after_approach=True,
+        velocity_scale=1.0,
+    )
+
+
+def test_a68_an_approach_is_planned_beside_where_the_other_arm_will_end(bench) -> None:
+    slow, _ = leaving(bench)
+    blocked = bench.run(bench.plan_client, approach("right", -0.02))
+    assert (blocked.success, blocked.failure.stage) == (False, "goal"), blocked.message
+    assert "openarm_left_" in blocked.failure.second
+    _, left = bench.start(bench.execute_client, execute("left", slow))
+    bench.ros.spin_until(lambda: "left" in bench.robot.active, 5.0, "the left arm to set out")
+    plan = bench.run(bench.plan_client, approach("right", -0.02))
+    assert plan.success, plan.message
+    assert 0.0 < plan.wait < 20.0
+    assert not left.done()
+    _, right = bench.start(bench.execute_client, execute("right", plan.transfer))
+    assert nearest(bench, [left, right]) >= 0.020
+    assert right.result().result.success, right.result().result.message
+
+
+def test_n12_two_grasps_are_carried_out_at_once(bench) -> None:
+    """Each arm is asked for itself: free path, approach and retreat, the next as soon as the last has ended."""
+    sides = {"left": 0.10, "right": -0.10}
+    plans = {side: bench.run(bench.plan_client, approach(side, y)) for side, y in sides.items()}
+    for plan in plans.values():
+        assert plan.success, plan.message
+    parts = {side: [plan.transfer, plan.approach, plan.retreat] for side, plan in plans.items()}
+    ends: dict[str, list[str]] = {side: [] for side in sides}
+    under_way: dict[str, object] = {}
+
+    def step() -> bool:
+        for side in sides:
+            future = under_way.get(side)
+            if future is not None and future.done():
+                ends[side].append(future.result().result.code)
+                under_way[side] = None
+            if under_way.get(side) is None and parts[side]:
+                under_way[side] = bench.start(bench.execute_client, execute(side, parts[side].pop(0)))[1]
+        together.append(len(bench.robot.active))
+        seen.append(dict(bench.robot.state))
+        return not any(parts.values()) and all(future is None for future in under_way.values())
+
+    together: list[int] = []
+    seen: list[dict[str, float]] = []
+    bench.ros.spin_until(step, 40.0, "both grasps")
+    assert ends == dict.fromkeys(sides, ["OK"] * 3)
+    assert max(together) == 2
+    both = BothArms(bench.node._arms["left"], bench.node._arms["right"])
+    scene = both.scene(seen[0])
+    assert min(scene.separation(np.array([state[n] for n in both.names])) for state in seen[::3]) >= 0.020
+
+
+# --- what is held
+@pytest.fixture
+def holding(bench):
+    """The right hand has just lifted a cube."""
+    plan = bench.run(bench.plan_client, approach("right", -0.24))
+    for part in (plan.transfer, plan.approach, plan.retreat):
+        assert bench.run(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=part)).success
+    bench.ros.spin_until(lambda: bench.held() == ["right/cube"], 5.0, "the cube to be shown as held")
+    return bench
+
+
+def test_p04_what_is_held_stays_so_until_a_request_says_otherwise(holding) -> None:
+    bench = holding
+    shelf = CollisionBox(id="shelf", pose=matrix_to_pose(se3.make(None, (0.27, -0.24, 0.465))))
+    shelf.size.x, shelf.size.y, shelf.size.z = 0.30, 0.30, 0.01
+    goal = to(bench, "right", (0.27, -0.24, 0.500), obstacles=[shelf], plan_only=True)
+    refused = bench.run(bench.move_client, goal)
+    assert refused.code == "IN_COLLISION", refused.message
+    assert (refused.failure.first, refused.failure.second) == ("held cube", "shelf")
+    assert "with cube in the hand as before (hand_empty: true if it holds nothing any more)" in refused.message
+    assert bench.held() == ["right/cube"]
+
+    moved = bench.run(bench.move_client, to(bench, "right", (0.27, -0.20, 0.56)))
+    assert moved.success, moved.message
+    assert "with cube in the hand" in moved.message
+    assert bench.held() == ["right/cube"]
+
+    goal.hand_empty = True
+    assert bench.run(bench.move_client, goal).success
+    assert bench.held() == ["right/cube"]  # a plan alone forgets nothing
+    both = bench.named("right", "home", hand_empty=True)
+    both.attached = [CollisionBox(id="cup", pose=matrix_to_pose(np.eye(4)), size=shelf.size)]
+    result = bench.run(bench.move_client, both)
+    assert result.code == "INVALID_ARGUMENT"
+    assert "attached names cup, and hand_empty is true" in result.message
+    assert bench.run(bench.move_client, bench.named("right", "home", hand_empty=True)).success
+    bench.ros.spin_until(lambda: bench.held() == [], 5.0, "an empty hand")
+
+
+def test_p04_motions_of_both_arms_keep_what_is_held(holding) -> None:
+    bench = holding
+    targets = [ArmTarget(arm=side, kind=ArmTarget.NAMED, named="home") for side in ("left", "right")]
+    assert bench.run(bench.both_client, MoveArms.Goal(targets=targets, velocity_scale=1.0)).success
+    assert bench.held() == ["right/cube"]
+    targets[1].hand_empty = True
+    assert bench.run(bench.both_client, MoveArms.Goal(targets=targets, velocity_scale=1.0)).success
+    bench.ros.spin_until(lambda: bench.held() == [], 5.0, "an empty hand")
