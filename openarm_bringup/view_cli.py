@@ -6,6 +6,8 @@ from __future__ import annotations
 import asyncio
 import signal
 import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -16,7 +18,7 @@ from openarm_bringup.view_guard import LOOPBACK
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
-    from openarm_bringup.view_server import Item
+    from openarm_bringup.view_server import ViewServer
 
 
 def view(
@@ -48,12 +50,6 @@ async def _serve(host: str, port: int, show: bool) -> str:
     from aiohttp import web
     from rich.console import Console
 
-    from openarm_bringup.view_client import GraphView
-    from openarm_bringup.view_guard import Guard
-    from openarm_bringup.view_server import ViewServer
-    from openarm_bringup.view_wire import robot_shapes
-    from openarm_grasp.states import State
-
     loop = asyncio.get_running_loop()
     stop: asyncio.Future[None] = loop.create_future()
 
@@ -61,19 +57,9 @@ async def _serve(host: str, port: int, show: bool) -> str:
         if not stop.done():
             stop.set_result(None) if error is None else stop.set_exception(error)
 
-    def take(item: Item) -> None:
-        loop.call_soon_threadsafe(server.put, item)
-
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, end)
-    graph = GraphView(take, lambda error: loop.call_soon_threadsafe(end, error))
-    hello = {
-        "robot": robot_shapes(graph.description),
-        "cameras": [camera.name for camera in graph.cameras],
-        "states": [state.value for state in State],
-    }
-    server = ViewServer(Guard(host), hello, graph)
-    with graph:
+    with make_server(host, end) as server:
         runner = web.AppRunner(server.app(), access_log=None, shutdown_timeout=1.0)
         await runner.setup()
         try:
@@ -92,3 +78,32 @@ async def _serve(host: str, port: int, show: bool) -> str:
         finally:
             await runner.cleanup()
     return address
+
+
+@contextmanager
+def make_server(host: str, on_end: Callable[[BaseException], None]) -> Iterator[ViewServer]:
+    """The server of the page and the thread that looks at the graph; within a running asyncio loop.
+
+    Args:
+        host: Address that the server will listen on.
+        on_end: Called in the loop with what ended the thread too early.
+    """
+    from openarm_bringup.view_client import GraphView
+    from openarm_bringup.view_guard import Guard
+    from openarm_bringup.view_server import ViewServer
+    from openarm_bringup.view_wire import robot_shapes
+    from openarm_grasp.states import State
+
+    loop = asyncio.get_running_loop()
+    graph = GraphView(
+        lambda item: loop.call_soon_threadsafe(server.put, item),
+        lambda error: loop.call_soon_threadsafe(on_end, error),
+    )
+    hello = {
+        "robot": robot_shapes(graph.description),
+        "cameras": [camera.name for camera in graph.cameras],
+        "states": [state.value for state in State],
+    }
+    server = ViewServer(Guard(host), hello, graph)
+    with graph:
+        yield server

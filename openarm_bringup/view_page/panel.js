@@ -53,7 +53,7 @@ export class AskPanel {
       event.preventDefault();
       this.#pick(new FormData($("ask")));
     });
-    $("cancel").addEventListener("click", async () => this.#tell("outcome", await this.ask("cancel")));
+    $("cancel").addEventListener("click", () => this.#cancel());
     $("reset").addEventListener("click", () => this.#reset({}));
     $("shuffle").addEventListener("click", () => this.#reset({ scene: "random", seed: Math.floor(Math.random() * 1e6) }));
   }
@@ -91,6 +91,11 @@ export class AskPanel {
   async #pick(form) {
     const answer = await this.ask("pick", { label: this.label, arm: form.get("arm"), dry_run: form.has("dry_run") });
     if (!answer.success) this.#tell("outcome", answer);
+  }
+
+  async #cancel() {
+    const answer = await this.ask("cancel");
+    if (!answer.success) this.#tell("outcome", answer); // else the end of the grasp says it, perhaps before this answer
   }
 
   async #reset(order) {

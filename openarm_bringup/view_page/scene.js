@@ -31,7 +31,7 @@ const SOLID = [
   void main() {
     vec3 normal = normalize(n), view = normalize(eye - p);
     const vec3 key = vec3(0.43, -0.52, 0.74);
-    vec3 light = mix(ground, sky, 0.5 + 0.5 * normal.z) + 0.62 * max(dot(normal, key), 0.0);
+    vec3 light = mix(ground, sky, 0.5 + 0.5 * normal.z) + 0.55 * max(dot(normal, key), 0.0);
     float shine = pow(max(dot(normal, normalize(key + view)), 0.0), 40.0);
     float rim = pow(1.0 - max(dot(normal, view), 0.0), 3.0);
     color = vec4(c.rgb * light + 0.10 * shine + 0.09 * rim * sky, c.a);

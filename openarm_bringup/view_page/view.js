@@ -40,7 +40,7 @@ const handlers = {
   },
   cloud(head, body) {
     const end = 12 * head.count;
-    scene.setPoints("cloud", new Float32Array(body, 0, 3 * head.count), new Uint8Array(body, end), 3, 0.009);
+    scene.setPoints("cloud", new Float32Array(body, 0, 3 * head.count), new Uint8Array(body, end), 3, 0.011);
   },
   map(head, body) {
     drawMap(new Float32Array(body), head.count);
@@ -209,8 +209,8 @@ function drawLines(name, ends, color) {
 function drawFloor() {
   const dark = matchMedia("(prefers-color-scheme: dark)").matches;
   scene.theme = dark
-    ? { background: [0.06, 0.078, 0.086], sky: [0.78, 0.82, 0.84], ground: [0.42, 0.42, 0.44] }
-    : { background: [0.914, 0.933, 0.941], sky: [0.72, 0.74, 0.75], ground: [0.46, 0.45, 0.44] };
+    ? { background: [0.06, 0.078, 0.086], sky: [0.6, 0.64, 0.66], ground: [0.34, 0.34, 0.36] }
+    : { background: [0.914, 0.933, 0.941], sky: [0.68, 0.7, 0.71], ground: [0.44, 0.43, 0.42] };
   const [ends, colors] = [[], []];
   const line = (a, b) => {
     for (let k = 0; k < 20; k++) {

@@ -15,7 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import aiohttp
+import cv2
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome", "chrome")
 #: Software rendering, nothing from the net, nothing of the user's.
@@ -73,17 +76,31 @@ class Tab:
             await asyncio.sleep(0.05)
         return value
 
+    async def box(self, selector: str) -> dict[str, float]:
+        """Where an element is in the window, which is scrolled there."""
+        element = f"document.querySelector({selector!r})"
+        return await self.js(f"({element}.scrollIntoViewIfNeeded(), {element}.getBoundingClientRect().toJSON())")
+
     async def click(self, selector: str) -> None:
         """Click the middle of an element, as a mouse does."""
-        box = f"document.querySelector({selector!r}).getBoundingClientRect()"
-        x, y = await self.js(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
+        box = await self.box(selector)
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
         for kind in ("mousePressed", "mouseReleased"):
             await self.do("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
     async def picture(self, path: Path) -> None:
         """Save what the page looks like."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(base64.b64decode((await self.do("Page.captureScreenshot", format="png"))["data"]))
+        path.write_bytes(await self._png())
+
+    async def image(self, selector: str) -> NDArray[np.uint8]:
+        """What an element looks like, with what lies on it: (h, w, 3), BGR."""
+        box = await self.box(selector)
+        clip = {key: box[key] for key in ("x", "y", "width", "height")} | {"scale": 1}
+        return cv2.imdecode(np.frombuffer(await self._png(clip=clip), np.uint8), cv2.IMREAD_COLOR)
+
+    async def _png(self, **more: Any) -> bytes:
+        return base64.b64decode((await self.do("Page.captureScreenshot", format="png", **more))["data"])
 
     async def size(self, width: int, height: int, dark: bool = False) -> None:
         """Give the window a size, and the taste of its user."""
