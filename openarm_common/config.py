@@ -61,7 +61,7 @@ def describe_faults(error: ValidationError, where: str, model: type[BaseModel]) 
     faults: list[str] = []
     for item in error.errors():
         key = ".".join(str(part) for part in item["loc"]) or "(top level)"
-        text = item["msg"]
+        text = item["msg"].removeprefix("Value error, ")
         if item["type"] == "extra_forbidden":
             text = "unknown key" + (f"; valid keys: {', '.join(model.model_fields)}" if len(item["loc"]) == 1 else "")
         elif item["type"] != "missing":
