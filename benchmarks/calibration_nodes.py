@@ -29,7 +29,7 @@ from openarm_bringup.calibration_run import CalibrationOptions, as_row, run_cali
 from openarm_bringup.demo import parse_seeds
 from openarm_calibration.offline import calibrate
 from openarm_calibration.refine import mount_error
-from openarm_calibration.samples import load_session
+from openarm_calibration.session_file import load_session
 from openarm_common.cameras import load_cameras, true_mount
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError

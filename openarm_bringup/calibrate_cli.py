@@ -136,7 +136,7 @@ def together(
         store: Folder of stored calibrations.
     """
     from openarm_calibration.report import summary
-    from openarm_calibration.samples import load_session
+    from openarm_calibration.session_file import load_session
     from openarm_calibration.together import calibrate_together
     from openarm_common.description import RobotDescription
 

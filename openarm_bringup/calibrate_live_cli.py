@@ -6,10 +6,11 @@ from __future__ import annotations
 import math
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from openarm_bringup.calibration_source import store_in
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
@@ -19,13 +20,17 @@ if TYPE_CHECKING:
     from openarm_bringup.supervisor import Event
     from openarm_calibration.client import AutoResult
 
+#: Of ROS_DOMAIN_ID; there are no ports above.
+LAST_DOMAIN = 232
+#: Of the node's parameter auto.poses.
+MOST_POSES = 100
 Flag = Annotated[bool, Parameter(negative=())]
 
 
 def auto(
     *,
     camera: str = "both",
-    mount_seed: int | None = None,
+    mount_seed: str | None = None,
     poses: int = 0,
     save: Flag = False,
     store: Path | None = None,
@@ -41,7 +46,7 @@ def auto(
 
     Args:
         camera: Name of a camera (overhead, wrist), or both, one after the other.
-        mount_seed: Of the simulated mounts; that of the graph `calibrate` when not given.
+        mount_seed: Of the simulated mounts, or "none"; that of the graph `calibrate` when not given.
         poses: Samples a camera at most; 0: the node's parameter auto.poses.
         save: Store the result, unless it fails the limits.
         store: Folder of stored calibrations.
@@ -59,14 +64,21 @@ def auto(
 
     if poses < 0 or 0 < poses < 4:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--poses {poses}: at least 4 are needed, 10 to 15 are usual")
-    if mount_seed is not None and mount_seed < 0:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"--mount-seed {mount_seed}: expected 0 or more")
+    if poses > MOST_POSES:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--poses {poses}: expected 4 to {MOST_POSES}; 10 to 15 are usual")
+    seed: int | Literal["none"] | None = "none" if mount_seed == "none" else None
+    if mount_seed is not None and seed is None:
+        if not mount_seed.isdecimal():
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"--mount-seed {mount_seed}: expected 0 or more, or none")
+        seed = int(mount_seed)
+    if store is not None:
+        store_in(store)
     show = _Show()
     if running:
         return _running(camera, poses, save, delay, domain, show)
     cameras = ("overhead", "wrist") if camera == "both" else chosen_cameras((camera,))
     options = CalibrationOptions(
-        cameras=cameras, mount_seed=mount_seed, poses=poses, save=save, store=store, delay=delay, domain=domain,
+        cameras=cameras, mount_seed=seed, poses=poses, save=save, store=store, delay=delay, domain=domain,
         sets=tuple(set_),
     )  # fmt: skip
     listeners = CalibrationListeners(show.event, show.ready, show.camera, show.feedback)
@@ -85,11 +97,11 @@ def sample(*, remove: str | None = None, session: str = "", advice: Flag = False
         advice: Take none; list what there is and what to do next.
         domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
     """
-    from openarm_bringup.pick_cli import meet_graph
-
     if remove is not None and advice:
         raise OpenArmError(Code.INVALID_ARGUMENT, "--remove and --advice exclude each other")
-    meet_graph(domain)
+    if session and not session.endswith(".npz"):
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--session {session}: expected a name that ends in .npz")
+    _meet(domain)
     from openarm_calibration.client import CalibrationClient
 
     with CalibrationClient() as client:
@@ -107,13 +119,11 @@ def sample(*, remove: str | None = None, session: str = "", advice: Flag = False
 
 
 def _running(camera: str, poses: int, save: bool, delay: bool, domain: int | None, show: _Show) -> Outcome:
-    from openarm_bringup.pick_cli import meet_graph
-
     if camera == "both":
         raise OpenArmError(
             Code.INVALID_ARGUMENT, "--running needs --camera NAME: the board has to be moved between the cameras"
         )
-    meet_graph(domain)
+    _meet(domain)
     from openarm_calibration.client import CalibrationClient
 
     show.camera(camera)
@@ -126,6 +136,14 @@ def _running(camera: str, poses: int, save: bool, delay: bool, domain: int | Non
         except KeyboardInterrupt:
             return Outcome(False, "cancelled by Ctrl-C; the arm stands where it is", Code.CANCELLED)
     return _outcome({camera: result}, None, None)
+
+
+def _meet(domain: int | None) -> None:
+    from openarm_bringup.pick_cli import meet_graph
+
+    if domain is not None and not 0 <= domain <= LAST_DOMAIN:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--domain {domain}: expected 0 to {LAST_DOMAIN}")
+    meet_graph(domain)
 
 
 class _Show:
@@ -155,7 +173,7 @@ class _Show:
         line = f"pose {feedback.pose:>2} of {feedback.poses}  {feedback.stage:<9}{sigma:<42}{feedback.message}"
         if line != self._last:
             self._last = line
-            self._console.print(line, markup=False)
+            self._console.print(line, markup=False, soft_wrap=True)
 
 
 def _outcome(results: dict[str, AutoResult], error: OpenArmError | None, run_dir: Path | None) -> Outcome:
@@ -194,7 +212,7 @@ def _page(session: Path, out: Path) -> None:
     """Write the page of a session, when there is one that can be solved."""
     from openarm_calibration.offline import calibrate
     from openarm_calibration.report import page
-    from openarm_calibration.samples import load_session
+    from openarm_calibration.session_file import load_session
     from openarm_common.description import RobotDescription
 
     if not session.is_file():

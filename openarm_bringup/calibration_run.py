@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from openarm_bringup import environment, runs
 from openarm_bringup.graph import load_graph
@@ -32,7 +32,7 @@ class CalibrationOptions:
 
     Args:
         cameras: Names; each needs a scene `calibration_<camera>`.
-        mount_seed: Of the true mounts; None is the graph's.
+        mount_seed: Of the true mounts, or "none"; None is the graph's.
         poses: Samples a camera at most; 0 is the node's parameter.
         enough: Predicted errors that end it, m and rad; 0 is the node's parameter.
         save: Store results that do not fail.
@@ -43,7 +43,7 @@ class CalibrationOptions:
     """
 
     cameras: tuple[str, ...] = ("overhead", "wrist")
-    mount_seed: int | None = None
+    mount_seed: int | Literal["none"] | None = None
     poses: int = 0
     enough: tuple[float, float] = (0.0, 0.0)
     save: bool = False

@@ -90,7 +90,7 @@ def with_solved(
 
 
 def _from_session(path: Path, recording: Recording) -> tuple[SampleSet, str]:
-    from openarm_calibration.samples import load_session
+    from openarm_calibration.session_file import load_session
     from openarm_common.description import RobotDescription
 
     given = [f"--{f.name.replace('_', '-')}" for f in fields(recording) if getattr(recording, f.name) != f.default]
@@ -130,9 +130,15 @@ def _board(text: str) -> Board:
 
 
 def store_in(folder: Path | None) -> CalibrationStore:
-    """The store of a folder; without one, the default."""
+    """The store of a folder; without one, the default.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when it is a file.
+    """
     from openarm_calibration.store import CalibrationStore, default_folder
 
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--store {folder} is a file, expected a folder")
     return CalibrationStore(folder if folder is not None else default_folder())
 
 

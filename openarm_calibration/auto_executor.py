@@ -18,7 +18,8 @@ from openarm_calibration.convert import fill
 from openarm_calibration.next_pose import PoseSearch, Proposal
 from openarm_calibration.offline import Result
 from openarm_calibration.photo_client import wait_until
-from openarm_calibration.samples import Sample, session_path, without
+from openarm_calibration.samples import Sample, without
+from openarm_calibration.session_file import session_path
 from openarm_calibration.verdict import estimate_delay
 from openarm_common import se3
 from openarm_common.convert import matrix_to_pose, vector

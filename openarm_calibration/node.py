@@ -26,7 +26,7 @@ from openarm_calibration.auto_executor import AutoCalibrator
 from openarm_calibration.convert import fill
 from openarm_calibration.offline import ALGORITHMS, checked_algorithm
 from openarm_calibration.poses import advice
-from openarm_calibration.samples import load_session, session_path
+from openarm_calibration.session_file import load_session, session_path
 from openarm_calibration.session_node import SessionNode
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import run

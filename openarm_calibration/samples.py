@@ -13,7 +13,6 @@ import io
 import json
 import os
 import tempfile
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,7 +28,7 @@ from openarm_calibration.detect import Detection, guess_pose
 from openarm_calibration.problem import Problem, View, assemble, difference
 from openarm_common import se3
 from openarm_common.cameras import T_LINK_OPTICAL, Intrinsics
-from openarm_common.config import Config, validate
+from openarm_common.config import Config
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
 
@@ -252,51 +251,6 @@ class SampleSet:
         except OSError as error:
             raise OpenArmError(Code.ENVIRONMENT, f"can't write {path}: {error.strerror}") from error
         return hashlib.sha256(text.encode()).hexdigest()
-
-
-def load_session(path: Path, description: RobotDescription) -> tuple[SampleSet, str]:
-    """Read a session file; returns the samples and the hash.
-
-    Raises:
-        OpenArmError: CONFIG_INVALID, when it is missing, damaged, or no session.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            text = bytes(data["head"]).decode()
-            document = json.loads(text)
-            head = validate(SessionHead, document["head"], f"{path}:head")
-            out = SampleSet(head, description)
-            for k, entry in enumerate(document["samples"]):
-                ids, pixels = data[f"ids_{k}"].astype(np.int64), data[f"pixels_{k}"].astype(np.float64)
-                if pixels.shape != (len(ids), 2) or (len(ids) and ids.max() >= len(out.board.points)):
-                    raise ValueError(f"sample {k} has {len(ids)} ids and pixels {pixels.shape}")
-                out.add(
-                    Sample(
-                        entry["name"], entry["t_image_ns"], entry["t_joints_ns"], entry["joints"], entry["speed"],
-                        Detection(ids, pixels, entry["residual"]), data[f"pose_{k}"].astype(np.float64),
-                        data[f"png_{k}"].tobytes(), tuple((t, state) for t, state in entry["track"]),
-                    )
-                )  # fmt: skip
-    except FileNotFoundError as error:
-        raise OpenArmError(Code.CONFIG_INVALID, f"session file {path} does not exist") from error
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        raise OpenArmError(
-            Code.CONFIG_INVALID, f"{path} is no session file, or damaged: {type(error).__name__}: {error}"
-        ) from error
-    return out, hashlib.sha256(text.encode()).hexdigest()
-
-
-def session_path(text: str) -> Path:
-    """Path of a session file that was asked for.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, when it is empty.
-    """
-    if not text:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT, "path is empty; expected the name of a session file that ends in .npz"
-        )
-    return Path(text).expanduser()
 
 
 def moving_joints(head: SessionHead, description: RobotDescription) -> tuple[str, ...]:

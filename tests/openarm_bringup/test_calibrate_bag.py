@@ -19,7 +19,7 @@ from openarm_bringup import cli
 from openarm_bringup.bag import BagWriter
 from openarm_bringup.recorder_client import from_profile
 from openarm_calibration.refine import mount_error
-from openarm_calibration.samples import load_session
+from openarm_calibration.session_file import load_session
 from openarm_calibration.store import CalibrationStore
 from openarm_calibration.synthetic_session import BOARD, Known, make_session, photograph
 from openarm_common import se3

@@ -73,6 +73,21 @@ def test_a43_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) ->
     assert "mm" in out
 
 
+def test_a45_a_stored_file_that_would_run_something_is_told_and_not_run(capsys, tmp_path: Path) -> None:
+    """Also one that is cut short, and one whose name is a trick."""
+    store = tmp_path / "store"
+    store.mkdir(exist_ok=True)
+    (store / "wrist.yaml").write_text("!!python/object/apply:os.system ['touch " + str(tmp_path / "ran") + "']")
+    (store / "overhead.yaml").write_text("format: 1\ncamera: over")
+    (store / "..wrist.yaml").write_text("camera: ..wrist")
+    code, out, err = run(capsys, "list")
+    assert code == 1
+    assert "wrist.yaml" in err
+    assert "overhead.yaml" in err
+    assert "Traceback" not in out + err
+    assert not (tmp_path / "ran").exists()
+
+
 @pytest.mark.parametrize(
     ("argv", "code", "words"),
     [
@@ -85,7 +100,10 @@ def test_a43_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) ->
         (["solve", "nowhere.npz"], 1, "does not exist"),
         (["solve", "SESSION", "--algorithm", "tsay"], 2, "algorithms: REFINED, TSAI"),
         (["solve", "SESSION", "--exclude", "s999"], 2, "samples: s001"),
-        (["solve", __file__], 1, "no session file, or damaged"),
+        (["solve", __file__], 1, "is no session file"),
+        (["solve", "SESSION", "--store", "SESSION"], 2, "is a file, expected a folder"),
+        (["list", "--store", "SESSION"], 2, "is a file, expected a folder"),
+        (["report", "SESSION", "/proc/nowhere/page.html"], 1, "can't write /proc/nowhere/page.html"),
         (["report", "SESSION", "page.doc"], 2, "written as .html"),
         (["rollback", "../wrist"], 2, "camera name"),
         (["rollback", "wrist"], 1, "has 0 stored"),
@@ -95,10 +113,16 @@ def test_a43_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) ->
         (["auto", "--poses", "2"], 2, "at least 4"),
         (["auto", "--camera", "sideways"], 2, "cameras: overhead, wrist"),
         (["auto", "--camera", "spectator"], 2, "cameras: overhead, wrist"),
-        (["auto", "--mount-seed", "-3"], 2, "expected 0 or more"),
+        (["auto", "--mount-seed", "-3"], 2, "expected 0 or more, or none"),
+        (["auto", "--mount-seed", "one"], 2, "expected 0 or more, or none"),
+        (["auto", "--poses", "101"], 2, "expected 4 to 100"),
+        (["auto", "--store", "SESSION"], 2, "is a file, expected a folder"),
         (["auto", "--set", "nonsense"], 2, "expected node.param=value"),
         (["auto", "--running"], 2, "--camera NAME"),
         (["sample", "--remove", "last", "--advice"], 2, "exclude each other"),
+        (["sample", "--session", "samples.txt"], 2, "ends in .npz"),
+        (["sample", "--domain", "233"], 2, "expected 0 to 232"),
+        (["auto", "--running", "--camera", "wrist", "--domain", "-1"], 2, "expected 0 to 232"),
     ],
 )
 def test_wrong_calls_say_what_is_wrong(

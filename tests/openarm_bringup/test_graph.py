@@ -84,7 +84,7 @@ def test_need_of_itself_is_a_circle(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("{message: /joint_states}", "{message: /a, topic: /b}", "nodes.bridge.ready.0: Value error, give exactly one"),
+        ("{message: /joint_states}", "{message: /a, topic: /b}", "nodes.bridge.ready.0: give exactly one"),
         ("{message: /joint_states}", "{message: joint_states}", "must be an absolute name, such as /joint_states"),
         ("module: toy.arm", "modul: toy.arm", "nodes.arm.modul: unknown key"),
         ("seed: 3", "seed: -3", "seed: Input should be greater than or equal to 0, got -3"),

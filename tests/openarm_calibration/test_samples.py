@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from pathlib import Path
@@ -12,7 +13,8 @@ import pytest
 
 from openarm_calibration.gate import GateConfig, match
 from openarm_calibration.refine import mount_error
-from openarm_calibration.samples import load_session, without
+from openarm_calibration.samples import without
+from openarm_calibration.session_file import load_session
 from openarm_calibration.solve import SolveConfig, solve
 from openarm_calibration.verdict import assess, estimate_delay, side_by_side
 from openarm_common.description import RobotDescription
@@ -80,8 +82,14 @@ def test_samples_are_removed_by_name_and_a_wrong_name_lists_them(session) -> Non
     assert len(samples) == 1
 
 
-@pytest.mark.parametrize("damage", ["cut", "text", "empty", "pickle", "missing"])
-def test_a_damaged_session_is_refused(session, tmp_path: Path, damage: str) -> None:
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        ("cut", "damaged"), ("text", "expected an .npz archive"), ("empty", "is empty"), ("pickle", "damaged"),
+        ("missing", "does not exist"), ("folder", "Is a directory"),
+    ],
+)  # fmt: skip
+def test_a_damaged_session_is_refused(session, tmp_path: Path, damage: str, words: str) -> None:
     known = session(count=3)
     path = tmp_path / "s.npz"
     known.samples.save(path)
@@ -96,9 +104,51 @@ def test_a_damaged_session_is_refused(session, tmp_path: Path, damage: str) -> N
         np.savez(path, head=np.array([{}], dtype=object))
     else:
         path.unlink()
-    with pytest.raises(OpenArmError, match=r"session file|no session file") as caught:
+        if damage == "folder":
+            path.mkdir()
+    with pytest.raises(OpenArmError, match=words) as caught:
         load_session(path, known.description)
     assert caught.value.code == Code.CONFIG_INVALID
+
+
+def rewritten(known, path: Path, change) -> Path:
+    """A session file whose JSON and arrays somebody changed."""
+    known.samples.save(path)
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    document = json.loads(bytes(arrays["head"]).decode())
+    change(document, arrays)
+    arrays["head"] = np.frombuffer(json.dumps(document).encode(), dtype=np.uint8)
+    np.savez(path, **arrays)
+    return path
+
+
+def _renamed(joints: dict[str, float]) -> dict[str, float]:
+    return {name.replace("openarm_right", "panda"): value for name, value in joints.items()}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d, a: d["samples"][1].update(joints=_renamed(d["samples"][1]["joints"])), "another robot: it lacks"),
+        (lambda d, a: d["head"].update(parent="tool0"), "no link 'tool0'; links:"),
+        (lambda d, a: d["head"].update(camera="../wrist"), "head:camera"),
+        (lambda d, a: d["head"].update(board={"kind": "dots"}), "boards: circles, charuco"),
+        (lambda d, a: d["head"].update(board={"kind": "circles", "rows": 7}), "marks that its board does not have"),
+        (lambda d, a: a["pixels_1"].__setitem__((0, 0), math.nan), "all finite"),
+        (lambda d, a: a["ids_1"].__setitem__(0, -1), "marks that its board does not have"),
+        (lambda d, a: a["ids_1"].__setitem__(0, 1), "or twice"),
+        (lambda d, a: a.update(pose_1=np.eye(3)), "pose"),
+        (lambda d, a: a.pop("ids_2"), "ids_2"),
+        (lambda d, a: d["samples"][0].update(t_image_ns="soon"), "soon"),
+        (lambda d, a: d["samples"][0].update(name="s002"), "already"),
+        (lambda d, a: d.pop("samples"), "samples"),
+    ],
+)
+def test_a_changed_session_or_one_of_another_robot_is_refused_by_name(session, tmp_path, change, words: str) -> None:
+    known = session(count=3)
+    with pytest.raises(OpenArmError, match=words):
+        load_session(rewritten(known, tmp_path / "s.npz", change), known.description)
 
 
 def test_n09_a_delay_of_20_ms_is_estimated_to_1_ms(session) -> None:

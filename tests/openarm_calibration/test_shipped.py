@@ -11,7 +11,7 @@ import pytest
 
 from openarm_calibration.offline import calibrate
 from openarm_calibration.refine import mount_error
-from openarm_calibration.samples import load_session
+from openarm_calibration.session_file import load_session
 from openarm_calibration.store import CalibrationStore, StoredCalibration, of_these_mounts, places
 from openarm_common import se3
 from openarm_common.cameras import load_cameras, true_mount

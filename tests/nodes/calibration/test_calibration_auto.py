@@ -18,7 +18,7 @@ from rclpy.task import Future
 
 from openarm_calibration.node import CalibrationNode
 from openarm_calibration.refine import mount_error
-from openarm_calibration.samples import load_session
+from openarm_calibration.session_file import load_session
 from openarm_calibration.store import CalibrationStore
 from openarm_calibration.synthetic_session import Known, make_session
 from openarm_common import se3
