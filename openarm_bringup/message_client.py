@@ -14,6 +14,8 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 
+#: Names that an error lists.
+_MOST = 40
 _KINDS = ("msg", "srv", "action")
 _INTEGER = re.compile(r"(?P<unsigned>u?)int(?P<bits>8|16|32|64)|octet")
 _SEQUENCE = re.compile(r"^sequence<(?P<of>.+?)(, (?P<most>\d+))?>$|^(?P<array>.+)\[(?P<size>\d+)\]$")
@@ -44,7 +46,8 @@ def unknown(what: str, name: str, known: Iterable[str]) -> OpenArmError:
     names = sorted(known)
     near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
     near += [other for other in names if name.strip("/") and name.strip("/") in other and other not in near][:3]
-    hint = f"; did you mean {' or '.join(near)}?" if near else f"; there are {', '.join(names) or 'none'}"
+    some = ", ".join(names[:_MOST]) + (f" and {len(names) - _MOST} more" if len(names) > _MOST else "")
+    hint = f"; did you mean {' or '.join(near)}?" if near else f"; there are {some or 'none'}"
     return OpenArmError(Code.INVALID_ARGUMENT, f"no {what} {name!r}{hint}")
 
 

@@ -20,14 +20,17 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from tf2_msgs.msg import TFMessage
 
+from openarm_bringup import runs
 from openarm_bringup.message_client import to_data, unknown
 from openarm_common.convert import transform_to_matrix
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_STATIC_TF, QOS_TF, offered_qos
 
-#: Others are known after this long without news, s; while nobody is, they may still come.
+#: Others are known after this long without news, s; while nobody is, or one that is known to run is not, they may come.
 _QUIET_S = 0.6
-_DISCOVERY_S = 4.0
+_DISCOVERY_S = 8.0
+#: Services that every node has.
+_OF_ALL_NODES = ("rcl_interfaces/srv/", "type_description_interfaces/srv/")
 _ANSWER_S = 5.0
 
 
@@ -47,11 +50,13 @@ class Peer:
     def __enter__(self) -> Peer:
         began = changed = time.monotonic()
         before: Any = None
+        domain = self._context.get_domain_id()
+        there = {f"/{name}" for run in runs.running() if run.domain == domain for name in run.ready_nodes}
         while (now := time.monotonic()) - began < _DISCOVERY_S:
             known = (self.nodes(), self.topics(), self.services())
             if known != before:
                 before, changed = known, now
-            elif now - changed > _QUIET_S and known[0]:
+            elif now - changed > _QUIET_S and known[0] and (there <= set(known[0]) or now - began > _DISCOVERY_S / 2):
                 break
             self._executor.spin_once(timeout_sec=0.05)
         return self
@@ -91,8 +96,9 @@ class Peer:
         return {name: kinds[0] for name, kinds in self.node.get_topic_names_and_types() if "/_action/" not in name}
 
     def services(self) -> dict[str, str]:
-        """Type by service, without those of actions."""
-        return {name: kinds[0] for name, kinds in self.node.get_service_names_and_types() if "/_action/" not in name}
+        """Type by service, without those of actions and of nodes that are hidden, as this one."""
+        found = self.node.get_service_names_and_types()
+        return {name: kinds[0] for name, kinds in found if "/_action/" not in name and "/_openarm_cli" not in name}
 
     def actions(self) -> dict[str, str]:
         """Type by action."""
@@ -178,6 +184,11 @@ class ParametersOf:
         return result.successful, result.reason
 
 
+def plain(known: dict[str, str]) -> dict[str, str]:
+    """Leave out the services that every node has."""
+    return {name: kind for name, kind in known.items() if not kind.startswith(_OF_ALL_NODES)}
+
+
 def find(what: str, name: str, known: dict[str, str]) -> tuple[str, str]:
     """Return the full name of a topic, service or action, and its type; the leading slash may be left out.
 
@@ -186,5 +197,5 @@ def find(what: str, name: str, known: dict[str, str]) -> tuple[str, str]:
     """
     full = name if name.startswith("/") else f"/{name}"
     if full not in known:
-        raise unknown(what, full, known)
+        raise unknown(what, full, plain(known))
     return full, known[full]

@@ -20,14 +20,15 @@ from typing import Any, NamedTuple
 
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import LivelinessPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from openarm_bringup.bag import BagWriter, message_class
 from openarm_bringup.losses import Arrivals
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.node import offered_qos
 
 #: What the profiles record: regular expressions of whole topic names.
 PROFILES: Mapping[str, tuple[str, ...]] = {
@@ -46,6 +47,11 @@ PROFILES: Mapping[str, tuple[str, ...]] = {
 _NEVER = r".*/_action/.*|/parameter_events|/rosout|/sim/tick|/sim/ack"
 _QUEUE_BYTES = 512 * 2**20
 _DISCOVERY_S = 0.5
+_LOOK_S = 0.005
+#: Messages that a reader keeps between two looks.
+_DEPTH = 200
+#: Given a message as CDR and what is known of it.
+Take = Callable[[bytes, Mapping[str, Any]], None]
 #: The disk is left this much room, so that the bag can still be closed.
 _SPARE_BYTES = 200 * 2**20
 #: What rosbag2 writes for "no limit".
@@ -108,13 +114,13 @@ class Recorder:
         self._thinner = Thinner(image_rate)
         # Only the writing thread touches the bag: topics reach it through the queue as messages do.
         self._queue: queue.SimpleQueue[_Topic | _Message | None] = queue.SimpleQueue()
-        self._queued = 0
+        self._bytes_in = self._bytes_out = 0  # each counted by one thread
         self._topics: set[str] = set()
+        self._readers: list[tuple[Subscription, Take]] = []
         self._context = Context()
         rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node("openarm_recorder", context=self._context, use_global_arguments=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        self._end = threading.Event()
         self._changed = threading.Condition()
         self._threads = [
             threading.Thread(target=self._listen, name="recorder", daemon=True),
@@ -128,11 +134,12 @@ class Recorder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        self._context.try_shutdown()
-        self._threads[0].join(timeout=5.0)
+        self._end.set()
+        self._threads[0].join()
         self._queue.put(None)
         self._threads[1].join()
         self._node.destroy_node()
+        self._context.try_shutdown()
         full = OSError(self.recorded.ended) if self.recorded.ended else None
         self._bag.remember("lost", str(self.recorded.lost.total()))
         self._bag.__exit__(type(full) if full else None, full, None)
@@ -149,15 +156,22 @@ class Recorder:
         return not self.recorded.ended
 
     def _listen(self) -> None:
+        # Looking into sixty readers takes 0.1 ms; an executor makes a wait set of them anew for every few messages.
         found_at = 0.0
-        try:
-            while self._context.ok():
-                if time.monotonic() - found_at > _DISCOVERY_S:
-                    self._discover()
-                    found_at = time.monotonic()
-                self._executor.spin_once(timeout_sec=0.1)
-        except ExternalShutdownException:
-            pass  # the normal end
+        while not self._end.wait(_LOOK_S):
+            if time.monotonic() - found_at > _DISCOVERY_S:
+                self._discover()
+                found_at = time.monotonic()
+            self._drain()
+        self._drain()  # what has come until the end
+
+    def _drain(self) -> None:
+        for reader, take in self._readers:
+            with reader.handle:
+                for _ in range(_DEPTH):
+                    if (message := reader.handle.take_message(reader.msg_type, True)) is None:
+                        break
+                    take(*message)
 
     def _discover(self) -> None:
         for topic, kinds in self._node.get_topic_names_and_types():
@@ -165,8 +179,7 @@ class Recorder:
                 continue
             if not any(pattern.fullmatch(topic) for pattern in self._wanted):
                 continue
-            offered = self._node.get_publishers_info_by_topic(topic)
-            if not offered:
+            if not self._node.count_publishers(topic):
                 continue
             self._topics.add(topic)
             try:
@@ -174,21 +187,12 @@ class Recorder:
             except OpenArmError as error:
                 self._node.get_logger().warning(f"{topic} is not recorded: {error.message}")
                 continue
-            profiles = [info.qos_profile for info in offered]
-            reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
-            latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
-            profile = QoSProfile(
-                history=HistoryPolicy.KEEP_LAST,
-                depth=200,
-                reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-            )
+            profile = offered_qos(self._node, topic, _DEPTH)
             self._queue.put(_Topic(topic, kinds[0], from_profile(profile)))
-            # rclpy passes the info of a message to a callback with two arguments, which its annotations do not know.
-            take: Any = self._taker(topic)
-            self._node.create_subscription(kind, topic, take, profile, raw=True)
+            reader = self._node.create_subscription(kind, topic, _in_vain, profile, raw=True)
+            self._readers.append((reader, self._taker(topic)))
 
-    def _taker(self, topic: str) -> Callable[[bytes, Mapping[str, Any]], None]:
+    def _taker(self, topic: str) -> Take:
         arrivals = Arrivals()
 
         def publishers() -> int:
@@ -199,10 +203,10 @@ class Recorder:
                 self.recorded.lost[topic] += missing
             if not self._thinner.keeps(topic, data):
                 return
-            if self._queued + len(data) > _QUEUE_BYTES or self.recorded.ended:
+            if self._bytes_in - self._bytes_out > _QUEUE_BYTES or self.recorded.ended:
                 self.recorded.lost[topic] += 1
                 return
-            self._queued += len(data)
+            self._bytes_in += len(data)
             self._queue.put(_Message(topic, info["received_timestamp"], data))
 
         return take
@@ -214,7 +218,7 @@ class Recorder:
                 self._bag.add_topic(item.name, item.type, item.qos)
                 continue
             topic, t_ns, data = item
-            self._queued -= len(data)
+            self._bytes_out += len(data)
             if self.recorded.ended:
                 self.recorded.lost[topic] += 1
                 continue
@@ -233,6 +237,10 @@ class Recorder:
                 continue
             self.recorded.counts[topic] += 1
             self.recorded.bytes += len(data)
+
+
+def _in_vain(_: bytes) -> None:
+    """The callback of a reader that nobody spins."""
 
 
 class Thinner:

@@ -178,17 +178,20 @@ def pub(
 
 
 @service.command(name="list")
-def service_list(*, domain: int | None = None) -> Outcome:
+def service_list(
+    *, all_: Annotated[bool, Parameter("--all", negative=())] = False, domain: int | None = None
+) -> Outcome:
     """List services and their types.
 
     Args:
+        all_: Also those for parameters and types that every node has.
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.peer_client import Peer
+    from openarm_bringup.peer_client import Peer, plain
 
     with Peer() as peer:
-        return _listing(peer.services(), "services")
+        return _listing(peer.services() if all_ else plain(peer.services()), "services")
 
 
 @service.command

@@ -46,6 +46,11 @@ class RunRecord(Config):
     nodes: dict[str, NodeRecord]
 
     @property
+    def ready_nodes(self) -> list[str]:
+        """Names of the nodes that are ready now."""
+        return [name for name, node in self.nodes.items() if node.state == "ready"]
+
+    @property
     def health(self) -> str:
         """In a word or two: ready, not ready, or without which nodes it goes on."""
         failed = [name for name, node in self.nodes.items() if node.state == "failed"]

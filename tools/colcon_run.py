@@ -52,11 +52,12 @@ def serve(install: Path, command: list[str]) -> None:
     process = subprocess.Popen(command, start_new_session=True)
     try:
         echo = [str(install / OPENARM), "topic", "echo", "/joint_states", "-n", "1", "--timeout", "60", "--json"]
-        answer = subprocess.run(echo, stdout=subprocess.PIPE, text=True, timeout=120, check=False)
-        while answer.returncode != 0 and time.monotonic() - began < 120 and process.poll() is None:
-            answer = subprocess.run(echo, stdout=subprocess.PIPE, text=True, timeout=120, check=False)
+        answer = subprocess.run(echo, capture_output=True, text=True, timeout=120, check=False)
+        # Exit code 2 is a topic that is not there yet.
+        while answer.returncode == 2 and time.monotonic() - began < 120 and process.poll() is None:
+            answer = subprocess.run(echo, capture_output=True, text=True, timeout=120, check=False)
         if answer.returncode != 0:
-            raise SystemExit(f"{command[0]}: no joint state within {time.monotonic() - began:.0f} s: {answer.stdout}")
+            raise SystemExit(f"{command[0]}: no joint state: {answer.stdout}\n{answer.stderr}")
         names = json.loads(answer.stdout)["messages"][0]["name"]
         say(f"{Path(command[0]).name}: a joint state of {len(names)} joints after {time.monotonic() - began:.1f} s")
     finally:
