@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from openarm_bringup import campaign_report, report, runs
+from openarm_bringup import campaign_ray, campaign_report, report, runs
 from openarm_bringup.campaign_tasks import make_task
 from openarm_common.errors import Code, OpenArmError
 
@@ -37,6 +37,7 @@ class CampaignOptions:
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, each with its calibration; empty: nominal mounts.
         use_effort: Whether the finger's effort counts as evidence.
+        ray: Address of a Ray cluster whose machines run the workers; "": this machine.
     """
 
     set_name: str = "nominal"
@@ -45,6 +46,7 @@ class CampaignOptions:
     noise: bool = False
     mount_seeds: tuple[int, ...] = ()
     use_effort: bool = True
+    ray: str = ""
 
     def settings(self) -> dict[str, Any]:
         """What must be the same for rows to belong together."""
@@ -79,8 +81,19 @@ class Campaign:
     resumed: int = 0
 
 
-def run_campaign(options: CampaignOptions, folder: Path, on_row: Callable[[Row], None] = lambda row: None) -> Campaign:
+def run_campaign(
+    options: CampaignOptions,
+    folder: Path,
+    on_row: Callable[[Row], None] = lambda row: None,
+    on_begin: Callable[[int], None] = lambda done: None,
+) -> Campaign:
     """Run all seeds that the folder has no row of, and write the reports; Ctrl-C keeps what is done.
+
+    Args:
+        options: What is run.
+        folder: Of the campaign.
+        on_row: Called with each new row.
+        on_begin: Called with the number of rows that are there already.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for an unknown set, or a folder with rows of other settings; what a fault of
@@ -90,6 +103,7 @@ def run_campaign(options: CampaignOptions, folder: Path, on_row: Callable[[Row],
         make_task(options.set_name, seed)  # faults of the call show before anything is started
     campaign = Campaign(folder, options, read_rows(folder, options))
     campaign.resumed = len(campaign.rows)
+    on_begin(campaign.resumed)
     done = {row["seed"] for row in campaign.rows}
     left = [seed for seed in options.seeds if seed not in done]
     began = time.monotonic()
@@ -140,6 +154,9 @@ def read_rows(folder: Path, options: CampaignOptions) -> list[Row]:
 
 def _rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Generator[Row, None, None]:
     """Rows as they come; the order of seeds with one worker."""
+    if options.ray:
+        yield from campaign_ray.rows(options, seeds, folder)
+        return
     if options.workers == 1:
         for seed in seeds:
             yield run_one(options, seed, folder)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,7 +24,9 @@ def campaign(
     noise: Annotated[bool, Parameter(negative=())] = False,
     mount_seeds: str | None = None,
     effort: bool = True,
+    ray: str = "",
     graph: Annotated[bool, Parameter(negative=())] = False,
+    against: Path | None = None,
     out: Path | None = None,
     accept: float = 0.99,
 ) -> Outcome:
@@ -39,12 +42,16 @@ def campaign(
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.
         effort: Whether the force of the fingers counts as evidence.
+        ray: Address of a Ray cluster, such as HOST:6379 or auto, whose machines share the workers.
         graph: Through a node graph of its own, over DDS and in real time, instead of in one process.
+        against: Folder of another campaign; how far both agree on the scenes that they share is told, and accepted by
+            the same share.
         out: Folder of the campaign; a new one below runs/ when not given.
         accept: Share of scenes that must go as expected.
     """
     from openarm_bringup import runs
     from openarm_bringup.campaign import CampaignOptions
+    from openarm_bringup.campaign_agree import rows_of
     from openarm_bringup.demo import parse_seeds
 
     options = CampaignOptions(
@@ -54,39 +61,35 @@ def campaign(
         noise=noise,
         mount_seeds=parse_seeds(mount_seeds) if mount_seeds is not None else (),
         use_effort=effort,
+        ray=ray,
     )
     folder = out if out is not None else runs.new_run_dir()
-    return _run(options, folder.resolve(), accept, graph=graph)
+    others = rows_of(against) if against is not None else []
+    return _run(options, folder.resolve(), accept, graph=graph, others=others)
 
 
-def _run(options: CampaignOptions, folder: Path, accept: float, *, graph: bool) -> Outcome:
+def _run(
+    options: CampaignOptions, folder: Path, accept: float, *, graph: bool, others: Sequence[Mapping[str, Any]]
+) -> Outcome:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from openarm_bringup.campaign import run_campaign, write_reports
+    from openarm_bringup.campaign_agree import compare, text_of
     from openarm_bringup.campaign_graph import run_graph_campaign
-    from openarm_bringup.campaign_report import figures, summarise
+    from openarm_bringup.campaign_progress import Watch
+    from openarm_bringup.campaign_report import figures
 
-    console = Console(stderr=True, highlight=False)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        bar = progress.add_task("scenes", total=len(options.seeds))
-        bad = 0
-
-        def show(row: dict[str, Any]) -> None:
-            nonlocal bad
-            bad += not row["as_expected"]
-            progress.update(bar, advance=1, description=f"scenes ({bad} not as expected)")
-            if not row["as_expected"]:
-                text = f"seed {row['seed']} ({row['kind']}): {row['outcome']}: {row['code']}: {row['message']}"
-                console.print(text, style="red", markup=False)
-
-        result = (run_graph_campaign if graph else run_campaign)(options, folder, show)
+    with Watch(len(options.seeds), Console(stderr=True, highlight=False)) as watch:
+        result = (run_graph_campaign if graph else run_campaign)(options, folder, watch.show, watch.begin)
     data = write_reports(result)
     text = "\n".join(f"{name:<44} {value}" for name, value in figures(data))
     good = sum(bool(row["as_expected"]) for row in result.rows)
-    summary = summarise(result.rows)
+    summary = data["summary"]
     success = bool(result.rows) and good >= accept * len(result.rows) and summary["false_success"] == 0
     message = f"{good} of {len(result.rows)} scenes went as expected. Report: {folder}/campaign.html"
-    data = {"folder": str(folder), **{key: data[key] for key in ("summary", "settings", "scenes_per_hour", "wall_s")}}
-    return Outcome(success, message, Code.OK if success else Code.PLACE_FAILED, data, text)
+    out = {"folder": str(folder), **{key: data[key] for key in ("summary", "settings", "scenes_per_hour", "wall_s")}}
+    if others:
+        out["agreement"] = agreement = compare(result.rows, others)
+        text += "\n" + text_of(agreement)
+        success = success and agreement["agree"]["rate"] >= accept
+    return Outcome(success, message, Code.OK if success else Code.PLACE_FAILED, out, text)

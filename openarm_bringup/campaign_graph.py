@@ -29,7 +29,10 @@ GRAPH_SETS = ("nominal",)
 
 
 def run_graph_campaign(
-    options: CampaignOptions, folder: Path, on_row: Callable[[Row], None] = lambda row: None
+    options: CampaignOptions,
+    folder: Path,
+    on_row: Callable[[Row], None] = lambda row: None,
+    on_begin: Callable[[int], None] = lambda done: None,
 ) -> Campaign:
     """Run all seeds that the folder has no row of through a graph of its own, and write the reports.
 
@@ -44,6 +47,7 @@ def run_graph_campaign(
         )
     campaign = Campaign(folder, options, read_rows(folder, options))
     campaign.resumed = len(campaign.rows)
+    on_begin(campaign.resumed)
     done = {row["seed"] for row in campaign.rows}
     tasks = [make_task(options.set_name, seed) for seed in options.seeds if seed not in done]
     began = time.monotonic()

@@ -13,6 +13,7 @@ import pytest
 from openarm_bringup import campaign, campaign_link, campaign_report, campaign_trial
 from openarm_bringup.campaign import CampaignOptions, run_campaign
 from openarm_bringup.campaign_faults import KINDS
+from openarm_bringup.campaign_progress import Pace
 from openarm_bringup.campaign_robot import SimulatedSenses
 from openarm_bringup.campaign_tasks import FaultPlan, make_task, sets
 from openarm_common.errors import Code, OpenArmError
@@ -86,6 +87,22 @@ def test_resume_runs_only_what_is_missing_and_drops_a_torn_line(tmp_path, monkey
     assert sorted(r["seed"] for r in done.rows) == [0, 1, 2, 3]
     with pytest.raises(OpenArmError, match="noise was False"):
         run_campaign(CampaignOptions(seeds=(4,), noise=True), tmp_path)
+
+
+def test_the_pace_counts_new_rows_alone() -> None:
+    pace = Pace(100)
+    pace.begin(50.0, 40)
+    assert pace.text(60.0) == ""
+    pace.done = 50
+    assert pace.text(86.0) == "1000 scenes an hour, 0:03:00 left"
+
+
+def test_clutter_is_five_to_eight_objects_each_asked_for() -> None:
+    tasks = [make_task("clutter", seed) for seed in range(10000, 10020)]
+    assert {len(task.labels) for task in tasks} == {5, 6, 7, 8}
+    for task in tasks:
+        assert sorted(task.labels) == sorted(item.label for item in task.scene.objects)
+        assert len({item.name for item in task.scene.objects}) == len(task.labels)
 
 
 def test_tasks_come_from_set_and_seed_alone() -> None:
