@@ -152,6 +152,9 @@ class PlaceConfig(Config):
     spot_step: float = Field(default=0.04, gt=0.0, le=0.2, description="grid of free spots, m")
     spots: int = Field(default=6, ge=1, le=50, description="free spots that are offered to the planner")
     neighbour_distance: float = Field(default=0.10, ge=0.0, le=0.5, description="least distance to other objects, m")
+    neighbour_room: float = Field(
+        default=0.13, ge=0.0, le=0.5, description="so far apart, both can be grasped from any side; preferred, m"
+    )
     origin_distance: float = Field(
         default=0.08, ge=0.0, le=0.5, description="least distance to where the object came from, m"
     )

@@ -129,8 +129,9 @@ def turns_to(target: Detection, yaw: float) -> tuple[float, ...]:
 def free_spots(arm: str, target: Detection, others: Sequence[Detection], config: GraspConfig) -> tuple[Array, ...]:
     """Free spots on the arm's side of the table, best first.
 
-    A spot keeps its distance from every other object and from where the object came; among those, room around it counts
-    (up to twice the distance asked for) and then nearness to where it came from, which keeps the carry short.
+    A spot keeps its distance from every other object and from where the object came. Those come first that leave room
+    for a hand around the others; among them, room around it counts (up to twice the distance asked for) and nearness to
+    where it came from, which keeps the carry short.
 
     Args:
         arm: "left" (y > 0) or "right".
@@ -143,7 +144,7 @@ def free_spots(arm: str, target: Detection, others: Sequence[Detection], config:
     """
     place = config.place
     side = 1.0 if arm == "left" else -1.0
-    ranked: list[tuple[float, float, float]] = []
+    ranked: list[tuple[bool, float, float, float]] = []
     for x in _grid(*place.region_x, place.spot_step):
         for abs_y in _grid(*place.region_abs_y, place.spot_step):
             spot = np.array([x, side * abs_y])
@@ -151,7 +152,8 @@ def free_spots(arm: str, target: Detection, others: Sequence[Detection], config:
             room = min((float(np.linalg.norm(spot - d.p_base[:2])) for d in others), default=np.inf)
             if origin < place.origin_distance or room < place.neighbour_distance:
                 continue
-            ranked.append((origin - min(room, 2.0 * place.neighbour_distance), x, side * abs_y))
+            cost = origin - min(room, 2.0 * place.neighbour_distance)
+            ranked.append((room < place.neighbour_room, cost, x, side * abs_y))
     if not ranked:
         raise OpenArmError(
             Code.PLACE_FAILED,
@@ -160,7 +162,7 @@ def free_spots(arm: str, target: Detection, others: Sequence[Detection], config:
         )
     # Six spots side by side would share one fate, so those offered lie apart.
     chosen: list[Array] = []
-    for _, x, y in sorted(ranked):
+    for _, _, x, y in sorted(ranked):
         spot = np.array([x, y])
         if all(np.linalg.norm(spot - other) >= 1.9 * place.spot_step for other in chosen):
             chosen.append(spot)

@@ -96,6 +96,21 @@ def test_p19_free_spots_keep_clear_of_neighbours_and_origin(arm):
         assert min(np.linalg.norm(spot - d.p_base[:2]) for d in others) >= 0.10
 
 
+def test_p19_a_spot_that_leaves_room_for_a_hand_comes_before_a_nearer_one() -> None:
+    """What is put down too near to another object blocks the way to it later."""
+    target = box(x=0.17, y=-0.10)
+    others = [box(x=x, y=y, label="blue") for x, y in ((0.33, -0.12), (0.20, -0.26), (0.34, -0.36))]
+
+    def rooms(config: GraspConfig) -> list[float]:
+        spots = free_spots("right", target, others, config)
+        return [min(float(np.linalg.norm(spot - d.p_base[:2])) for d in others) for spot in spots]
+
+    near = [room < CONFIG.place.neighbour_room for room in rooms(CONFIG)]
+    assert near == sorted(near)
+    assert not near[0]
+    assert rooms(GraspConfig.model_validate({"place": {"neighbour_room": 0.0}}))[0] < CONFIG.place.neighbour_room
+
+
 def test_a_full_table_has_no_free_spot():
     crowd = [box(x=x, y=y, label="blue") for x in np.arange(0.1, 0.5, 0.08) for y in np.arange(-0.5, 0.0, 0.08)]
     with pytest.raises(OpenArmError) as error:
