@@ -30,6 +30,11 @@ USED_PENALTY = 10.0
 _TILT_COST_PER_RAD = 2.0
 _WIDTH_WEIGHT = 0.15
 _SIDE_WEIGHT = 0.15
+_ROOM_WEIGHT = 0.15
+#: More room than this beside a finger is as good as this, m.
+_ROOM = 0.04
+#: Half of a finger's thickness, m.
+_FINGER = 0.010
 
 
 @dataclass(frozen=True)
@@ -114,6 +119,7 @@ def propose(
     *,
     shoulder_xy: Sequence[float] = (0.0, 0.0),
     used: frozenset[str] = frozenset(),
+    others: Sequence[Detection] = (),
 ) -> tuple[GraspCandidate, ...]:
     """Every grasp worth planning, best first.
 
@@ -122,12 +128,14 @@ def propose(
         config: Parameters.
         shoulder_xy: (2,) of the arm's shoulder in the base frame, m; leaning away from it reaches furthest.
         used: Ids that have failed before; they come last.
+        others: What stands around it; hands whose fingers have room come first.
 
     Raises:
         OpenArmError: TOO_WIDE, when no side fits into the hand.
     """
     found: list[GraspCandidate] = []
     for edge, direction, width in graspable_edges(target, config.approach):
+        room = _room(target.p_base, direction, others, config.hand)
         for flip, tilt_deg, lean in product(("+", "-"), config.approach.tilts_deg, ("+", "-")):
             if tilt_deg == 0.0 and lean == "-":
                 continue  # a vertical hand leans nowhere
@@ -138,6 +146,7 @@ def propose(
             parts = {
                 **candidate.parts,
                 "side": _SIDE_WEIGHT * sin(candidate.tilt) * _outward(target.p_base, heading, shoulder_xy),
+                "room": _ROOM_WEIGHT * (min(room, _ROOM) / _ROOM - 1.0),
                 "used": -USED_PENALTY if name in used else 0.0,
             }
             found.append(replace(candidate, parts=parts, score=sum(parts.values())))
@@ -172,6 +181,18 @@ def _outward(p_base: Array, heading: Array, shoulder_xy: Sequence[float]) -> flo
     x, y = float(p_base[0]) - shoulder_xy[0], float(p_base[1]) - shoulder_xy[1]
     distance = hypot(x, y)
     return (float(heading[0]) * x + float(heading[1]) * y) / distance if distance > 1e-6 else 0.0
+
+
+def _room(p_base: Array, direction: Array, others: Sequence[Detection], hand: HandConfig) -> float:
+    """Least distance between an open finger and what stands around, seen from above, m; negative: it does not fit."""
+    least = np.inf
+    for side in (1.0, -1.0):
+        finger = p_base[:2] + side * (hand.opening + _FINGER) * direction[:2]
+        for d in others:
+            local = np.abs((finger - d.p_base[:2]) @ d.T_base_object[:2, :2]) - d.size[:2] / 2.0
+            outside = float(np.linalg.norm(np.maximum(local, 0.0)))
+            least = min(least, (outside or float(local.max())) - _FINGER)
+    return least
 
 
 def target_box(target: Detection, config: GraspConfig) -> Box:

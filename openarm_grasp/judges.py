@@ -176,8 +176,8 @@ def _no_plan(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
 
 def _offer_grasps(m: Memory, around: Surroundings) -> None:
     m.arm = m.arms[0]
-    target = m.need_sighting().target
-    m.offered = propose(target, around.config, shoulder_xy=around.shoulders.get(m.arm, (0.0, 0.0)), used=m.used)
+    s, shoulder = m.need_sighting(), around.shoulders.get(m.arm, (0.0, 0.0))
+    m.offered = propose(s.target, around.config, shoulder_xy=shoulder, used=m.used, others=s.others)
 
 
 # --- grasping

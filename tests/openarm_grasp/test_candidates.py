@@ -145,7 +145,20 @@ def test_leaning_away_from_the_shoulder_comes_first():
 def test_score_is_the_sum_of_its_parts():
     for c in propose(box(), CONFIG):
         assert c.score == pytest.approx(sum(c.parts.values()))
-        assert set(c.parts) == {"tilt", "width", "side", "used"}
+        assert set(c.parts) == {"tilt", "width", "side", "room", "used"}
+
+
+def test_n21_hands_whose_fingers_have_room_come_first():
+    """A block stands close to the narrow side, across which the hand would close by itself: it turns by a quarter."""
+    alone = box(yaw=0.0, size=(0.045, 0.05, 0.05))
+    beside = box(x=alone.p_base[0] + 0.075, yaw=0.0, size=(0.05, 0.05, 0.05), label="blue")
+    assert "/x" in propose(alone, CONFIG)[0].id
+    offered = propose(alone, CONFIG, others=(beside,))
+    assert "/y" in offered[0].id
+    rooms = {c.id.split("/")[1][0]: c.parts["room"] for c in offered}
+    assert rooms["y"] == 0.0
+    assert rooms["x"] < -0.15  # the finger would stand in the block
+    assert len(offered) == len(propose(alone, CONFIG))  # the planner has the last word
 
 
 def test_a_used_candidate_comes_last():
