@@ -5,36 +5,31 @@ from __future__ import annotations
 
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Mapping, Sequence
-from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from openarm_bringup.campaign_planner import arms_behind, boxes_of, request_of
 from openarm_bringup.campaign_robot import SimRobot
-from openarm_common.cameras import load_cameras
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.held import HeldBox
-from openarm_common.housings import with_housings
 from openarm_common.robot_state import RobotStateBuffer
 from openarm_grasp import effects
-from openarm_grasp.candidates import Box as GraspBox
-from openarm_grasp.candidates import GraspCandidate
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames, GoHome, Planned
 from openarm_grasp.performer import check_deadline
-from openarm_grasp.place import PlaceTarget
 from openarm_motion import moves
-from openarm_motion.approach import ApproachRequest, Target, plan_approach
+from openarm_motion.approach import plan_approach
 from openarm_motion.arm import Arm, Situation
 from openarm_motion.checks import Motion, check_against_others, check_trajectory
-from openarm_motion.collision import Box, box_from
-from openarm_motion.config import MotionConfig
+from openarm_motion.collision import Box
 from openarm_motion.memory import HeldMemory
 from openarm_motion.trajectory import Trajectory
 from openarm_sim_bridge.actuation import End, TrajectoryOutcome
 from openarm_sim_bridge.gripper import GripperGoal, GripperOutcome
+from openarm_sim_bridge.touch import pad_links
 from openarm_sim_bridge.trajectory import Trajectory as FollowedTrajectory
 
 Array = NDArray[np.float64]
@@ -108,6 +103,11 @@ class DirectLink:
     def effort(self, joint: str) -> float:
         """Newest effort of a joint, N or N m."""
         return self.robot.efforts.get(joint, 0.0)
+
+    def pads(self, arm: str) -> tuple[float, ...]:
+        """Force on each finger pad of a hand, N, from its sensors."""
+        links = pad_links("left" if arm == "left" else "right")
+        return tuple(float(np.linalg.norm(self.robot.world.pad_wrench(link)[0])) for link in links)
 
     def check(self) -> None:
         """Raise when the grasp shall not go on: CANCELLED, ROBOT_LOST."""
@@ -311,38 +311,3 @@ class DirectLink:
             follower.cancel()
             raise
         return ends[0].stalled or ends[0].reached_goal
-
-
-def boxes_of(boxes: Sequence[GraspBox]) -> tuple[Box, ...]:
-    """Boxes of the grasp as the planner's."""
-    return tuple(Box(box.id, box.T_frame_box, box.size) for box in boxes)
-
-
-def request_of(effect: effects.PlanGrasp | effects.PlanPlace) -> ApproachRequest:
-    """What the planner is asked for a grasp or a place."""
-    if isinstance(effect, effects.PlanGrasp):
-        return ApproachRequest(
-            targets=tuple(_target(way) for way in effect.candidates),
-            obstacles=boxes_of((*effect.obstacles, effect.target)),
-            touchable=frozenset({effect.target.id}),
-            attached_after=True,
-        )
-    return ApproachRequest(
-        targets=tuple(_target(way) for way in effect.targets),
-        obstacles=boxes_of(effect.obstacles),
-        attached=boxes_of((effect.held,)),
-        detached_after=True,
-    )
-
-
-def _target(way: GraspCandidate | PlaceTarget) -> Target:
-    return Target(way.id, way.T_base_tcp, way.approach_offset, way.retreat_offset, way.score)
-
-
-@cache
-def arms_behind(top_z: float, centre: tuple[float, float], extents: tuple[float, float, float]) -> Mapping[str, Arm]:
-    """Both arms behind a table top (its height, middle and edges, m); made once a process."""
-    config = MotionConfig()
-    robot = with_housings(RobotDescription.load(), load_cameras().values())
-    static = (box_from("table", (*centre, top_z - 0.5 * extents[2]), extents),)
-    return {name: Arm(name, robot, config, static) for name in config.arms}

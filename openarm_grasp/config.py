@@ -90,6 +90,10 @@ class HeldConfig(Config):
     max_speed: float = Field(default=0.001, gt=0.0, le=0.01, description="fingers slower than this rest, m/s")
     min_effort: float = Field(default=5.0, gt=0.0, le=50.0, description="least closing force of the finger, N")
     use_effort: bool = Field(default=True, description="false for drivers that report no effort: the gap alone decides")
+    use_finger_force: bool = Field(
+        default=False, description="whether both finger pads must feel the object; for hands with sensors there"
+    )
+    min_pad_force: float = Field(default=0.5, gt=0.0, le=20.0, description="least force on each finger pad, N")
     max_tcp_error: float = Field(
         default=0.008, gt=0.0, le=0.05, description="TCP this far from the grasp hit something, m"
     )

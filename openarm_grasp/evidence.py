@@ -41,6 +41,7 @@ class Evidence:
         effort: Force of the finger actuator, N, any sign.
         speed: Of the gap, m/s, any sign.
         tcp_error: Distance of the TCP from the planned grasp, m.
+        pads: Force on each finger pad, N; empty when no sensor tells it.
     """
 
     gap: float
@@ -48,6 +49,7 @@ class Evidence:
     effort: float
     speed: float
     tcp_error: float = 0.0
+    pads: tuple[float, ...] = ()
 
 
 class Grip(Enum):
@@ -124,6 +126,9 @@ def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> tu
         return Grip.MOVING, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest"
     if config.use_effort and abs(e.effort) <= config.min_effort:
         return empty, f"{gap}, but the fingers press with {abs(e.effort):.1f} N, expected over {config.min_effort:g} N"
+    if config.use_finger_force and min(e.pads, default=0.0) < config.min_pad_force:
+        felt = f"a finger pad feels {min(e.pads):.1f} N" if e.pads else "no sensor tells what the finger pads feel"
+        return empty, f"{gap}, but {felt}, expected {config.min_pad_force:g} N on each (held.use_finger_force)"
     force = f", {abs(e.effort):.0f} N" if config.use_effort else ""
     return Grip.HELD, f"{gap} for {e.expected * 1e3:.1f} mm{force}: held"
 

@@ -113,6 +113,10 @@ class GraspExecutor:
         """Newest effort of a joint, N or N m."""
         return self._link.robot.efforts.get(joint, 0.0)
 
+    def pads(self, arm: str) -> tuple[float, ...]:
+        """Force on each finger pad of a hand, N; empty when no sensor tells it."""
+        return self._link.pads.of(arm)
+
     def check(self) -> None:
         """Raise when the grasp shall not go on."""
         self._link.check()

@@ -61,18 +61,21 @@ class HandReader:
         """(4, 4) pose of the tool centre point."""
         return self._description.link_pose(self._tcp, self._states.latest()[1])
 
-    def evidence(self, expected: float, effort: float, T_base_planned: Array | None) -> Evidence:
+    def evidence(
+        self, expected: float, effort: float, T_base_planned: Array | None, pads: tuple[float, ...] = ()
+    ) -> Evidence:
         """Everything that the joint states say about holding an object.
 
         Args:
             expected: Width of the object between the fingers, m.
             effort: Of the finger joint, N.
             T_base_planned: (4, 4) where the TCP should be; None leaves its error 0.
+            pads: Force on each finger pad, N; empty when no sensor tells it.
         """
         error = 0.0
         if T_base_planned is not None:
             error = float(np.linalg.norm(self.T_base_tcp()[:3, 3] - T_base_planned[:3, 3]))
-        return Evidence(self.gap(), expected, effort, self.gap_speed(), error)
+        return Evidence(self.gap(), expected, effort, self.gap_speed(), error, pads)
 
     def _finger_in(self, q: Mapping[str, float]) -> float:
         if self.joint not in q:

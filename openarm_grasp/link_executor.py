@@ -25,6 +25,7 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames
 from openarm_grasp.hand import Silence
 from openarm_grasp.observation import Frame
+from openarm_grasp.pad_client import Pads
 
 #: What the detector of the camera over the table finds.
 DETECTIONS = "/detections_3d"
@@ -48,6 +49,7 @@ class RobotLink:
         self._node = node
         self._config = config
         self.robot = RobotStateListener(node, node.description, joints=False)
+        self.pads = Pads(node)
         self._detections: Subscription | None = None
         self._topic = DETECTIONS
         self._frames: list[Frame] = []
@@ -73,6 +75,7 @@ class RobotLink:
         self._silence = Silence(_STARVED_S)
         self._active = True
         self.robot.enable(True)
+        self.pads.enable(self._config.held.use_finger_force)
         self._timer.reset()
         deadline = self._node.monotonic() + self._config.limits.ready_timeout
         while faults := missing():
@@ -89,6 +92,7 @@ class RobotLink:
         self.stop_looking()
         self._timer.cancel()
         self.robot.enable(False)
+        self.pads.enable(False)
 
     def cancel(self) -> None:
         """Let what is waited for end with CANCELLED."""

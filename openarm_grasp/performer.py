@@ -72,6 +72,10 @@ class Link(Protocol):
         """Newest effort of a joint, N or N m; 0 when none is told."""
         ...
 
+    def pads(self, arm: str) -> tuple[float, ...]:
+        """Force on each finger pad of a hand, N; empty when no sensor tells it."""
+        ...
+
     def check(self) -> None:
         """Raise when the work shall not go on: CANCELLED, ROBOT_LOST."""
         ...
@@ -300,7 +304,8 @@ class Performer:
             return abs(speed) < still or link.now_ns >= end_ns
 
         await link.until(at_rest, limit, rest)
-        return hand.evidence(effect.expected, link.effort(hand.joint), effect.T_base_tcp)
+        pads = link.pads(effect.arm) if self._config.held.use_finger_force else ()
+        return hand.evidence(effect.expected, link.effort(hand.joint), effect.T_base_tcp, pads)
 
 
 def check_deadline(now_ns: int, deadline_ns: int) -> None:

@@ -48,6 +48,14 @@ def test_a71_grip_truth_table(changes, expected):
     assert reason
 
 
+@pytest.mark.parametrize(("pads", "held"), [((12.0, 14.0), True), ((12.0, 0.4), False), ((), False)])
+def test_a69_where_there_are_sensors_both_pads_must_feel_the_object(pads, held):
+    evidence = Evidence(**{**vars(GOOD), "pads": pads})
+    grip, reason = judge_grip(evidence, HeldConfig(use_finger_force=True))
+    assert (grip is Grip.HELD) == held, reason
+    assert judge_grip(evidence, HELD)[0] is Grip.HELD  # without, the pads decide nothing
+
+
 def test_a_driver_that_reports_no_effort_is_judged_by_the_gap():
     config = HeldConfig(use_effort=False)
     assert judge_grip(Evidence(0.05, 0.05, 0.0, 0.0), config)[0] is Grip.HELD

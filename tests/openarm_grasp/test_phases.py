@@ -13,7 +13,7 @@ from openarm_bringup.campaign_tasks import Task
 from openarm_bringup.campaign_trial import Trials
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Scene, SceneObject
-from openarm_grasp.config import GraspConfig, HandConfig
+from openarm_grasp.config import GraspConfig, HandConfig, HeldConfig
 from openarm_grasp.effects import GraspOutcome, GraspRequest
 from openarm_grasp.performer import run_request
 
@@ -134,6 +134,16 @@ def test_p21_a_cancel_in_each_state_drops_nothing_and_the_next_request_works(sta
     holds = trials.machine.kept is not None and trials.performer.gap("right") < 0.08
     outcome = bench.ask("", phase="place") if holds else bench.ask("blue")
     assert outcome.success, outcome.message
+
+
+@pytest.mark.parametrize("use", [False, True])
+def test_a69_a_grasp_is_held_with_and_without_the_force_of_the_pads(use: bool) -> None:
+    """The simulated pads feel half the closing force each; a hand that is closed on nothing feels none."""
+    bench = Bench(CUBE, config=GraspConfig(held=HeldConfig(use_finger_force=use)))
+    assert max(bench.trials.link.pads("left")) < 0.1
+    outcome = bench.ask("red", phase="pick")
+    assert outcome.success, outcome.message
+    assert min(bench.trials.link.pads("left")) > 5.0
 
 
 def test_n20_the_closing_force_can_be_limited() -> None:

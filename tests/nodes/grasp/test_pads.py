@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the grasp node hears of finger pads."""
+
+from __future__ import annotations
+
+import pytest
+from geometry_msgs.msg import WrenchStamped
+
+from openarm_common.config import Config
+from openarm_common.node import QOS_SENSOR, BaseNode
+from openarm_grasp.pad_client import Pads
+
+
+def test_a69_both_pads_of_a_hand_are_heard_while_listening_and_a_silent_one_says_nothing(ros) -> None:
+    pads = Pads(ros.add(BaseNode("listener", Config)))
+    topics = [f"/openarm_right_{finger}_finger/contact_wrench" for finger in ("left", "right")]
+    left, right = (ros.node.create_publisher(WrenchStamped, topic, QOS_SENSOR) for topic in topics)
+    assert all(ros.node.count_subscribers(topic) == 0 for topic in topics)
+    pads.enable(True)
+    message = WrenchStamped()
+    message.wrench.force.x, message.wrench.force.y = 3.0, -4.0
+
+    def heard(*publishers) -> bool:
+        for publisher in publishers:
+            publisher.publish(message)
+        return bool(pads.of("right"))
+
+    ros.spin_until(lambda: left.get_subscription_count() and right.get_subscription_count(), 10.0, "discovery")
+    ros.spin_until(lambda: heard(left, right), 10.0, "both pads")
+    assert pads.of("right") == pytest.approx((5.0, 5.0))
+    assert pads.of("left") == ()
+    ros.spin_until(lambda: not heard(left), 10.0, "the right pad's silence")
+    pads.enable(False)
+    ros.spin_until(lambda: ros.node.count_subscribers(topics[0]) == 0, 10.0, "the end of listening")
