@@ -8,6 +8,7 @@ come from seeds, and calibrations travel with the work.
 from __future__ import annotations
 
 import logging
+import socket
 import tempfile
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,8 @@ Files = dict[str, bytes]
 
 #: Workers that may be lost (a machine that is switched off, a process that is killed) with one seed.
 _LOST = 2
+#: A cluster that is there answers within this, s.
+_REACH_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -106,9 +109,12 @@ def _connect(options: CampaignOptions) -> Any:
             "campaigns on several machines need Ray: install the extra `cluster` (pip install openarm-vision[cluster])"
         )
         raise OpenArmError(Code.ENVIRONMENT, text) from error
+    host, _, port = options.ray.rpartition(":")
     try:
+        if host and port.isdigit():  # Ray itself would go on trying for minutes
+            socket.create_connection((host, int(port)), _REACH_S).close()
         ray.init(address=options.ray, log_to_driver=False, logging_level=logging.WARNING)
-    except (ConnectionError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise OpenArmError(
             Code.ENVIRONMENT,
             f"no Ray cluster at {options.ray!r}: {error}; start one with `ray start --head` here and"
