@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionClient
 from rclpy.task import Future
@@ -175,17 +176,27 @@ class Follower:
 
         def ended() -> bool:
             late = self._states.buffer.latest()[0] - arrived_ns > config.settle * 1e9
-            return late or cancelled() or self._worst(motion)[1] <= config.goal_tolerance
+            return late or cancelled() or not self._missed(motion)
 
         await watch.until(ended, lambda: self._raise_if_lost(watch), math.inf)
-        name, error = self._worst(motion)
-        if error > config.goal_tolerance:
+        missed = self._missed(motion)
+        if missed:
             if cancelled():
                 raise OpenArmError(Code.CANCELLED, f"cancelled; the {self._arm.name} arm holds where it is")
-            raise OpenArmError(
-                Code.EXECUTION_FAILED,
-                f"{name} ended {error:.3f} rad from its goal, expected within {config.goal_tolerance:g}; blocked?",
-            )
+            raise OpenArmError(Code.EXECUTION_FAILED, f"{missed}; blocked?")
+
+    def _missed(self, motion: Motion) -> str:
+        """How far from its end the arm is, in a sentence; empty when it is there."""
+        config = self._arm.config.execution
+        name, error = self._worst(motion)
+        if error > config.goal_tolerance:
+            return f"{name} ended {error:.3f} rad from its goal, expected within {config.goal_tolerance:g}"
+        now = self._states.buffer.latest()[1]
+        ends = self._arm.kinematics.fk_many(np.array([motion.q[-1], [now[name] for name in motion.names]]))
+        gap = float(np.linalg.norm(ends[0, :3, 3] - ends[1, :3, 3]))
+        if gap > config.tool_tolerance:
+            return f"the tool ended {gap * 1e3:.1f} mm from its goal, expected within {config.tool_tolerance * 1e3:g}"
+        return ""
 
     def _worst(self, motion: Motion) -> tuple[str, float]:
         now = self._states.buffer.latest()[1]

@@ -111,7 +111,7 @@ def map_boxes(cells: np.ndarray) -> Sequence[Box]:
     return [box_from(f"c{k}", corner + (i + 0.5) * 0.02, (0.02,) * 3) for k, i in enumerate(np.argwhere(cells))]
 
 
-def test_a67_cells_of_a_map_are_never_overlooked(right: Arm, home: dict[str, float]) -> None:
+def test_a59_cells_of_a_map_are_never_overlooked(right: Arm, home: dict[str, float]) -> None:
     rng = np.random.default_rng(9)
     cells = np.zeros((50, 80, 50), np.bool_)
     cells[tuple(rng.integers(0, cells.shape, (60, 3)).T)] = True

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pitfalls of planners: paths through the chest, thin walls, starts outside a limit by rounding."""
+"""Pitfalls of planners: paths through the chest, thin walls, starts outside a limit by rounding, names in code."""
 
 from __future__ import annotations
+
+import ast
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import openarm_motion
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion import moves
@@ -78,3 +82,18 @@ def test_a_start_far_outside_a_limit_is_named(right: Arm, home: dict[str, float]
     with pytest.raises(OpenArmError, match="start: openarm_right_joint4") as caught:
         right.situation(home, q)
     assert caught.value.code == Code.LIMITS
+
+
+def test_b13_no_name_of_the_robot_is_in_the_code(right: Arm) -> None:
+    """Joints, links, groups and arms are named by configuration and description alone."""
+    description = right.description
+    groups = {f"{side}_arm" for side in ("left", "right")} | {"openarm_left", "openarm_right"}
+    names = {*description.joints, *description.links, *groups} - {"world"}
+    files = [p for p in Path(openarm_motion.__file__).parent.glob("*.py") if p.name not in ("config.py", "setup.py")]
+    assert len(files) > 40
+    for path in files:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found = [name for name in names if name in node.value]
+                assert not found, f"{path.name}:{node.lineno} names {found}"

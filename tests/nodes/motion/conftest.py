@@ -42,6 +42,8 @@ class FakeRobot:
         self.silent = False
         self.answer: Callable[[FollowJointTrajectory.Result], None] = lambda result: None
         self.stuck: set[str] = set()
+        #: Joints that stay so far beside where they should be, rad.
+        self.sag: dict[str, float] = {}
         self.accept = True
         self.cancelled: list[str] = []
         self.gone: set[str] = set()
@@ -73,7 +75,7 @@ class FakeRobot:
             now = (self.t_ns - start_ns) * 1e-9
             for i, name in enumerate(names):
                 if name not in self.stuck:
-                    self.state[name] = float(np.interp(now, t, q[:, i]))
+                    self.state[name] = float(np.interp(now, t, q[:, i])) + self.sag.get(name, 0.0)
         if not self.silent:
             message = JointState(name=list(self.state), position=list(self.state.values()))
             message.header.stamp = ns_to_stamp(self.t_ns)

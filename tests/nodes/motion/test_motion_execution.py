@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -75,6 +76,20 @@ def test_a71_a_controller_that_says_success_is_not_evidence(bench) -> None:
     assert (result.success, result.code) == (False, "EXECUTION_FAILED")
     assert "openarm_right_joint2 ended" in result.message
     assert "rad from its goal" in result.message
+
+
+def test_b40_the_tool_must_end_within_its_tolerance(bench) -> None:
+    arm, goal = bench.node._arms["right"], bench.description.group_state("right_arm", "official_home")
+    q = np.array([goal[name] for name in arm.names])
+    ways = [0.019 * np.array(signs) for signs in itertools.product((-1, 1), repeat=7)]  # within each joint's tolerance
+    far = [np.linalg.norm(arm.kinematics.fk(q + way)[:3, 3] - arm.kinematics.fk(q)[:3, 3]) for way in ways]
+    worst = ways[int(np.argmax(far))]
+    bench.robot.sag = dict(zip(arm.names, worst.tolist(), strict=True))
+    result = bench.run(bench.move_client, bench.named())
+    assert (result.success, result.code) == (False, "EXECUTION_FAILED")
+    assert f"the tool ended {max(far) * 1e3:.1f} mm from its goal, expected within 10" in result.message
+    bench.robot.sag = dict(zip(arm.names, (0.3 * worst).tolist(), strict=True))
+    assert bench.run(bench.move_client, bench.named("right", "home")).success
 
 
 def test_a_silent_robot_ends_a_motion_within_two_seconds(bench) -> None:

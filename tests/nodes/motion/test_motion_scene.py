@@ -166,7 +166,7 @@ def parameters(**values) -> dict:
     return {"parameter_overrides": [Parameter(f"map.{name}", value=value) for name, value in values.items()]}
 
 
-def test_a67_the_map_is_in_the_way_unless_something_known_explains_it(make_bench, writer) -> None:
+def test_a59_the_map_is_in_the_way_unless_something_known_explains_it(make_bench, writer) -> None:
     bench = make_bench()
     cell = goal_tip(bench)
     write(writer, [cell])
