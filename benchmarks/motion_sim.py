@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans executed in MuJoCo, judged by its contacts with the robot itself, the table and obstacles (N-11, N-12).
 
-    python -m benchmarks.motion_sim [--plans 1000] [--both 200] [--blind 20] [--first-seed 1000]
-        [--runs FILE] [--json PATH]
+    python -m benchmarks.motion_sim [--plans 1000] [--both 200] [--beside 200] [--blind 20]
+        [--first-seed 1000] [--runs FILE] [--json PATH]
 
 Core and physics in one process, without DDS and faster than real time. Each scene is drawn from its seed: a table with
 boxes on it and in the air, ten plans one after the other from wherever the arm stands. Trajectories go through the
@@ -18,18 +18,18 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.motion_problems import around_box, random_free, table_boxes
+from benchmarks.motion_stand import FAR, Seen, Stand
 from benchmarks.report import Row, write_report
 from openarm_common import se3
 from openarm_common.cameras import load_cameras
@@ -39,18 +39,14 @@ from openarm_common.housings import with_housings
 from openarm_common.scene import load_scene
 from openarm_motion import moves
 from openarm_motion.arm import Arm, Situation
+from openarm_motion.beside import Course, least_wait
 from openarm_motion.both import BothArms
+from openarm_motion.checks import Motion
 from openarm_motion.collision import Box, box_from
 from openarm_motion.config import MotionConfig
+from openarm_motion.seen import Known
 from openarm_motion.together import BothGoals, plan_staggered, plan_together
 from openarm_motion.trajectory import Trajectory
-from openarm_sim_bridge.actuation import TrajectoryConfig, TrajectoryOutcome
-from openarm_sim_bridge.controller import RobotController
-from openarm_sim_bridge.gripper import GripperConfig
-from openarm_sim_bridge.model import PhysicsConfig, build_spec
-from openarm_sim_bridge.stage import Stage
-from openarm_sim_bridge.trajectory import Trajectory as Commanded
-from openarm_sim_bridge.world import World
 
 Array = NDArray[np.float64]
 
@@ -58,102 +54,10 @@ Array = NDArray[np.float64]
 _A_SCENE = 10
 #: Goals that are drawn for one plan before the scene is given up.
 _DRAWS = 40
-#: Distances of the arms are looked for up to here, m.
-_FAR = 0.3
+#: Distance from where the other arm will end that the motion node plans with, m.
+_BESIDE = 0.035
 #: Faults of a request that make another goal be drawn: drawn goals may well be out of reach or blocked.
 _REFUSED = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN, Code.LIMITS)
-
-
-@dataclass
-class Seen:
-    """What the judge saw of one plan."""
-
-    kind: str
-    code: str = "OK"
-    contacts: list[str] = field(default_factory=list)
-    separation: float = _FAR
-    duration: float = 0.0
-    planning: float = 0.0
-    refused: int = 0
-
-
-class Stand:
-    """The simulated robot among boxes, and who moves it."""
-
-    def __init__(self, description: RobotDescription, boxes: tuple[Box, ...]) -> None:
-        scene = load_scene("empty")
-        stage = Stage(description, {}, None, PhysicsConfig())
-        spec = build_spec(description, scene, {}, None, PhysicsConfig())
-        for box in boxes:
-            quaternion = np.roll(se3.quat_xyzw_from_matrix(box.T[:3, :3]), 1)
-            spec.worldbody.add_geom(
-                name=box.id, type=mujoco.mjtGeom.mjGEOM_BOX, size=box.size / 2, pos=box.T[:3, 3], quat=quaternion
-            )
-        self.world = World(spec, joint_names=stage.joint_names, home=stage.home)
-        self._controller = RobotController(
-            stage.arms(), stage.grippers(), self.world, TrajectoryConfig(), GripperConfig()
-        )
-        self._geoms = [
-            [
-                g
-                for g in range(self.world.model.ngeom)
-                if self._body(g).startswith(f"openarm_{side}_") and self._solid(g)
-            ]
-            for side in ("left", "right")
-        ]
-        #: Pairs that touch before anything has moved, for example closed fingers.
-        self._usual = set(self._touching())
-
-    def state(self) -> dict[str, float]:
-        """Joints by name."""
-        return dict(zip(self.world.joint_names, self.world.read_joints().position.tolist(), strict=True))
-
-    def run(self, parts: Mapping[str, Trajectory], seen: Seen, *, distances: bool) -> None:
-        """Execute trajectories, one an arm, begun at the same moment."""
-        world, outcomes = self.world, dict[str, TrajectoryOutcome]()
-        for side, part in parts.items():
-            follower = self._controller.arms[side]
-            order = [world.joint_names.index(name) for name in follower.group.names]
-            command = follower.check(Commanded(part.names, part.t, part.q, part.v, part.a))
-            measured = world.read_joints().position[order]
-            follower.start(command, world.t_ns, measured, lambda outcome, side=side: outcomes.update({side: outcome}))
-        contacts: set[str] = set()
-        while len(outcomes) < len(parts):
-            world.set_targets(self._controller.update(world.read_joints(), world.period_ns))
-            for _ in range(world.steps_per_tick):
-                world.step(1)
-                contacts |= set(self._touching()) - self._usual
-            if distances:
-                seen.separation = min(seen.separation, self._separation(seen.separation))
-        seen.contacts = sorted(contacts)
-        faults = [outcome.text for outcome in outcomes.values() if outcome.result != 0]
-        if faults:
-            seen.code = f"EXECUTION_FAILED: {faults[0]}"
-
-    def _touching(self) -> Iterator[str]:
-        data = self.world.data
-        for contact in data.contact[: data.ncon]:
-            if contact.dist < 0.0:
-                yield " - ".join(sorted(self._name(int(g)) for g in (contact.geom1, contact.geom2)))
-
-    def _separation(self, limit: float) -> float:
-        model, data = self.world.model, self.world.data
-        for a in self._geoms[0]:
-            for b in self._geoms[1]:
-                far = float(np.linalg.norm(data.geom_xpos[a] - data.geom_xpos[b]))
-                if far - model.geom_rbound[a] - model.geom_rbound[b] < limit:
-                    limit = min(limit, mujoco.mj_geomDistance(model, data, a, b, limit, None))
-        return limit
-
-    def _solid(self, geom: int) -> bool:
-        return bool(self.world.model.geom_contype[geom] or self.world.model.geom_conaffinity[geom])
-
-    def _body(self, geom: int) -> str:
-        return self.world.model.body(int(self.world.model.geom_bodyid[geom])).name
-
-    def _name(self, geom: int) -> str:
-        body = self._body(geom)
-        return self.world.model.geom(geom).name or "nameless" if body == "world" else body
 
 
 def scene_boxes(arms: Mapping[str, Arm], home: Mapping[str, float], rng: np.random.Generator) -> tuple[Box, ...]:
@@ -253,6 +157,53 @@ def run_both(
     return out
 
 
+def run_beside(
+    arms: Mapping[str, Arm], description: RobotDescription, home: Mapping[str, float], seed: int
+) -> list[Seen]:
+    """Plans of one arm, made and begun while the other is under way, as the motion node does it."""
+    rng = np.random.default_rng(seed)
+    boxes = scene_boxes(arms, home, rng)
+    stand, out = Stand(description, boxes), list[Seen]()
+    under_way: dict[str, tuple[Trajectory, int]] = {}
+    nearest = FAR
+    for k in range(2 * _A_SCENE):
+        arm, other = list(arms.values())[:: 1 if k % 2 == 0 else -1]
+        seen = Seen("beside", separation=nearest)
+        while arm.name in stand.busy or (stand.busy and rng.random() > 0.02):
+            stand.tick(seen, distances=True)
+        under_way = {name: value for name, value in under_way.items() if name in stand.busy}
+        for _ in range(_DRAWS):
+            begin, state, held = time.perf_counter(), stand.state(), Course.standing(other, stand.state())
+            later = state
+            if other.name in under_way:
+                trajectory, since_ns = under_way[other.name]
+                held = Course(other, Motion.of(trajectory).later((since_ns - stand.world.t_ns) * 1e-9))
+                later = {**state, **held.motion.at(held.motion.duration)}
+            goals = middle_goals(arm, later, boxes, rng)
+            now = replace(arm.situation(later, scale=float(rng.choice([0.3, 0.5, 1.0]))), known=Known(apart=_BESIDE))
+            try:
+                scene = moves.free_scene(arm, now, moves.Around(boxes))
+                plan = arm.plan_certified(scene, now, goals, 2.0).trajectory
+                wait = least_wait(Course(arm, Motion.of(plan)), [held], state)
+            except OpenArmError as error:
+                if error.code not in _REFUSED:
+                    raise
+                seen.refused += 1
+                continue
+            seen.planning, seen.duration = time.perf_counter() - begin, plan.duration
+            stand.start(arm.name, plan, wait)
+            under_way[arm.name] = (plan, stand.world.t_ns + round(wait * 1e9))
+            out.append(seen)
+            nearest = FAR
+            break
+        else:
+            nearest = seen.separation
+    while stand.busy:
+        stand.tick(out[-1], distances=True)
+    stand.close(out[-1])
+    return out
+
+
 def middle_goals(arm: Arm, state: dict[str, float], boxes: tuple[Box, ...], rng: np.random.Generator) -> Array:
     """Configurations with the hand in the space that both arms share, where it is free of the boxes."""
     alone = {**state, **dict.fromkeys((n for n in state if arm.name not in n), 0.0)}
@@ -271,6 +222,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--plans", type=int, default=1000, help="plans of one arm")
     parser.add_argument("--both", type=int, default=200, help="plans of both arms")
+    parser.add_argument("--beside", type=int, default=200, help="plans of one arm while the other is under way")
     parser.add_argument("--blind", type=int, default=20, help="plans that know nothing of the boxes in the air")
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--runs", type=Path, default=Path("runs/motion_sim.jsonl"), help="a line a scene; continued")
@@ -289,6 +241,7 @@ def main() -> None:
     for name, count, run in (
         ("n11", args.plans, run_single),
         ("n12", args.both, run_both),
+        ("beside", args.beside, run_beside),
         ("blind", args.blind, run_blind),
     ):
         seen: list[Seen] = []
@@ -333,8 +286,8 @@ def _rows(name: str, seen: list[Seen]) -> list[Row]:
         Row(f"{name}_plan_p95_ms", float(np.percentile(planning, 95)) * 1e3, "ms", "lower", None, n=n),
         Row(f"{name}_moved_s", sum(s.duration for s in seen), "s", "higher", None, n=n),
     ]
-    if name == "n12":
-        rows.append(Row("n12_separation_mm", min(s.separation for s in seen) * 1e3, "mm", "higher", 20.0, n=n))
+    if name in ("n12", "beside"):
+        rows.append(Row(f"{name}_separation_mm", min(s.separation for s in seen) * 1e3, "mm", "higher", 20.0, n=n))
     return rows
 
 
