@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from openarm_bringup.campaign_link import arms_behind, request_of
+from openarm_bringup.campaign_planner import arms_behind, request_of
 from openarm_bringup.campaign_tasks import Task
 from openarm_common import se3
 from openarm_common.description import RobotDescription
@@ -60,7 +60,7 @@ def push_task(seed: int) -> Task:
 
 def _one_object(seed: int, rng: np.random.Generator) -> Scene:
     color = str(rng.choice(list(PALETTE)))
-    a, b, c = (round(float(edge), 3) for edge in rng.uniform((0.04, 0.04, 0.04), (0.07, 0.07, 0.07)))
+    a, b, c = (round(float(edge), 3) for edge in rng.uniform((0.04, 0.04, 0.04), (0.07, 0.07, 0.06)))
     item = SceneObject(
         name=f"{color}_box",
         shape="box",

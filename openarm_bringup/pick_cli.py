@@ -74,6 +74,7 @@ def pick(
         "outcome": result.outcome,
         "label": result.label,
         "arm": result.arm,
+        "route": result.route,
         "attempts": result.attempts,
         "place_position": list(result.place_position),
         "duration": result.duration,

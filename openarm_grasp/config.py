@@ -191,14 +191,9 @@ class PushConfig(Config):
     """How objects that no arm can grasp are pushed into reach."""
 
     most: int = Field(default=3, ge=0, le=10, description="pushes of one object, each followed by a look; 0: none")
-    reach_x: tuple[float, float] = Field(
-        default=(0.17, 0.43), description="x of places that it is pushed to, beside the region of free spots, m"
-    )
-    reach_abs_y: tuple[float, float] = Field(default=(0.10, 0.26), description="|y| of those places, m")
-    shortest: float = Field(default=0.02, gt=0.0, le=0.2, description="shortest push, m")
-    longest: float = Field(default=0.15, gt=0.0, le=0.5, description="longest push, m")
+    lengths: tuple[float, ...] = Field(default=(0.06, 0.10), description="lengths of a push that are tried, m")
+    directions: int = Field(default=12, ge=1, le=72, description="directions of a push that are tried")
     gap: float = Field(default=0.012, ge=0.005, le=0.05, description="hand to object before it is pushed, m")
-    hand_half: float = Field(default=0.015, gt=0.0, le=0.05, description="half of the closed fingers' width, m")
     tilts_deg: tuple[float, ...] = Field(
         default=(0.0, 15.0, 30.0, 45.0, 60.0), description="leans of the pushing hand from vertical, deg"
     )

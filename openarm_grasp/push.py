@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
-from math import cos, hypot, radians, sin
+from math import cos, hypot, inf, pi, radians, sin
 
 import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common import se3
+from openarm_common.description import RobotDescription, Side
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.candidates import UP, GraspCandidate, obstacle_boxes, target_box
 from openarm_grasp.config import GraspConfig
@@ -41,6 +43,11 @@ from openarm_grasp.rehearsal import NO_WAY, Rehearsal, standing_at
 from openarm_grasp.routing import ARMS, arm_order
 
 Array = NDArray[np.float64]
+
+#: Between two points of a hand's shape, m.
+_GRAIN = 0.005
+#: Points no further behind the foremost than this are at the front, m.
+_FLAT = 0.002
 
 
 @dataclass(frozen=True)
@@ -105,7 +112,7 @@ class Pusher:
                 if error.code not in NO_WAY:
                     raise
                 faults.append(f"to ({x:.3f}, {y:.3f}) m: {error.message}")
-        why = "; ".join(faults) or f"no free place in reach is within {self._config.push.longest:g} m"
+        why = f"{faults[0]} ({len(faults) - 1} other pushes refused)" if faults else "there is no free place around it"
         raise OpenArmError(Code.UNREACHABLE, f"it cannot be pushed into reach either: {why}")
 
     @property
@@ -129,8 +136,11 @@ class Pusher:
     async def _push_to(self, seen: Sighting, end: Array, taker: str) -> Push:
         """The other arm is asked first: it comes from the other side."""
         config, faults = self._config, list[str]()
-        ways = push_ways(seen.target, end, config)
         for arm in sorted(ARMS, key=lambda arm: arm == taker):
+            ways = push_ways(seen.target, end, config, closed_hand(self._link.description, arm))
+            if not ways:
+                faults.append(f"{arm} hand: {seen.target.label!r} would tip over")
+                continue
             self._link.check()
             effect = PlanGrasp(arm, ways, obstacle_boxes(seen.others, config), target_box(seen.target, config))
             try:
@@ -206,59 +216,64 @@ class Pusher:
 
 
 def destinations(target: Detection, others: Sequence[Detection], around: Surroundings) -> tuple[Array, ...]:
-    """Places near the object where an arm usually grasps, free of others, the nearest first.
+    """Places around the object, on the table and free of others: short pushes first, then those to the sides.
 
     Args:
         target: The object.
         others: What else stands on the table.
-        around: Parameters.
+        around: Parameters and table.
     """
-    config, place = around.config.push, around.config.place
-    p = target.p_base[:2]
-    found: list[tuple[float, float, float]] = []
-    regions = ((place.region_x, place.region_abs_y), (config.reach_x, config.reach_abs_y))
-    for ((x0, x1), (y0, y1)), side in product(regions, (1.0, -1.0)):
-        x, y = float(np.clip(p[0], x0, x1)), side * float(np.clip(side * p[1], y0, y1))
-        length = hypot(x - p[0], y - p[1])
-        room = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=np.inf)
-        if config.shortest <= length <= config.longest and room >= place.neighbour_distance:
-            found.append((length, x, y))
-    return tuple(np.array([x, y]) for _, x, y in sorted(found))
+    config, place, table = around.config.push, around.config.place, around.table
+    p, half = target.p_base[:2], 0.5 * float(np.hypot(*target.size[:2]))
+    found: list[tuple[float, float, float, float]] = []
+    for length, k in product(config.lengths, range(config.directions)):
+        angle = 2.0 * pi * k / config.directions
+        x, y = float(p[0] + length * cos(angle)), float(p[1] + length * sin(angle))
+        room = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=inf)
+        on_table = table.x[0] + half <= x <= table.x[1] - half and table.y[0] + half <= y <= table.y[1] - half
+        if on_table and room >= place.neighbour_distance:
+            found.append((length, -round(abs(sin(angle)), 3), x, y))
+    return tuple(np.array([x, y]) for _, _, x, y in sorted(found))
 
 
-def push_ways(target: Detection, end: Array, config: GraspConfig) -> tuple[GraspCandidate, ...]:
+def push_ways(target: Detection, end: Array, config: GraspConfig, hand: Sequence[Array]) -> tuple[GraspCandidate, ...]:
     """How a closed hand may stand behind the object, the most upright first.
 
     One of its four faces looks ahead, so that a flat side of the object is met flat; it leans sideways, or with its
-    tips ahead, never over the object. The tips are as low as in a grasp: below the middle of what stands upright.
+    tips ahead, never over the object. Whatever part of the hand comes first must meet the object at half of its height
+    or lower, else the object would tip over.
 
     Args:
         target: The object.
         end: (2,) where it shall be pushed.
         config: Parameters.
+        hand: Points (n, 3) of the closed hand, TCP frame.
     """
     way = np.array([*(end - target.p_base[:2]), 0.0])
     ahead = _direction(way)
     aside = np.cross(UP, ahead)
-    half = 0.5 * float(np.abs(target.T_base_object[:3, :2].T @ ahead) @ target.size[:2])
-    behind = half + config.push.hand_half + config.push.gap
+    half, half_width = (
+        0.5 * float(np.abs(target.T_base_object[:3, :2].T @ v) @ target.size[:2]) for v in (ahead, aside)
+    )
+    tall = float(target.size[2])
+    faces = (("ahead+", ahead), ("ahead-", -ahead), ("aside+", aside), ("aside-", -aside))
     found: list[GraspCandidate] = []
-    for (name, y_tool), tilt_deg, lean in product(
-        (("ahead+", ahead), ("ahead-", -ahead), ("aside+", aside), ("aside-", -aside)),
-        config.push.tilts_deg,
-        (1.0, -1.0),
-    ):
+    for (name, y_tool), tilt_deg, lean in product(faces, config.push.tilts_deg, (1.0, -1.0)):
         heading = lean * np.cross(UP, y_tool)
         if (tilt_deg == 0.0 and lean < 0.0) or float(heading @ ahead) < -1e-6:
             continue
         tilt = radians(tilt_deg)
-        z_tool = sin(tilt) * heading - cos(tilt) * UP
-        p = target.p_base - behind * ahead
-        p[2] = target.bottom + config.hand.tip_clearance + config.hand.tip_clearance_tilted * sin(tilt)
+        R = se3.rotation_from_z_y(sin(tilt) * heading - cos(tilt) * UP, y_tool)
+        height = config.hand.tip_clearance + config.hand.tip_clearance_tilted * sin(tilt)
+        front, low = _front(hand @ R.T, ahead, half_width, (-height, tall - height))
+        if low + height > 0.5 * tall:
+            continue
+        p = target.p_base - (half + front + config.push.gap) * ahead
+        p[2] = target.bottom + height
         found.append(
             GraspCandidate(
                 id=f"{target.label}/push/{name}/tilt{tilt_deg:g}" + (f"/lean{lean:+g}" if tilt_deg else ""),
-                T_base_tcp=se3.make(se3.rotation_from_z_y(z_tool, y_tool), p),
+                T_base_tcp=se3.make(R, p),
                 approach_offset=config.approach.pregrasp_distance * UP,
                 retreat_offset=way + config.push.gap * ahead,
                 width=0.0,
@@ -268,6 +283,41 @@ def push_ways(target: Detection, end: Array, config: GraspConfig) -> tuple[Grasp
             )
         )
     return tuple(sorted(found, key=lambda c: -c.score))
+
+
+@cache
+def closed_hand(description: RobotDescription, arm: Side) -> Array:
+    """Points (n, 3) of the hand and its closed fingers, some mm apart, TCP frame, m."""
+    tcp = description.tcp_link(arm)
+    palm = description.chain(tcp)[-1].parent
+    links = [palm, *(joint.child for joint in description.joints.values() if joint.parent == palm)]
+    poses = description.link_poses(dict.fromkeys(description.joints, 0.0))
+    T_tcp_base = se3.inverse(poses[tcp])
+    found = [np.zeros((1, 3))]
+    for link in links:
+        for part in description.links[link].collision:
+            if part.kind == "box":
+                steps = [np.linspace(-0.5, 0.5, max(2, round(edge / _GRAIN) + 1)) * edge for edge in part.size]
+                grid = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+                found.append(se3.apply(T_tcp_base @ poses[link] @ part.T_link_primitive, grid))
+    return np.vstack(found)
+
+
+def _front(points: Array, ahead: Array, half_width: float, height: tuple[float, float]) -> tuple[float, float]:
+    """How far the parts of the hand that can meet the object reach ahead of the TCP, and how low the foremost does, m.
+
+    Args:
+        points: (n, 3) of the hand's surface, axes of the base, from the TCP.
+        ahead: (3,) direction.
+        half_width: Of the object, across that direction, m.
+        height: Of the object's lower and upper face above the TCP, m.
+    """
+    across = np.abs(points @ np.cross(UP, ahead))
+    low, high = height
+    meets = points[(across <= half_width + _FLAT) & (points[:, 2] > low) & (points[:, 2] < high + _FLAT)]
+    reach = meets @ ahead
+    front = float(reach.max())
+    return front, float(meets[reach > front - _FLAT, 2].min())
 
 
 def shifted(T: Array, offset: Array) -> Array:

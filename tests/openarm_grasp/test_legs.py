@@ -222,8 +222,9 @@ def test_n13_a65_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(ro
     outcome = two.ask()
     assert (outcome.code, outcome.route) == (Code.OK, "push")
     assert two.pushed == 1
-    assert "push 1 by the right hand moved it" in outcome.message  # the arm that then grasps is the left one
-    assert outcome.arm == "left"
+    pusher = next(e.arm for e in two.world.done(fx.Execute))
+    assert f"push 1 by the {pusher} hand moved it 60 mm" in outcome.message
+    assert pusher != outcome.arm  # the hand that comes from the other side pushes
     closed = next(e for e in two.world.done(fx.MoveGripper))
     assert closed.position == 0.0
 
