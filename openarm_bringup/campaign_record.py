@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is kept of a task that did not go as expected: pictures, cloud, joint trace, states, and how to run it again."""
+"""What is kept of a task that did not go as expected: pictures, cloud and map, joints, states, how to run it again."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from openarm_bringup.campaign_robot import SimRobot
 from openarm_common.errors import OpenArmError
-from openarm_perception.depth import Deprojector, DepthLimits
+from openarm_common.octomap_codec import write_file
+from openarm_octomap.config import GridConfig
+from openarm_octomap.grid import DepthScan, OccupancyGrid
 
 _VIEWS = ("overhead", "spectator")
 _PICTURES = 6
@@ -32,7 +34,7 @@ class Keeper:
         self._robot = robot
         self._folder = folder
         self._pictures: list[tuple[str, NDArray[np.uint8]]] = []
-        self._cloud: NDArray[np.float64] | None = None
+        self._scan: DepthScan | None = None
         self._failed = False
 
     def step(self, state: str, *, failed: bool) -> None:
@@ -42,7 +44,10 @@ class Keeper:
         self._failed = failed
         seen = self._robot.images.get("overhead")
         if state == "TRANSFORM" and seen is not None:
-            self._cloud = self._points(seen[2])
+            t_ns, _, depth = seen
+            camera = self._robot.cameras["overhead"]
+            T_base_camera = self._robot.camera_pose(camera, t_ns)
+            self._scan = DepthScan(depth.copy(), camera.intrinsics, T_base_camera, camera.near, camera.far)
 
     def write(self, row: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> Path:
         """Write all that is known of the task into its folder, and return that."""
@@ -51,8 +56,11 @@ class Keeper:
         self._shoot("end")
         for name, picture in self._pictures:
             cv2.imwrite(str(folder / f"{name}.png"), np.ascontiguousarray(picture[..., ::-1]))
-        if self._cloud is not None:
-            np.savez_compressed(folder / "cloud.npz", points_base=self._cloud.astype(np.float32))
+        if self._scan is not None:
+            np.savez_compressed(folder / "cloud.npz", points_base=self._scan.points())
+            grid = OccupancyGrid(GridConfig())
+            grid.integrate([self._scan], 0)
+            write_file(folder / "map.bt", grid.binary(), grid.lattice.resolution)
         trace = list(self._robot.trace)
         np.savez_compressed(
             folder / "joints.npz",
@@ -73,9 +81,3 @@ class Keeper:
                 self._pictures.append((f"{name}_{view}", self._robot.draw(view)[0].copy()))
             except OpenArmError:
                 return  # a picture that cannot be drawn is not what failed
-
-    def _points(self, depth: Any) -> NDArray[np.float64]:
-        camera = self._robot.cameras["overhead"]
-        points = Deprojector(DepthLimits(near=camera.near, far=camera.far)).valid_points(depth, camera.intrinsics)
-        T = camera.T_parent_optical
-        return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]

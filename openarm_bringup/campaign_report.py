@@ -58,13 +58,20 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "wilson_high": high,
         "objects": interval(len(done), len(grasps)),
         "attempts": dict(sorted(Counter(int(row["attempts"]) for row in placed).items())),
-        "causes": dict(Counter(f"{row['code']}" for row in failed).most_common()),
+        "causes": dict(Counter(_cause(row) for row in failed).most_common()),
         "kinds": _kinds(rows),
         "arms": _arms(grasps),
         "place_error_mm": _spread(errors, 2),
         "cycle_s": _spread(times, 2),
         "state_s": _states(done),
     }
+
+
+def _cause(row: Row) -> str:
+    """Why a scene did not go as expected."""
+    if row["code"] != "OK":
+        return str(row["code"])
+    return "false success" if row["false_success"] else "placed, though that should not be possible"
 
 
 def _kinds(rows: Sequence[Row]) -> dict[str, Any]:
@@ -153,6 +160,7 @@ _STYLE = """body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:7
 h1,h2{font-weight:600}table{border-collapse:collapse;width:100%;margin:1rem 0}
 td,th{padding:.25rem .6rem;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}
 tr.bad td{background:#fdecea}code{background:#f3f3f3;padding:0 .25rem}
+code,p{overflow-wrap:anywhere}img{width:16rem;margin-right:.5rem}
 .bar{background:#4c78a8;height:.8rem}.wide{width:50%}"""
 
 
@@ -170,7 +178,10 @@ def write_html(path: Path, data: Mapping[str, Any]) -> None:
         (kind, v["expected"], f"{v['count']} of {v['n']}", ", ".join(f"{c} {n}" for c, n in v["codes"].items()))
         for kind, v in s["kinds"].items()
     ]
+    arms = [(arm, _rate(v)) for arm, v in s["arms"].items()]
+    body += ["<h2>Arms</h2>", _table(("arm", "objects placed"), arms)] if arms else []
     body += ["<h2>Kinds</h2>", _table(("kind", "expected", "as expected", "codes"), kinds)]
+    body += _failures(path.parent, data["rows"])
     body += ["<h2>Scenes</h2>", _rows(data["rows"])]
     settings = {**data["settings"], **data["versions"]}
     body += ["<h2>Made with</h2>", _table((), [(k, str(v)) for k, v in settings.items()])]
@@ -192,6 +203,20 @@ def _bars(values: Mapping[str, float], unit: str) -> str:
         for k, v in values.items()
     )
     return f"<table>{''.join(lines)}</table>"
+
+
+def _failures(folder: Path, rows: Sequence[Row]) -> list[str]:
+    """What the cameras saw of scenes that did not go as expected."""
+    out: list[str] = []
+    for row in rows:
+        kept = folder / "failures" / str(row["seed"])
+        pictures = [] if row["as_expected"] else sorted(kept.glob("failed*_spectator.png"))
+        pictures += [] if row["as_expected"] else kept.glob("end_spectator.png")
+        if pictures:
+            links = (f"failures/{row['seed']}/{picture.name}" for picture in pictures)
+            images = "".join(f'<a href="{link}"><img src="{link}" alt="{Path(link).stem}"></a>' for link in links)
+            out.append(f"<p>seed {row['seed']}: {html.escape(str(row['message']))}</p><p>{images}</p>")
+    return ["<h2>Not as expected: at each failure, and at the end</h2>", *out] if out else []
 
 
 def _rows(rows: Sequence[Row]) -> str:

@@ -197,7 +197,7 @@ class SimRobot:
         rgb, depth = self.draw(name)
         self.images[name] = (self.t_ns, rgb, depth)
         try:
-            T_base_camera = self._camera_pose(camera, stamp_ns)
+            T_base_camera = self.camera_pose(camera, stamp_ns)
             optics = self.camera_faults.intrinsics(name, camera.intrinsics)
             view = DepthView(depth, optics, T_base_camera, camera.near, camera.far)
             perceived = _pipeline(name, self._table_z).run(
@@ -237,7 +237,12 @@ class SimRobot:
     def _noise(self, name: str, z: NDArray[np.float32]) -> NDArray[np.float32]:
         return add_depth_noise(z, self.cameras[name].intrinsics.fx, DepthNoiseConfig(enabled=True), self._rng)
 
-    def _camera_pose(self, camera: CameraConfig, stamp_ns: int) -> Array:
+    def camera_pose(self, camera: CameraConfig, stamp_ns: int) -> Array:
+        """T_base_optical (4, 4) of a camera at a stamp, as the suite believes.
+
+        Raises:
+            OpenArmError: STALE_DATA, when the camera rides on a joint of which the stamp knows nothing.
+        """
         T_parent_link = self._mounts.get(camera.name, camera.T_parent_link)
         T_link_optical = se3.inverse(camera.T_parent_link) @ camera.T_parent_optical
         T_base_parent = self.states.lookup(self.description.root, camera.parent, stamp_ns)

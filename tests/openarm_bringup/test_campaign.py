@@ -17,8 +17,11 @@ from openarm_bringup.campaign_progress import Pace
 from openarm_bringup.campaign_robot import SimulatedSenses
 from openarm_bringup.campaign_tasks import FaultPlan, make_task, sets
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.octomap_codec import read_file
 from openarm_grasp import performer
 from openarm_grasp.config import GraspConfig
+from openarm_octomap.config import GridConfig
+from openarm_octomap.grid import OccupancyGrid
 
 
 def row(seed: int, *, placed: bool = True, attempts: int = 1, false: bool = False, expected=("placed",), code="OK"):
@@ -42,7 +45,7 @@ def test_n01_n04_rates_carry_wilson_intervals_and_attempts() -> None:
     assert s["success_rate"]["low"] == pytest.approx(0.150, abs=1e-3)
     assert s["success_rate"]["high"] == pytest.approx(0.850, abs=1e-3)
     assert s["attempts"] == {1: 1, 2: 1}
-    assert s["causes"] == {"GRASP_LOST": 1, "OK": 1}
+    assert s["causes"] == {"GRASP_LOST": 1, "false success": 1}
     assert s["state_s"] == {"LIFT": 1.5}
 
 
@@ -161,8 +164,18 @@ def test_n02_n24_what_cannot_be_held_is_refused_and_everything_of_it_kept(tmp_pa
     assert found["code"] in (Code.GRASP_MISSED, Code.GRASP_LOST, Code.HAND_COLLISION)
     assert found["attempts"] == 3
     kept = {path.name for path in tmp_path.iterdir()}
-    assert {"row.json", "reason.txt", "joints.npz", "cloud.npz", "end_spectator.png", "end_overhead.png"} <= kept
+    assert {
+        "row.json",
+        "reason.txt",
+        "joints.npz",
+        "cloud.npz",
+        "map.bt",
+        "end_spectator.png",
+        "end_overhead.png",
+    } <= kept
     assert any(name.startswith("failed_0") for name in kept)
+    occupied = read_file(tmp_path / "map.bt").on(OccupancyGrid(GridConfig()).lattice)[0] > 0.0
+    assert 1000 < int(occupied.sum()) < 20000  # a table and what stands on it
     assert "openarm campaign --seeds 10000" in (tmp_path / "reason.txt").read_text()
 
 
