@@ -36,16 +36,19 @@ class GraphView:
 
     Args:
         on_item: Gets all that is new, in a thread of this object.
-        on_end: Gets what ended that thread, when it was not `close`.
+        on_end: Gets what ended that thread too early.
+        timeout: Longest wait for a server to be there, s.
     """
 
-    def __init__(self, on_item: Callable[[Item], object], on_end: Callable[[BaseException], object]) -> None:
+    def __init__(
+        self, on_item: Callable[[Item], object], on_end: Callable[[BaseException], object], *, timeout: float = 3.0
+    ) -> None:
         self.description = RobotDescription.load()
         self.cameras = tuple(load_cameras().values())
         self._on_item, self._on_end = on_item, on_end
         self._makers = makers(self.description, self.cameras, CLOUD_CAMERA)
         self._wanted: frozenset[str] = frozenset()
-        self._ask = BackgroundNode("openarm_view", timeout=3.0)
+        self._ask = BackgroundNode("openarm_view", timeout=timeout)
         self._context = Context()
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._node: Node = rclpy.create_node(

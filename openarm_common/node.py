@@ -101,7 +101,9 @@ class BaseNode(LockstepNode, Generic[ConfigT]):
         self.config: ConfigT = validate(model, data, f"parameters of {self.get_fully_qualified_name()}")
         self.__pool = ThreadPoolExecutor(max_workers=4, thread_name_prefix=name)
         self.__description: RobotDescription | None = None
-        self.__status = DiagnosticStatus(level=DiagnosticStatus.STALE, name=f"{name}: status", hardware_id="openarm")
+        self.__status = DiagnosticStatus(
+            level=DiagnosticStatus.STALE, name=f"{self.get_name()}: status", hardware_id="openarm"
+        )
         self.__diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
         self.create_timer(1.0, self.__publish_diagnostics, clock=self.steady_clock)
 
@@ -132,7 +134,7 @@ class BaseNode(LockstepNode, Generic[ConfigT]):
         What the model or `take` refuse with an OpenArmError stays as it was; who asked is told why.
         """
 
-        def change(parameters: list[Parameter[Any]]) -> SetParametersResult:
+        def change(parameters: list[Parameter]) -> SetParametersResult:
             data = self.config.model_dump()
             for parameter in parameters:
                 *groups, key = parameter.name.split(".")

@@ -47,7 +47,8 @@ export class AskPanel {
     this.ask = ask;
     this.onChosen = onChosen;
     this.labels = null;
-    this.label = null;
+    this.label = null; // what a click would pick
+    this.wish = null; // what was chosen last; it may be out of sight for a while
     this.running = false;
     $("ask").addEventListener("submit", (event) => {
       event.preventDefault();
@@ -62,10 +63,15 @@ export class AskPanel {
     const labels = [...new Set(boxes.map((box) => box.label))].sort();
     if (labels.join() === this.labels?.join()) return;
     this.labels = labels;
-    this.choose(labels.includes(this.label) ? this.label : (labels[0] ?? null));
+    this.#select(labels.includes(this.wish) ? this.wish : (labels[0] ?? null));
   }
 
   choose(label) {
+    this.wish = label;
+    this.#select(label);
+  }
+
+  #select(label) {
     this.label = label;
     const chips = (this.labels ?? []).map((name) => {
       const chip = element("button", { type: "button", role: "radio", "aria-checked": name === label, text: name });

@@ -47,8 +47,8 @@ const handlers = {
   },
   detections(message) {
     boxes = message.boxes;
-    asking.setDetections(boxes);
     drawDetections();
+    asking.setDetections(boxes);
   },
   plan(message) {
     const ends = message.ways.flatMap((way) => way.slice(1).flatMap((point, i) => [way[i], point]));
@@ -148,13 +148,22 @@ function drawRobot() {
   scene.setSolids("held", "box", data, { glass: true });
 }
 
+/** From the floor over the table top (0.4 m) and what stands on it to what is above. */
+const HEIGHTS = [[0, [0.2, 0.42, 0.6]], [0.4, [0.42, 0.58, 0.56]], [0.5, [0.85, 0.62, 0.32]], [1, [0.8, 0.34, 0.3]]];
+
+function heightColor(z) {
+  const above = Math.max(1, HEIGHTS.findIndex(([height], i) => z < height || i === HEIGHTS.length - 1));
+  const [[low, a], [high, b]] = [HEIGHTS[above - 1], HEIGHTS[above]];
+  const u = Math.min(1, Math.max(0, (z - low) / (high - low)));
+  return a.map((v, i) => v + u * (b[i] - v));
+}
+
 function drawMap(cells, count) {
   const data = new Float32Array(INSTANCE * count);
   for (let i = 0; i < count; i++) {
     const [x, y, z, edge] = cells.subarray(4 * i, 4 * i + 4);
     const size = 0.94 * edge;
-    const u = Math.min(1, Math.max(0, z / 1.0));
-    data.set([size, 0, 0, 0, 0, size, 0, 0, 0, 0, size, 0, x, y, z, 1, 0.22 + 0.66 * u, 0.47 + 0.14 * u, 0.62 - 0.32 * u, 1], INSTANCE * i);
+    data.set([size, 0, 0, 0, 0, size, 0, 0, 0, 0, size, 0, x, y, z, 1, ...heightColor(z), 1], INSTANCE * i);
   }
   scene.setSolids("map", "box", data);
 }

@@ -23,7 +23,8 @@ NASTY = "<img src=x onerror='document.title=1'>"
 
 
 #: JavaScript: what sticks out of the window to the right.
-_TOO_WIDE = """[...document.querySelectorAll("body *")].filter((one) => one.getBoundingClientRect().right > innerWidth + 1)
+_TOO_WIDE = """[...document.querySelectorAll("body *")]
+  .filter((one) => one.getBoundingClientRect().right > innerWidth + 1)
   .map((one) => one.tagName + "#" + one.id + "." + one.className)"""
 
 
@@ -84,6 +85,7 @@ class StandIns:
             (publisher(Octomap, "/octomap_binary", QOS_LATCHED), octree),
         ]
         self.image = sent[1][0]
+        self.detections = sent[2][1]
         node.create_timer(0.1, lambda: [out.publish(message) for out, message in sent])
         group = ReentrantCallbackGroup()
         node.create_service(ResetWorld, "/sim/reset_world", self._reset)
@@ -222,6 +224,11 @@ def test_the_page_shows_the_graph_and_asks_it(stand_ins: StandIns, open_tab: Any
         await tab.until("document.querySelector('#outcome').textContent.startsWith('CANCELLED: cancelled while')")
         await tab.click("#shuffle")
         await tab.until("document.querySelector('#world-answer').textContent === 'the world is as it was'")
+
+        # one that is no longer seen can't be asked for
+        stand_ins.detections.detections.pop()
+        await tab.until("document.querySelectorAll('#choices button').length === 1")
+        assert await tab.js("document.querySelectorAll('#labels button').length") == 1
 
         # who looks away takes nothing
         assert stand_ins.image.get_subscription_count() > 0

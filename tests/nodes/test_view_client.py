@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page's side of the graph: it listens to what is wanted, shows what comes, and says what does not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from openarm_common.errors import Code, OpenArmError
+
+
+class Looking:
+    """A view of the graph of a test, and the newest that it has seen of each key."""
+
+    def __init__(self, ros) -> None:
+        from openarm_bringup.view_client import GraphView
+
+        self.ros = ros
+        self.seen: dict[str, Any] = {}
+        self.ended: list[BaseException] = []
+        self.view = GraphView(self._take, self.ended.append, timeout=0.3)
+
+    def _take(self, item) -> None:
+        self.seen[item.key] = item.payload
+
+    def wait(self, key: str, fits: Callable[[Any], object] = bool, seconds: float = 10.0) -> Any:
+        """The newest payload of a key, once it fits."""
+        self.ros.spin_until(lambda: self.ended or (key in self.seen and fits(self.seen[key])), seconds, key)
+        assert not self.ended, self.ended
+        return self.seen[key]
+
+
+@pytest.fixture
+def looking(ros):
+    made = Looking(ros)
+    with made.view:
+        yield made
+
+
+def test_a_cloud_is_made_of_depth_and_colour_of_one_stamp(ros, looking: Looking) -> None:
+    from geometry_msgs.msg import TransformStamped
+    from sensor_msgs.msg import CameraInfo, Image
+    from tf2_msgs.msg import TFMessage
+
+    from openarm_common.cameras import Intrinsics
+    from openarm_common.convert import array_to_image, info_from_intrinsics, matrix_to_transform
+    from openarm_common.node import QOS_SENSOR, QOS_STATIC_TF
+
+    frame = "overhead_color_optical_frame"
+    intrinsics = Intrinsics.from_fovy(64, 48, 60.0)
+    outs = {
+        name: ros.node.create_publisher(kind, f"/overhead/{name}", QOS_SENSOR)
+        for name, kind in (("color/image_raw", Image), ("depth/image_raw", Image), ("depth/camera_info", CameraInfo))
+    }
+    tf = ros.node.create_publisher(TFMessage, "/tf_static", QOS_STATIC_TF)
+    down = np.array([[0.0, -1, 0, 0.4], [-1, 0, 0, 0], [0, 0, -1, 1.2], [0, 0, 0, 1]])
+    edge: TransformStamped = matrix_to_transform("openarm_body_link0", frame, down, 0)
+    tf.publish(TFMessage(transforms=[edge]))
+    color = np.zeros((48, 64, 3), np.uint8)
+    color[..., 2] = 255
+    t_ns, lag = 0, 1
+
+    def publish() -> None:
+        nonlocal t_ns
+        t_ns += 100_000_000
+        outs["color/image_raw"].publish(array_to_image(color, "rgb8", frame, t_ns - lag))
+        outs["depth/image_raw"].publish(array_to_image(np.full((48, 64), 800, np.uint16), "16UC1", frame, t_ns))
+        outs["depth/camera_info"].publish(info_from_intrinsics(intrinsics, frame, t_ns))
+
+    ros.node.create_timer(0.1, publish)
+    looking.view.want(frozenset({"cloud"}))
+    ros.spin_until(lambda: outs["depth/image_raw"].get_subscription_count(), 10.0, "the page listens")
+    begun = t_ns
+    ros.spin_until(lambda: t_ns > begun + 800_000_000, 10.0, "frames whose halves do not fit")
+    assert "cloud" not in looking.seen
+    lag = 0
+    data = looking.wait("cloud")
+    length = int.from_bytes(data[:4], "little")
+    count = json.loads(data[4 : 4 + length])["count"]
+    body = data[4 + length :]
+    points = np.frombuffer(body[: 12 * count], np.float32).reshape(-1, 3)
+    colors = np.frombuffer(body[12 * count :], np.uint8).reshape(-1, 3)
+    np.testing.assert_allclose(points[:, 2], 0.4, atol=1e-3)  # the table
+    assert abs(points[:, :2].mean(axis=0) - (0.4, 0.0)).max() < 0.05
+    assert len(colors) == count > 100
+    assert (colors == (0, 0, 255)).all()
+
+    looking.view.want(frozenset())
+    ros.spin_until(lambda: not outs["depth/image_raw"].get_subscription_count(), 10.0, "the page looks away")
+
+
+def test_what_hangs_on_a_link_and_the_way_of_a_plan_are_shown(ros, looking: Looking) -> None:
+    from geometry_msgs.msg import Point
+    from sensor_msgs.msg import JointState
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    from openarm_common.node import QOS_COMMAND, QOS_LATCHED
+
+    held = Marker(type=Marker.CUBE, action=Marker.ADD, ns="red")
+    held.header.frame_id = "openarm_left_hand_tcp"
+    held.scale.x = held.scale.y = held.scale.z = 0.05
+    held.pose.orientation.w = 1.0
+    ros.node.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED).publish(MarkerArray(markers=[held]))
+    way = Marker(type=Marker.LINE_STRIP, points=[Point(x=0.1), Point(x=0.2)])
+    ros.node.create_publisher(MarkerArray, "/motion/preview", QOS_LATCHED).publish(MarkerArray(markers=[way]))
+    joints = ros.node.create_publisher(JointState, "/joint_states", QOS_COMMAND)
+    looking.view.want(frozenset({"robot", "plan"}))
+    shown = json.loads(looking.wait("held"))["boxes"][0]
+    assert (shown["label"], shown["link"], shown["size"]) == ("red", "openarm_left_hand_tcp", [0.05, 0.05, 0.05])
+    ros.spin_until(joints.get_subscription_count, 10.0, "the page listens")
+    looking.wait("fault:robot", lambda text: "nothing on /joint_states" in text)
+    message = JointState(name=["openarm_left_joint1"], position=[0.3])
+    ros.node.create_timer(0.05, lambda: joints.publish(message))
+    looking.wait("robot")
+    looking.wait("fault:robot", lambda text: json.loads(text)["text"] == "")
+
+
+def test_a_message_that_can_t_be_shown_is_said_and_the_rest_goes_on(ros, looking: Looking) -> None:
+    from sensor_msgs.msg import Image
+
+    from openarm_common.node import QOS_SENSOR
+
+    images = ros.node.create_publisher(Image, "/overhead/color/image_raw", QOS_SENSOR)
+    bad = Image(encoding="bayer", width=2, height=2, step=2, data=[0] * 4)
+    ros.node.create_timer(0.05, lambda: images.publish(bad))
+    looking.view.want(frozenset({"image:overhead", "states"}))
+    looking.wait("fault:image:overhead", lambda text: "'bayer' is not supported" in text)
+    looking.wait("health")
+
+
+def test_without_a_graph_every_question_has_an_answer(looking: Looking) -> None:
+    from openarm_bringup.view_server import Order, Reset
+
+    view = looking.view
+    for ask in (lambda: view.pick(Order(label="red")), view.cancel, lambda: view.reset(Reset())):
+        with pytest.raises(OpenArmError, match="is the graph up") as refused:
+            ask()
+        assert refused.value.code is Code.NOT_READY
