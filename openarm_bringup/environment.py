@@ -16,6 +16,11 @@ from openarm_bringup.graph import Graph, NodeSpec
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 
+#: The variable that names the Fast DDS profile of a process.
+PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+#: Reaches of discovery that go beyond this machine.
+ACROSS_MACHINES = ("subnet", "system_default")
+
 
 def domain_id(graph: Graph, environ: Mapping[str, str] = os.environ) -> int:
     """Return the ROS domain of a graph: its own, else the environment's, else 0.
@@ -50,8 +55,15 @@ def node_environment(graph: Graph, name: str, run_dir: Path, environ: Mapping[st
     for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         env.setdefault(key, "1")
     if spec.large_messages:
-        env["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(write_profile(spec, run_dir / "params" / f"{name}.fastdds.xml"))
+        env[PROFILE] = str(write_profile(spec, run_dir / "params" / f"{name}.fastdds.xml"))
+    elif graph.discovery in ACROSS_MACHINES:
+        env[PROFILE] = str(network_profile())
     return {**env, **spec.env}
+
+
+def network_profile() -> Path:
+    """Return the Fast DDS profile of processes that hear images from another machine."""
+    return config_dir() / "fastdds_network.xml"
 
 
 def write_profile(spec: NodeSpec, path: Path) -> Path:

@@ -86,6 +86,7 @@ def pick(
 def meet_graph(domain: int | None) -> None:
     """Set this process up to meet the graph: of that domain, or the only one that runs here."""
     from openarm_bringup import runs
+    from openarm_bringup.environment import ACROSS_MACHINES, PROFILE, network_profile
 
     try:
         record = runs.the_running(domain)
@@ -100,3 +101,5 @@ def meet_graph(domain: int | None) -> None:
     os.environ["ROS_DOMAIN_ID"] = str(record.domain)
     if record.discovery != "system_default":
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = record.discovery.upper()
+    if record.discovery in ACROSS_MACHINES:
+        os.environ.setdefault(PROFILE, str(network_profile()))

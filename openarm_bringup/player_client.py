@@ -28,6 +28,10 @@ from openarm_common.convert import ns_to_stamp
 from openarm_common.errors import Code, OpenArmError
 
 _CLOCK = "/clock"
+#: What comes from a robot and its cameras: two of them in one graph would be taken for one that jumps.
+_ROBOT = r"/clock|/joint_states|/tf|.*/(color|depth)/(image_raw|camera_info)"
+#: Topics that several may publish.
+_SHARED = "/tf_static"
 #: Subscribers of what a graph publishes come within this time after the publishers are there, s.
 _MEET_S = 4.0
 _SETTLE_S = 1.0
@@ -45,6 +49,7 @@ class Player:
     Attributes:
         published: Messages so far.
         unknown: Types that no installed package has.
+        left: Topics that the graph makes itself, and that are not published therefore.
         late_ms: The most that a message was published after its time.
     """
 
@@ -71,6 +76,8 @@ class Player:
                 continue
             self._publishers[topic] = self._node.create_publisher(message, names.get(topic, topic), to_profile(qos))
         self.unknown = sorted(missing)
+        self.left: list[str] = []
+        self._all = topics is None
         own_clock = clock and _CLOCK not in self._publishers
         self._clock = self._node.create_publisher(Clock, _CLOCK, 1) if own_clock else None
 
@@ -85,7 +92,34 @@ class Player:
             if all(counts) and now - changed > _SETTLE_S:
                 break
             time.sleep(0.02)
+        try:
+            if self._all:
+                self._yield_to_graph()
+        except OpenArmError:
+            self.__exit__()
+            raise
         return self
+
+    def _yield_to_graph(self) -> None:
+        """Leave the topics out that somebody publishes already.
+
+        Raises:
+            OpenArmError: BUSY, when it is a robot that does.
+        """
+        for topic, publisher in list(self._publishers.items()):
+            name = publisher.topic_name
+            infos = self._node.get_publishers_info_by_topic(name)
+            others = sorted({info.node_name for info in infos} - {self._node.get_name()})
+            if not others or name == _SHARED:
+                continue
+            if re.fullmatch(_ROBOT, name):
+                raise OpenArmError(
+                    Code.BUSY,
+                    f"{name} is published by {', '.join(others)} already, and a bag takes the place of the robot; "
+                    "replay into a graph without one (`openarm up replay`), or choose topics (--topics, --remap)",
+                )
+            self.left.append(name)
+            self._node.destroy_publisher(self._publishers.pop(topic))
 
     def __exit__(self, *_: object) -> None:
         self._node.destroy_node()

@@ -142,12 +142,14 @@ def replay(
             for n, handler in before.items():
                 signal.signal(n, handler)
         mended = f"; it was cut short: {opened.mended} bytes at its end were not whole" if opened.mended else ""
-    data = {"bag": str(bag), "messages": player.published, "unknown_types": player.unknown, "late_ms": player.late_ms}
+    data = {"bag": str(bag), "messages": player.published, "late_ms": player.late_ms}
+    data |= {"unknown_types": player.unknown, "left_to_graph": player.left}
     if stop.is_set():
         return Outcome(False, f"stopped after {player.published} messages", Code.CANCELLED, data)
     if player.published == 0:
         return Outcome(False, f"nothing to replay in {bag}{mended}", Code.NOTHING_DETECTED, data)
-    left = f"; not installed, left out: {', '.join(player.unknown)}" if player.unknown else ""
+    left = f"; left to the graph, which makes them itself: {', '.join(player.left)}" if player.left else ""
+    left += f"; not installed, left out: {', '.join(player.unknown)}" if player.unknown else ""
     return Outcome(True, f"{player.published} messages of {bag}{mended}{left}", data=data)
 
 

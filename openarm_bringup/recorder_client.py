@@ -45,7 +45,7 @@ PROFILES: Mapping[str, tuple[str, ...]] = {
 }
 #: Not recorded by a profile: a replay would be taken for the simulation or for a parameter service.
 _NEVER = r".*/_action/.*|/parameter_events|/rosout|/sim/tick|/sim/ack"
-_QUEUE_BYTES = 512 * 2**20
+_QUEUE_BYTES, _LARGE = 512 * 2**20, 64 * 2**10
 _DISCOVERY_S = 0.5
 _LOOK_S = 0.005
 #: Messages that a reader keeps between two looks.
@@ -203,7 +203,9 @@ class Recorder:
                 self.recorded.lost[topic] += missing
             if not self._thinner.keeps(topic, data):
                 return
-            if self._bytes_in - self._bytes_out > _QUEUE_BYTES or self.recorded.ended:
+            # Where the disk can't follow, what is large gives way first.
+            room = _QUEUE_BYTES if len(data) > _LARGE else 2 * _QUEUE_BYTES
+            if self._bytes_in - self._bytes_out > room or self.recorded.ended:
                 self.recorded.lost[topic] += 1
                 return
             self._bytes_in += len(data)

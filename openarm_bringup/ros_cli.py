@@ -10,6 +10,7 @@ import sys
 import time
 from contextlib import suppress
 from itertools import pairwise
+from statistics import median
 from typing import Annotated, Any
 
 import yaml
@@ -97,7 +98,9 @@ def echo(
 
 @topic.command
 def hz(name: str, *, seconds: float = 5.0, domain: int | None = None) -> Outcome:
-    """Measure the rate of a topic by the wall clock.
+    """Measure the rate of a topic by the wall clock, what is lost, and how long messages take to arrive.
+
+    The delay holds where publisher and this machine have one clock.
 
     Args:
         name: Of the topic.
@@ -105,17 +108,21 @@ def hz(name: str, *, seconds: float = 5.0, domain: int | None = None) -> Outcome
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
+    from openarm_bringup.losses import Arrivals
     from openarm_bringup.message_client import interface
     from openarm_bringup.peer_client import Peer, find
 
     at: list[float] = []
-    size = [0]
+    delays: list[float] = []
+    size, lost, arrivals = [0], [0], Arrivals()
     with Peer() as peer:
         found, kind = find("topic", name, peer.topics())
 
-        def take(data: bytes) -> None:
+        def take(data: bytes, info: Any) -> None:
             at.append(time.monotonic())
+            delays.append((info["received_timestamp"] - info["source_timestamp"]) * 1e-6)
             size[0] += len(data)
+            lost[0] += arrivals.missing(info["publication_sequence_number"], lambda: peer.node.count_publishers(found))
 
         peer.node.create_subscription(interface(kind), found, take, peer.offered(found), raw=True)
         peer.spin_until(lambda: False, seconds)
@@ -129,9 +136,13 @@ def hz(name: str, *, seconds: float = 5.0, domain: int | None = None) -> Outcome
         "period_min_ms": min(gaps) * 1e3,
         "period_max_ms": max(gaps) * 1e3,
         "messages": len(at),
+        "lost": lost[0],
+        "delay_median_ms": median(delays),
+        "delay_max_ms": max(delays),
         "bytes_per_s": size[0] / seconds,
     }
     said = f"{found}: {rate:.2f} Hz, period {min(gaps) * 1e3:.1f} to {max(gaps) * 1e3:.1f} ms, {len(at)} messages"
+    said += f", {lost[0]} lost, {median(delays):.1f} ms on the way ({max(delays):.1f} at most)"
     return Outcome(True, f"{said}, {size[0] / seconds / 1e6:.2f} MB/s", data=data)
 
 

@@ -14,7 +14,7 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 
-from openarm_bringup.environment import node_arguments, node_environment
+from openarm_bringup.environment import PROFILE, node_arguments, node_environment
 from openarm_bringup.graph import graph_names, load_graph
 from openarm_bringup.runs import new_run_dir
 from openarm_common.resources import config_dir
@@ -59,7 +59,7 @@ def start(context: LaunchContext) -> list[ExecuteProcess]:
         view = config_dir() / "rviz" / f"{graph.name}.rviz"
         whole = config_dir() / "rviz" / "sim.rviz"
         environment = node_environment(graph, next(iter(graph.nodes)), run_dir)
-        environment.pop("FASTRTPS_DEFAULT_PROFILES_FILE", None)  # RViz publishes nothing large
+        environment.pop(PROFILE, None)  # RViz publishes nothing large
         command = ["rviz2", "-d", str(view if view.is_file() else whole)]
         processes.append(ExecuteProcess(cmd=command, env=environment, name="rviz", output="screen"))
     return processes

@@ -19,7 +19,7 @@ from openarm_bringup.bag import open_bag
 from openarm_bringup.player_client import Player
 from openarm_bringup.recorder_client import Recorder, Thinner
 from openarm_common.convert import array_to_image
-from openarm_common.errors import OpenArmError
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 
 
@@ -67,6 +67,23 @@ def test_what_is_recorded_is_replayed(ros, tmp_path: Path) -> None:
             assert offered.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
             assert player.published == 41
     assert heard == [str(i) for i in range(40)]
+
+
+def test_a_bag_takes_the_place_of_the_robot_and_of_nothing_else(ros, tmp_path: Path) -> None:
+    recorder = record(ros, tmp_path / "bag", 3)
+    assert recorder.recorded.counts["/chatter"] == 3
+    with open_bag(tmp_path / "bag") as bag:
+        player = Player(bag, None, {}, clock=True)
+        with pytest.raises(OpenArmError, match="published by probe already") as refused, player:
+            pass
+        assert refused.value.code == Code.BUSY
+        for publisher in list(ros.node.publishers):
+            if publisher.topic_name == "/overhead/color/image_raw":
+                ros.node.destroy_publisher(publisher)
+        with Player(bag, None, {}, clock=True) as player:
+            assert {"/chatter", "/robot_description"} <= set(player.left)
+            player.play(0.0, 0.0, 0.0, threading.Event())
+            assert player.published == 3
 
 
 def test_patterns_choose_topics(ros, tmp_path: Path) -> None:
