@@ -22,6 +22,9 @@ PLAN_FAILS = "plan_fails"
 MISSES = "detection_missed"
 
 
+_ENDURANCE = 10
+
+
 @dataclass(frozen=True)
 class FaultPlan:
     """Something that goes wrong.
@@ -107,6 +110,13 @@ def crowded_scene(seed: int, count: int) -> Scene:
     return whole.model_copy(update={"objects": tuple(objects), "name": f"crowded_{seed}"})
 
 
+def endurance(seed: int) -> Task:
+    """Two objects, picked and placed ten times each in one world: nothing is reset, and no failure is made good."""
+    scene = random_scene(seed, count=2)
+    labels = tuple(item.label for item in scene.objects)
+    return Task("endurance", seed, scene, _ENDURANCE * labels, kind="endurance")
+
+
 def sets() -> Mapping[str, Callable[[int], Task]]:
     """Makers of tasks by the name of the set."""
     from openarm_bringup import campaign_faults, campaign_two_arms
@@ -114,6 +124,7 @@ def sets() -> Mapping[str, Callable[[int], Task]]:
     return {
         "nominal": nominal,
         "clutter": clutter,
+        "endurance": endurance,
         "faults": campaign_faults.fault_task,
         "handover": campaign_two_arms.handover_task,
         "push": campaign_two_arms.push_task,

@@ -37,7 +37,7 @@ def row(seed: int, *, placed: bool = True, attempts: int = 1, false: bool = Fals
     }  # fmt: skip
 
 
-def test_n01_n04_rates_carry_wilson_intervals_and_attempts() -> None:
+def test_n01_n04_n19_rates_carry_wilson_intervals_and_attempts() -> None:
     rows = [row(0), row(1, attempts=2), row(2, placed=False, code="GRASP_LOST"), row(3, false=True, placed=False)]
     s = campaign_report.summarise(rows)
     assert (s["success"], s["possible"], s["first_attempt"], s["false_success"]) == (2, 4, 1, 1)
