@@ -21,6 +21,7 @@ from typing import Any
 from openarm_bringup import campaign_ray, campaign_report, report, runs
 from openarm_bringup.campaign_tasks import make_task
 from openarm_common.errors import Code, OpenArmError
+from openarm_perception.kinds import DetectorKind
 
 Row = dict[str, Any]
 ROWS = "rows.jsonl"
@@ -37,6 +38,7 @@ class CampaignOptions:
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, each with its calibration; empty: nominal mounts.
         use_effort: Whether the finger's effort counts as evidence.
+        detector: What finds objects: color, network, both.
         ray: Address of a Ray cluster whose machines run the workers; "": this machine.
     """
 
@@ -46,6 +48,7 @@ class CampaignOptions:
     noise: bool = False
     mount_seeds: tuple[int, ...] = ()
     use_effort: bool = True
+    detector: DetectorKind = "color"
     ray: str = ""
 
     def settings(self) -> dict[str, Any]:
@@ -55,6 +58,7 @@ class CampaignOptions:
             "noise": self.noise,
             "mount_seeds": list(self.mount_seeds),
             "use_effort": self.use_effort,
+            **({"detector": self.detector} if self.detector != "color" else {}),
         }
 
     def command(self, seed: int) -> str:
@@ -67,6 +71,7 @@ class CampaignOptions:
         parts.append("--noise" if self.noise else "")
         parts.append("--mount-seeds " + ",".join(map(str, self.mount_seeds)) if self.mount_seeds else "")
         parts.append("" if self.use_effort else "--no-effort")
+        parts.append(f"--detector {self.detector}" if self.detector != "color" else "")
         return " ".join(part for part in parts if part)
 
 
@@ -199,7 +204,7 @@ def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
             task, mounts = campaign_mounts.with_mounts(task, options.mount_seeds, folder / "mounts")
         trials = campaign_trial.Trials(
             task,
-            SimulatedSenses(depth_noise=options.noise),
+            SimulatedSenses(depth_noise=options.noise, detector=options.detector),
             GraspConfig(held=HeldConfig(use_effort=options.use_effort)),
             mounts=mounts,
             folder=folder / "failures" / str(seed),

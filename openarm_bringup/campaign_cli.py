@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -24,6 +24,7 @@ def campaign(
     noise: Annotated[bool, Parameter(negative=())] = False,
     mount_seeds: str | None = None,
     effort: bool = True,
+    detector: Literal["color", "network", "both"] = "color",
     ray: str = "",
     graph: Annotated[bool, Parameter(negative=())] = False,
     against: Path | None = None,
@@ -37,11 +38,12 @@ def campaign(
 
     Args:
         seeds: Such as 0-99 or 1,4,7-9.
-        set_: nominal, clutter, faults.
+        set_: nominal, clutter, faults, endurance.
         workers: Processes.
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.
         effort: Whether the force of the fingers counts as evidence.
+        detector: What finds objects: their colour, the network, or both checking each other.
         ray: Address of a Ray cluster, such as HOST:6379 or auto, whose machines share the workers.
         graph: Through a node graph of its own, over DDS and in real time, instead of in one process.
         against: Folder of another campaign; how far both agree on the scenes that they share is told, and accepted by
@@ -61,6 +63,7 @@ def campaign(
         noise=noise,
         mount_seeds=parse_seeds(mount_seeds) if mount_seeds is not None else (),
         use_effort=effort,
+        detector=detector,
         ray=ray,
     )
     folder = out if out is not None else runs.new_run_dir()

@@ -67,6 +67,7 @@ async def _run(campaign: Campaign, tasks: list[Task], on_row: Callable[[Row], No
         overrides["mount_seed"] = options.mount_seeds[0]
     sets = [f"mujoco_bridge.depth_noise.enabled={str(options.noise).lower()}"]
     sets.append(f"grasp.held.use_effort={str(options.use_effort).lower()}")
+    sets += [f"{node}.detector={options.detector}" for node in ("detector", "wrist_detector")]
     graph = load_graph("sim", overrides=overrides, sets=tuple(sets))
     for name in ("logs", "params"):
         (campaign.folder / name).mkdir(parents=True, exist_ok=True)

@@ -29,7 +29,10 @@ from openarm_common.scene import Scene
 from openarm_grasp.observation import Detection, Frame
 from openarm_perception.depth import DepthImage, DepthLimits
 from openarm_perception.detector import ColorDetector, ColorDetectorConfig, Mask
+from openarm_perception.kinds import DetectorKind
 from openarm_perception.localize import Localizer, LocalizerConfig
+from openarm_perception.looking import make_pipeline
+from openarm_perception.network import NetworkConfig
 from openarm_perception.pipeline import Pipeline
 from openarm_perception.robot import RobotConfig, RobotFinder
 from openarm_sim_bridge.actuation import TrajectoryConfig
@@ -54,6 +57,7 @@ class SimulatedSenses(Config):
     """How well the simulated robot sees and how long that takes, s of simulated time."""
 
     depth_noise: bool = Field(default=True, description="depth as noisy as a D435's")
+    detector: DetectorKind = Field(default="color", description="what finds objects")
     max_rate: float = Field(default=10.0, gt=0.0, description="most frames that are detected in, Hz")
     latency: float = Field(default=0.06, ge=0.0, le=1.0, description="from an image to its detections, s")
 
@@ -200,7 +204,7 @@ class SimRobot:
             T_base_camera = self.camera_pose(camera, stamp_ns)
             optics = self.camera_faults.intrinsics(name, camera.intrinsics)
             view = DepthView(depth, optics, T_base_camera, camera.near, camera.far)
-            perceived = _pipeline(name, self._table_z).run(
+            perceived = _pipeline(name, self._table_z, self._senses.detector).run(
                 rgb, depth, optics, T_base_camera, self._robot_in(view, stamp_ns)
             )
         except OpenArmError:
@@ -265,8 +269,9 @@ def _finder() -> RobotFinder:
 
 
 @cache
-def _pipeline(camera_name: str, table_z: float) -> Pipeline:
+def _pipeline(camera_name: str, table_z: float, kind: DetectorKind) -> Pipeline:
     camera = load_cameras()[camera_name]
     colors = load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig)
     limits = DepthLimits(near=camera.near, far=camera.far)
-    return Pipeline(ColorDetector(colors), Localizer(LocalizerConfig(), limits, table_z))
+    localizer = Localizer(LocalizerConfig(), limits, table_z)
+    return make_pipeline(kind, ColorDetector(colors), NetworkConfig(), localizer)

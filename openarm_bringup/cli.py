@@ -8,6 +8,7 @@ code. Modules of commands import heavy libraries inside their functions, so that
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,6 +34,7 @@ def build_app() -> App:
         campaign_cli,
         checks_cli,
         demo_cli,
+        detector_cli,
         doctor_cli,
         graph_cli,
         grasp_cli,
@@ -76,6 +78,7 @@ def build_app() -> App:
         app.command(group)
     app.command(grasp_cli.app)
     app.command(calibrate_cli.app)
+    app.command(detector_cli.app)
     return app
 
 
@@ -158,7 +161,13 @@ def _version() -> str:
 
 def main() -> None:
     """Run the command line of this process."""
-    sys.exit(run(sys.argv[1:]))
+    try:
+        code = run(sys.argv[1:])
+        sys.stdout.flush()
+    except BrokenPipeError:  # who reads has read enough, as `openarm topic echo ... | head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -12,16 +12,18 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 from pydantic import Field
 
 from openarm_bringup.detector_scene import RandomViews
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import SHAPES
-from openarm_perception.yolo_text import write_classes, write_labels
+from openarm_perception.yolo_text import read_labels, write_classes, write_labels
 
 _QUALITY = 95
 _VERSION = 1
@@ -80,6 +82,25 @@ def make_data(folder: Path, config: DataConfig, progress: Callable[[str, int], N
             views.close()
     _summarise(folder, config)
     return made
+
+
+def write_sheet(folder: Path, name: str, columns: int = 6, rows: int = 5) -> Path:
+    """A picture of the first pictures of a set with their boxes, `SET_preview.jpg`; returns it."""
+    colors = ((40, 40, 230), (60, 200, 60), (230, 130, 40), (30, 200, 240))
+    tiles: list[MatLike] = []
+    for path in sorted((folder / "images" / name).glob("*.jpg"))[: columns * rows]:
+        image = cast(MatLike, cv2.imread(str(path)))
+        height, width = image.shape[:2]
+        text = (folder / "labels" / name / f"{path.stem}.txt").read_text(encoding="utf-8")
+        kinds, boxes = read_labels(text, width, height, len(SHAPES), path.name)
+        for kind, (left, top, right, bottom) in zip(kinds, boxes.round().astype(int).tolist(), strict=True):
+            cv2.rectangle(image, (left, top), (right, bottom), colors[kind % len(colors)], 2)
+        tiles.append(cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA))
+    tiles += [np.zeros((240, 320, 3), np.uint8)] * (-len(tiles) % columns)
+    sheet = folder / f"{name}_preview.jpg"
+    lines = [np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)]
+    cv2.imwrite(str(sheet), np.vstack(lines), [cv2.IMWRITE_JPEG_QUALITY, 90])
+    return sheet
 
 
 def digest(folder: Path, name: str) -> str:

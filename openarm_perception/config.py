@@ -6,12 +6,14 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 
 from openarm_common.cameras import CameraConfig, load_cameras
-from openarm_common.config import Config
+from openarm_common.config import AT_RUN_TIME, Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import load_scene
 from openarm_perception.detector import Policy
 from openarm_perception.filters import FilterConfig
+from openarm_perception.kinds import DetectorKind
 from openarm_perception.localize import LocalizerConfig
+from openarm_perception.network import NetworkConfig
 from openarm_perception.robot import CloudRobotConfig, RobotConfig
 
 
@@ -32,10 +34,20 @@ class DetectNodeConfig(Config):
     table_height: float | None = Field(
         default=None, ge=-1.0, le=2.0, description="of the table in the base frame, m; without one, the scene's"
     )
-    policy: Policy = Field(
-        default="score", description="which detection comes first: most certain, or nearest to the centre"
+    detector: DetectorKind = Field(
+        default="color",
+        description="what finds objects: their colour, a network, both checking each other, or depth alone (anything)",
+        json_schema_extra=AT_RUN_TIME,
     )
-    label: str = Field(default="", description="only objects of this name; empty takes all")
+    network: NetworkConfig = NetworkConfig()
+    policy: Policy = Field(
+        default="score",
+        description="which detection comes first: most certain, or nearest to the centre",
+        json_schema_extra=AT_RUN_TIME,
+    )
+    label: str = Field(
+        default="", description="only objects of this name; empty takes all", json_schema_extra=AT_RUN_TIME
+    )
     max_rate: float = Field(
         default=10.0, gt=0.0, le=60.0, description="most frames processed a second of the stamps, Hz"
     )

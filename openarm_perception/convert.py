@@ -25,6 +25,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.convert import matrix_to_pose, ns_to_stamp, vector
 from openarm_common.errors import Code, OpenArmError
+from openarm_perception.attributes import kind_of
 from openarm_perception.detector import Detection2D
 from openarm_perception.localize import Detection3D
 from openarm_perception.pipeline import Perceived
@@ -54,28 +55,44 @@ def check_frames(messages: Mapping[str, Image | CameraInfo], optical_frame: str)
 
 
 def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Detection2DArray:
-    """Boxes by their centre, pixels; the pose of the hypothesis is left empty, a box in an image has none."""
+    """Boxes by their centre, pixels: the label, and what a network calls its shape; a box in an image has no pose."""
     message = Detection2DArray(header=header(frame_id, t_ns))
     for name, detection in zip(_names(found), found, strict=True):
         box = BoundingBox2D(size_x=float(detection.size[0]), size_y=float(detection.size[1]))
         box.center.position.x, box.center.position.y = detection.centre
-        hypothesis = ObjectHypothesis(class_id=detection.label, score=detection.score)
-        results = [ObjectHypothesisWithPose(hypothesis=hypothesis)]
+        also = (detection.kind,) if detection.kind not in ("", detection.label) else ()
+        results = [_hypothesis(name, detection.score) for name in (detection.label, *also)]
         message.detections.append(Detection2DMsg(header=message.header, results=results, bbox=box, id=name))
     return message
 
 
 def detections_3d(located: Sequence[Detection3D], frame_id: str, t_ns: int) -> Detection3DArray:
-    """Upright boxes: x along the smaller horizontal extent, z up, full edges, m."""
+    """Upright boxes: x along the smaller horizontal extent, z up, full edges, m.
+
+    The first hypothesis is the label; others of the same score name the shape (box, cylinder, sphere, cube, can).
+    """
     message = Detection3DArray(header=header(frame_id, t_ns))
     for name, detection in zip(_names(located), located, strict=True):
         pose = matrix_to_pose(detection.T_base_object)
-        hypothesis = ObjectHypothesis(class_id=detection.label, score=detection.score)
         uncertain = PoseWithCovariance(pose=pose, covariance=detection.covariance.ravel())
-        results = [ObjectHypothesisWithPose(hypothesis=hypothesis, pose=uncertain)]
+        results = [_hypothesis(name, detection.score, uncertain) for name in names_of(detection)]
         box = BoundingBox3D(center=pose, size=vector(detection.size))
         message.detections.append(Detection3DMsg(header=message.header, results=results, bbox=box, id=name))
     return message
+
+
+def names_of(detection: Detection3D) -> tuple[str, ...]:
+    """What an object may be called, its label first, then its shape: told by a network, else by its outline."""
+    shape = detection.source.kind or {"rectangle": "box", "circle": "cylinder"}.get(detection.method, "")
+    if detection.score == 0.0:  # not measured
+        shape = detection.source.kind
+    names = (detection.label, kind_of(shape, detection.size), shape)
+    return tuple(dict.fromkeys(name for name in names if name))
+
+
+def _hypothesis(name: str, score: float, pose: PoseWithCovariance | None = None) -> ObjectHypothesisWithPose:
+    hypothesis = ObjectHypothesis(class_id=name, score=score)
+    return ObjectHypothesisWithPose(hypothesis=hypothesis, pose=pose or PoseWithCovariance())
 
 
 def mask_image(perceived: Perceived, shape: tuple[int, int]) -> NDArray[np.uint8]:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,7 +21,6 @@ from sensor_msgs.msg import CameraInfo, Image
 from vision_msgs.msg import Detection2DArray, Detection3DArray
 from visualization_msgs.msg import MarkerArray
 
-from openarm_common.cameras import Intrinsics
 from openarm_common.config import load_config
 from openarm_common.convert import array_to_image, image_to_array, intrinsics_from_info, stamp_to_ns
 from openarm_common.depth_view import DepthView
@@ -35,34 +34,14 @@ from openarm_perception.depth import DepthImage, DepthLimits
 from openarm_perception.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.draw import annotate
 from openarm_perception.localize import Localizer
+from openarm_perception.looking import make_pipeline
 from openarm_perception.matching import StampMatcher
 from openarm_perception.pipeline import Perceived, Pipeline
 from openarm_perception.robot_client import RobotInView
-from openarm_perception.table import TableMeasurement, measure_table, of_block
+from openarm_perception.table_executor import Frame, Placed, answer
 
 #: A measurement is made of an image that is not older than this, s.
 _FRESH = 1.0
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """A frame whose images fit together, waiting for the pose of its camera."""
-
-    t_ns: int
-    rgb: NDArray[np.uint8]
-    depth: DepthImage
-    intrinsics: Intrinsics
-    deadline: float  # wall clock, s
-
-
-@dataclass(frozen=True)
-class _Placed:
-    """A frame, where its camera was, where the robot is in it (None: not known), and when it was there."""
-
-    frame: _Frame
-    T_base_camera: NDArray[np.float64]
-    robot: Mask | None
-    at: float
 
 
 class DetectNode(BaseNode[DetectNodeConfig]):
@@ -76,19 +55,19 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         #: Whether the camera rides on an arm, so that its pose needs joint states.
         self._rides = any(joint.type != "fixed" for joint in self.description.chain(camera.parent))
         colors = Path(config.colors) if config.colors else config_dir() / "params" / "detector.yaml"
+        #: Why objects are found by colour though something else was asked for.
+        self._fallback = ""
         limits = DepthLimits(near=camera.near, far=camera.far)
-        self._pipeline = Pipeline(
-            ColorDetector(load_config(colors, ColorDetectorConfig)),
-            Localizer(config.localizer, limits, config.table_top_z()),
-            config.policy,
-            config.label,
-        )
+        self._colors = ColorDetector(load_config(colors, ColorDetectorConfig))
+        self._localizer = Localizer(config.localizer, limits, config.table_top_z())
+        self._pipeline = self._first_pipeline()
+        self.accept_changes(self._take)
         self._poses = RobotStateListener(self, self.description, joints=False)
         self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(tuple(self._topics()), self._on_frame)
         self._inputs: list[Subscription] = []
-        self._waiting: _Frame | None = None
+        self._waiting: Frame | None = None
         #: The newest frame whose camera pose is known.
-        self._newest: _Placed | None = None
+        self._newest: Placed | None = None
         #: Without depth nothing says which pixels are the robot.
         self._robot: RobotInView | None = None
         if config.self_filter.enabled and config.depth_topic:
@@ -112,8 +91,28 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
         self.diagnose(True, "idle: nobody listens", **self._counts)
         self.create_service(MeasureTable, "~/measure_table", self._on_measure_table)
+        self._began: deque[float] = deque(maxlen=20)
         if self.lockstep:
             self._subscribe()
+
+    def _make(self, config: DetectNodeConfig) -> Pipeline:
+        return make_pipeline(
+            config.detector, self._colors, config.network, self._localizer, config.policy, config.label
+        )
+
+    def _first_pipeline(self) -> Pipeline:
+        """As configured; a network that cannot be used leaves the work to the colour detector."""
+        try:
+            return self._make(self.config)
+        except OpenArmError as error:
+            self._fallback = f"; by colour instead of {self.config.detector}: {error.message}"
+            self.get_logger().error(f"{error.message}; objects are found by colour")
+            return self._make(self.config.model_copy(update={"detector": "color"}))
+
+    def _take(self, config: DetectNodeConfig) -> None:
+        """Detect as configured from the next frame on."""
+        self._pipeline = self._make(config)
+        self._fallback = ""
 
     def lockstep_missing(self) -> str:
         """The pose of a fixed camera, without which its first frames would be skipped."""
@@ -184,7 +183,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             return
         self._try_waiting()
 
-    def _check(self, t_ns: int, messages: dict[str, Image | CameraInfo]) -> _Frame:
+    def _check(self, t_ns: int, messages: dict[str, Image | CameraInfo]) -> Frame:
         color, info = cast(Image, messages["color"]), cast(CameraInfo, messages["info"])
         convert.check_frames(messages, self._optical_frame)
         rgb = image_to_array(color)
@@ -192,7 +191,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             raise OpenArmError(Code.BAD_IMAGE, f"colour image is {color.encoding!r}; valid: rgb8, bgr8")
         if color.encoding == "bgr8":
             rgb = np.ascontiguousarray(rgb[..., ::-1])
-        return _Frame(
+        return Frame(
             t_ns,
             cast(NDArray[np.uint8], rgb),
             cast(DepthImage, image_to_array(cast(Image, messages["depth"])))
@@ -224,14 +223,14 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         try:
             started = time.perf_counter()
             robot = self._find_robot(frame, T_base_camera, joints)
-            self._newest = _Placed(frame, T_base_camera, robot, self.monotonic())
+            self._newest = Placed(frame, T_base_camera, robot, self.monotonic())
             perceived = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, T_base_camera, robot)
         except OpenArmError as error:
             self._complain("refused_frames", f"frame refused: {error.message}")
             return
         self._publish(frame, perceived, (time.perf_counter() - started) * 1e3)
 
-    def _posture(self, frame: _Frame) -> Mapping[str, float] | None:
+    def _posture(self, frame: Frame) -> Mapping[str, float] | None:
         """Joints at the stamp, as long as they may still come; None when nobody tells them: objects are seen still."""
         if self._robot is None:
             return None
@@ -249,7 +248,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         return self.monotonic() < self._listening_since + self.config.transform_wait
 
     def _find_robot(
-        self, frame: _Frame, T_base_camera: NDArray[np.float64], joints: Mapping[str, float] | None
+        self, frame: Frame, T_base_camera: NDArray[np.float64], joints: Mapping[str, float] | None
     ) -> Mask | None:
         if self._robot is None or joints is None:
             return None
@@ -263,12 +262,12 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._uncut = ""
         return robot
 
-    def _too_old(self, frame: _Frame, error: OpenArmError) -> bool:
+    def _too_old(self, frame: Frame, error: OpenArmError) -> bool:
         """Whether waiting is in vain: joint states have passed the stamp without one that answers for it."""
         heard = self._poses.age_s() < math.inf
         return error.code is Code.STALE_DATA and heard and self._poses.buffer.latest()[0] > frame.t_ns
 
-    def _publish(self, frame: _Frame, perceived: Perceived, elapsed_ms: float) -> None:
+    def _publish(self, frame: Frame, perceived: Perceived, elapsed_ms: float) -> None:
         self._boxes.publish(convert.detections_2d(perceived.found, self._optical_frame, frame.t_ns))
         self._objects.publish(convert.detections_3d(perceived.boxes, BASE_FRAME, frame.t_ns))
         if self._markers.get_subscription_count():
@@ -283,53 +282,26 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._counts["refused_objects"] += len(perceived.refused)
         view = ", ".join(detection.label for detection in perceived.located) or "nothing"
         refused = f"; not located: {'; '.join(perceived.refused)}" if perceived.refused else ""
-        values: dict[str, object] = {"processing_ms": f"{elapsed_ms:.1f}", **self._counts}
+        values: dict[str, object] = {"processing_ms": f"{elapsed_ms:.1f}", "rate_hz": self._rate(), **self._counts}
+        values["detector"] = "color" if self._fallback else self.config.detector
         if self._robot is not None and perceived.robot is None:
             self._counts["uncut"] += 1
             refused += f"; the robot is taken for surroundings: {self._uncut}"
         elif self._robot is not None:
             values |= self._robot.values()
-        self.diagnose(True, f"in view: {view}{refused}", **values)
+        self.diagnose(not self._fallback, f"in view: {view}{refused}{self._fallback}", **values)
+
+    def _rate(self) -> str:
+        """Frames a second of the wall clock, over the last twenty."""
+        self._began.append(self.monotonic())
+        span = self._began[-1] - self._began[0]
+        return f"{(len(self._began) - 1) / span:.1f}" if span > 0.0 else "0"
 
     def _on_measure_table(
         self, request: MeasureTable.Request, response: MeasureTable.Response
     ) -> MeasureTable.Response:
-        try:
-            result = self._measure_table(request)
-        except OpenArmError as error:
-            response.code, response.message = error.code.value, error.message
-            return response
-        response.success, response.code = True, Code.OK.value
-        response.height, response.std, response.tilt = result.height, result.std, result.tilt
-        response.points = result.points
-        before = self._pipeline.localizer.table_height
-        response.message = f"the table is {result.height:.4f} m high; the detector took it for {before:.4f} m"
-        if request.apply:
-            self._pipeline.localizer.table_height = result.height
-            response.message += ", and takes what was measured now"
-        return response
-
-    def _measure_table(self, request: MeasureTable.Request) -> TableMeasurement:
         self._asked_until = self.monotonic() + 5.0
-        newest = self._newest
-        if newest is None or not self.measurable:
-            raise OpenArmError(
-                Code.NOT_READY, f"no image of {self.config.camera} yet; it is listened to now: ask again in a second"
-            )
-        frame, T_base_camera, robot = newest.frame, newest.T_base_camera, newest.robot
-        localizer = self._pipeline.localizer
-        if request.block_height == 0.0:
-            depth = frame.depth if robot is None else np.where(robot, frame.depth.dtype.type(0), frame.depth)
-            return measure_table(depth, frame.intrinsics, T_base_camera, localizer.limits, localizer.table_height)
-        found = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, T_base_camera, robot).located
-        blocks = [place for place in found if request.label in ("", place.label) and place.measured]
-        if len(blocks) != 1:
-            view = ", ".join(place.label for place in found) or "nothing"
-            raise OpenArmError(
-                Code.NOTHING_DETECTED,
-                f"expected one block {request.label!r} in view, which shows {view}; give its label",
-            )
-        return of_block(blocks[0], request.block_height)
+        return answer(request, response, self._newest if self.measurable else None, self._pipeline, self.config.camera)
 
     def _complain(self, count: str, message: str) -> None:
         self._counts[count] += 1

@@ -38,6 +38,7 @@ class Detection2D:
         size: (width, height) of the box.
         mask: (height, width) bool, the pixels of the box that belong to the object.
         truncated: Whether the border of the image cuts it.
+        kind: What shape it has, where the detector knows: a class of a network; empty otherwise.
     """
 
     label: str
@@ -46,6 +47,7 @@ class Detection2D:
     size: tuple[int, int]
     mask: Mask
     truncated: bool
+    kind: str = ""
 
     @property
     def origin(self) -> tuple[int, int]:
@@ -154,6 +156,17 @@ class ColorDetector:
         hsv = cast(Image, cv2.cvtColor(rgb, cv2.COLOR_RGB2HSV))
         found = [d for label, bounds in self._bounds.items() for d in self._of_colour(label, bounds, hsv)]
         return tuple(sorted((d for d in found if d.score >= self.config.min_score), key=lambda d: -d.area))
+
+    def name(self, rgb: Image, mask: Mask) -> tuple[str, float]:
+        """The colour of most pixels (h, w) of an image (h, w, 3), and how many share it, 0 to 1; "" and 0 of none."""
+        hsv = cast(Image, cv2.cvtColor(rgb, cv2.COLOR_RGB2HSV))
+        count = max(int(np.count_nonzero(mask)), 1)
+        shares = {
+            label: sum(np.count_nonzero(cv2.inRange(hsv, *ends)[mask]) for ends in bounds) / count
+            for label, bounds in self._bounds.items()
+        }
+        best = max(shares, key=lambda label: shares[label])
+        return (best, shares[best]) if shares[best] > 0.0 else ("", 0.0)
 
     def _of_colour(self, label: str, bounds: list[tuple[Image, Image]], hsv: Image) -> list[Detection2D]:
         raw = cv2.inRange(hsv, *bounds[0])

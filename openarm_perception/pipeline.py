@@ -14,6 +14,7 @@ from openarm_common.errors import OpenArmError
 from openarm_perception.depth import DepthImage, check_size, unit_scale
 from openarm_perception.detector import Detection2D, Detector, Mask, Policy, rank
 from openarm_perception.localize import Detection3D, Localizer
+from openarm_perception.view import Seen, View
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,8 @@ class Pipeline:
         check_size("depth image", depth.shape, intrinsics)
         unit_scale(depth)
         size = (intrinsics.width, intrinsics.height)
-        found = rank(self.detector.detect(rgb), self.policy, size, self.label)
+        seen = self.look(View(rgb, depth, intrinsics, T_base_camera, robot))
+        found = rank(seen.found, self.policy, size, self.label)
         located: list[Detection3D] = []
         refused: list[str] = []
         unmeasured: list[Detection3D] = []
@@ -91,4 +93,12 @@ class Pipeline:
                 refused.append(error.message)
                 with contextlib.suppress(OpenArmError):  # flat on the table, or the robot: it stands in nobody's way
                     unmeasured.append(self.localizer.enclose(detection, depth, intrinsics, T_base_camera, robot))
+        for doubt in seen.doubts:
+            refused.append(doubt.why)
+            with contextlib.suppress(OpenArmError):
+                unmeasured.append(self.localizer.enclose(doubt.found, depth, intrinsics, T_base_camera, robot))
         return Perceived(found, tuple(located), tuple(refused), robot, tuple(unmeasured))
+
+    def look(self, view: View) -> Seen:
+        """Objects of a frame in the image; what else than colour they are told by is the business of subclasses."""
+        return Seen(self.detector.detect(view.rgb))

@@ -7,7 +7,7 @@ NAME = "openarm_perception"
 setup(
     name=NAME,
     version="0.1.0",
-    packages=[NAME],
+    packages=[NAME, f"{NAME}.training"],
     package_dir={NAME: "."},
     package_data={NAME: ["py.typed"]},
     data_files=[

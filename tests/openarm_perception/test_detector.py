@@ -137,7 +137,7 @@ def test_b27_policies_rank_by_score_or_by_distance_from_the_centre() -> None:
 def test_b03_a_detection_in_the_image_holds_no_position_in_space() -> None:
     """Pixels and metres are different types: a 2-D detection has no depth, no frame, nothing to take for a position."""
     names = {f.name for f in dataclasses.fields(Detection2D)}
-    assert names == {"label", "score", "centre", "size", "mask", "truncated"}
+    assert names == {"label", "score", "centre", "size", "mask", "truncated", "kind"}
 
 
 @pytest.mark.parametrize(

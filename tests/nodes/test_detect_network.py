@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `detector` with the other ways to see; the network is a file that always gives the same box."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+
+from openarm_common.convert import pose_to_matrix
+from tests.nodes.detect_bench import TABLE, Bench, FakeCamera
+from tests.openarm_perception.onnx_file import boxes, write_network
+
+
+@pytest.fixture
+def camera(ros) -> FakeCamera:
+    return FakeCamera(ros)
+
+
+@pytest.fixture
+def model(camera, tmp_path) -> str:
+    """A network that sees a box where the camera shows one."""
+    rows, columns = camera.patch
+    box = (columns.start, rows.start, columns.stop, rows.stop, 0, 0.8)
+    return str(write_network(tmp_path / "net.onnx", boxes(box), (1, 3, 480, 640)))
+
+
+def change(bench: Bench, **values) -> list:
+    """Set parameters of the running node; dots are double underscores."""
+    return bench.node.set_parameters([Parameter(k.replace("__", "."), value=v) for k, v in values.items()])
+
+
+def names(bench: Bench) -> list[list[str]]:
+    return [[r.hypothesis.class_id for r in found.results] for found in bench.detect().detections]
+
+
+@pytest.mark.parametrize(
+    ("detector", "called"),
+    [
+        ("color", ["red", "box"]),
+        ("network", ["red", "box"]),
+        ("both", ["red", "box"]),
+        ("anything", ["anything", "box"]),
+    ],
+)
+def test_p17_every_detector_finds_the_box_behind_the_same_topic(ros, camera, model, detector, called) -> None:
+    bench = Bench(ros, camera=camera, detector=detector, **{"network.model": model})
+    (found,) = bench.detect().detections
+    assert [r.hypothesis.class_id for r in found.results] == called
+    np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.002)
+    size = found.bbox.size
+    np.testing.assert_allclose((size.x, size.y, size.z), (0.04, 0.06, 0.05), atol=0.0025)
+    bench.said("in view: " + called[0])
+    values = {v.key: v.value for v in bench.diagnostics.got[-1].status[0].values}
+    assert values["detector"] == detector
+    assert float(values["processing_ms"]) > 0.0
+    assert float(values["rate_hz"]) >= 0.0
+
+
+def test_b69_the_detector_is_switched_while_it_runs(ros, camera, model, tmp_path) -> None:
+    """What is set holds from the next frame on; what cannot be is refused with a reason, and the one before goes on."""
+    bench = Bench(ros, camera=camera, **{"network.model": model})
+    assert names(bench) == [["red", "box"]]
+    assert change(bench, detector="anything")[0].successful
+    assert names(bench) == [["anything", "box"]]
+    blind = write_network(tmp_path / "blind.onnx", boxes(), (1, 3, 480, 640))
+    assert change(bench, network__model=str(blind), detector="network")[-1].successful
+    assert names(bench) == []
+    (refused,) = change(bench, network__model="nothing.onnx")
+    assert not refused.successful
+    assert "there is no network nothing.onnx; models: " in refused.reason
+    (refused,) = change(bench, detector="hearing")
+    assert "'color', 'network', 'both' or 'anything'" in refused.reason
+    (refused,) = change(bench, network__threshold=1.5)
+    assert "less than 1" in refused.reason
+    (refused,) = change(bench, network__classes=["pear"])
+    assert "blind.onnx knows no 'pear'; classes: box, ball" in refused.reason
+    assert bench.node.config.network.model == str(blind)
+    assert names(bench) == []
+    assert change(bench, detector="color")[0].successful
+    assert names(bench) == [["red", "box"]]
+    assert change(bench, label="blue")[0].successful
+    assert names(bench) == []
+
+
+def test_n15_a_network_that_cannot_be_used_leaves_the_work_to_the_colours(ros, camera, tmp_path) -> None:
+    path = tmp_path / "damaged.onnx"
+    path.write_bytes(b"no network")
+    bench = Bench(ros, camera=camera, detector="network", **{"network.model": str(path)})
+    assert names(bench) == [["red", "box"]]
+    bench.said(f"; by colour instead of network: network {path} (10 bytes) is damaged")
+    status = bench.diagnostics.got[-1].status[0]
+    assert status.level != status.OK
+
+
+def test_n16_what_only_colour_sees_is_told_but_not_given_to_be_grasped(ros, camera, tmp_path) -> None:
+    """In view with score 0, as everything that is in the way and not measured."""
+    blind = write_network(tmp_path / "blind.onnx", boxes(), (1, 3, 480, 640))
+    bench = Bench(ros, camera=camera, detector="both", **{"network.model": str(blind)})
+    (found,) = bench.detect().detections
+    assert found.results[0].hypothesis.score == 0.0
+    bench.said("the network sees nothing there; it is looked at again")

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The networks that come with the suite, on what the simulated cameras see (seeds that no report uses)."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from benchmarks.localization import Studio, errors
+from openarm_common.resources import models_dir
+from openarm_common.scene import SHAPES, random_scene
+from openarm_perception.convert import names_of
+from openarm_perception.depth import DepthLimits
+from openarm_perception.localize import Localizer, LocalizerConfig
+from openarm_perception.looking import make_pipeline
+from openarm_perception.network import NetworkConfig, NetworkDetector
+
+FOLDER = models_dir() / "detector"
+MODELS = ("shapes_320x256", "shapes_640x480")
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_b22_b67_the_shipped_files_are_small_and_need_no_gpu(name: str) -> None:
+    """At most 3.2 million parameters of 4 bytes; run by the CPU provider alone; the card tells their hash."""
+    path = FOLDER / f"{name}.onnx"
+    assert path.stat().st_size < 4 * 3.2e6 / 4  # a quarter of it
+    network = NetworkDetector(NetworkConfig(model=name))
+    assert network._session.get_providers() == ["CPUExecutionProvider"]
+    assert network.names == SHAPES
+    assert hashlib.sha256(path.read_bytes()).hexdigest() in (FOLDER / "README.md").read_text()
+
+
+@pytest.mark.parametrize("kind", ["network", "both"])
+def test_n14_n16_the_shipped_network_finds_random_scenes(kind) -> None:
+    """Every object of six scenes under the overhead camera, in place, by colour and shape."""
+    studio = Studio()
+    camera = studio.cameras["overhead"]
+    limits = DepthLimits(near=camera.near, far=camera.far)
+    joints = studio.home()
+    for seed in range(5000, 5006):
+        scene = random_scene(seed)
+        studio.load(scene, joints)
+        rgb, depth = studio.draw("overhead")
+        localizer = Localizer(LocalizerConfig(), limits, scene.table.top_z)
+        pipeline = make_pipeline(kind, studio.detector, NetworkConfig(), localizer)
+        seen = pipeline.run(rgb, depth, camera.intrinsics, studio.T_base_camera("overhead", joints))
+        items = {item.label: item for item in scene.objects}
+        assert sorted(place.label for place in seen.located) == sorted(items), (seed, seen.refused)
+        for place in seen.located:
+            assert items[place.label].shape in names_of(place)
+            assert np.abs(errors(place, items[place.label], scene.table))[0] < 3.0
+    studio.close()

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Networks, both detectors and depth alone on rendered tables; the networks are made up, their boxes exact or not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from openarm_common.config import load_config
+from openarm_common.resources import config_dir
+from openarm_perception.convert import names_of
+from openarm_perception.depth import DepthLimits
+from openarm_perception.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.kinds import DetectorKind
+from openarm_perception.localize import Localizer, LocalizerConfig
+from openarm_perception.looking import make_pipeline
+from openarm_perception.network import NetworkConfig
+from openarm_perception.pipeline import Perceived, Pipeline
+from tests.openarm_perception.onnx_file import boxes, write_network
+
+LIMITS = DepthLimits(near=0.07)
+COLORS = ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))
+CLASSES = ("box", "cylinder")
+
+
+@pytest.fixture
+def perceive(tabletop, tmp_path):
+    """What a kind of detector makes of things, of which the network tells (class, score, shift of its box, px)."""
+
+    def run(kind: DetectorKind, things, told=None, spoil=None, robot=None) -> Perceived:
+        view = tabletop.render(things)
+        rows = []
+        for i, thing in enumerate(things):
+            alone = Pipeline(COLORS, Localizer(LocalizerConfig(), LIMITS, tabletop.table_height))
+            colour = replace(thing, label="red") if thing.label == "grey" else thing
+            (found,) = alone.detector.detect(tabletop.render([colour]).rgb)
+            say = (CLASSES.index(thing.kind), 0.9, 0.0) if told is None else told.get(i)
+            if say is not None:
+                (u, v), (w, h) = found.origin, found.size
+                rows.append((u + say[2], v + say[2], u + w + say[2], v + h + say[2], say[0], say[1]))
+        model = write_network(tmp_path / "net.onnx", boxes(*rows), (1, 3, 480, 640), str(list(CLASSES)))
+        localizer = Localizer(LocalizerConfig(), LIMITS, tabletop.table_height)
+        pipeline = make_pipeline(kind, COLORS, NetworkConfig(model=str(model)), localizer)
+        rgb = view.rgb if spoil is None else spoil(view.rgb.copy())
+        return pipeline.run(rgb, view.depth, view.intrinsics, view.T_base_camera, robot)
+
+    return run
+
+
+def three(tabletop):
+    return [
+        tabletop.Thing("red", "box", (0.05, 0.06, 0.05), 0.27, 0.0, 0.4),
+        tabletop.Thing("blue", "cylinder", (0.05, 0.05, 0.09), 0.22, 0.25),
+        tabletop.Thing("grey", "box", (0.05, 0.05, 0.05), 0.30, -0.25, 0.2),
+    ]
+
+
+@pytest.mark.parametrize("shift", [-3.0, 0.0, 3.0])
+def test_n15_boxes_of_a_network_become_objects_in_place(tabletop, perceive, shift: float) -> None:
+    """Also with boxes a few pixels off: depth and colour say where an object ends. Labels are colours if possible."""
+    things = three(tabletop)
+    seen = perceive("network", things, {0: (0, 0.9, shift), 1: (1, 0.8, shift), 2: (0, 0.7, shift)})
+    assert not seen.refused
+    found = {place.label: place for place in seen.located}
+    assert sorted(found) == ["blue", "box", "red"]
+    for thing, label in zip(things, ("red", "blue", "box"), strict=True):
+        assert np.abs(found[label].position - thing.position).max() < 0.003
+        assert np.abs(np.array(found[label].size) - [*sorted(thing.size[:2]), thing.size[2]]).max() < 0.004
+    assert names_of(found["red"]) == ("red", "box")
+    assert names_of(found["blue"]) == ("blue", "can", "cylinder")
+    assert names_of(found["box"]) == ("box", "cube")
+
+
+def test_n16_what_both_see_is_found_and_named_by_both(tabletop, perceive) -> None:
+    seen = perceive("both", three(tabletop))
+    assert {(d.label, d.kind) for d in seen.found} == {("red", "box"), ("blue", "cylinder"), ("box", "box")}
+    assert len(seen.located) == 3
+    assert not seen.refused
+
+
+def test_n16_what_the_network_does_not_see_is_looked_at_again(tabletop, perceive) -> None:
+    """A network that has gone blind: nothing coloured is grasped, all of it stands in the way, and each is told of."""
+    seen = perceive("both", three(tabletop), {2: (0, 0.9, 0.0)})
+    assert [place.label for place in seen.located] == ["box"]
+    assert sorted(place.label for place in seen.unmeasured) == ["blue", "red"]
+    assert all(place.score == 0.0 for place in seen.unmeasured)
+    assert any(
+        "red at pixel" in why and "the network sees nothing there; it is looked at again" in why for why in seen.refused
+    )
+
+
+def test_n16_a_colour_that_only_paint_has_is_no_object(tabletop, perceive) -> None:
+    """A red sheet on the table: by colour it is found in the image; the network knows better."""
+
+    def sheet(rgb):
+        rgb[100:140, 300:360] = (205, 20, 20)
+        return rgb
+
+    things = three(tabletop)[1:]
+    assert "red" in [d.label for d in perceive("color", things, spoil=sheet).found]
+    seen = perceive("both", things, spoil=sheet)
+    assert sorted(place.label for place in seen.boxes) == ["blue", "box"]
+    assert any("red at pixel (330, 120): the network sees nothing there" in why for why in seen.refused)
+
+
+def test_n16_what_has_lost_its_colour_to_one_of_them_is_looked_at_again(tabletop, perceive) -> None:
+    """Specks hide the red of a box from the colour detector, whose kernel takes it out; most of it is still red."""
+
+    def specks(rgb):
+        hidden = np.zeros(rgb.shape[:2], np.bool_)
+        hidden[::3, ::3] = True
+        red = (rgb[..., 0] > 100) & (rgb[..., 1] < 80)
+        rgb[hidden & red] = (120, 120, 120)
+        return rgb
+
+    things = three(tabletop)[:2]
+    assert [d.label for d in perceive("color", things, spoil=specks).found] == ["blue"]
+    seen = perceive("both", things, spoil=specks)
+    assert [place.label for place in seen.located] == ["blue"]
+    assert any("box at pixel" in why and "colour sees nothing red there" in why for why in seen.refused)
+
+
+def test_one_object_named_twice_is_one_object(tabletop, perceive) -> None:
+    """Two classes for one thing, not overlapping enough for the boxes alone: the more certain one stays."""
+    thing = three(tabletop)[0]
+    seen = perceive("network", [thing, thing], {0: (0, 0.7, -9.0), 1: (1, 0.8, 0.0)})
+    assert [(d.label, d.kind) for d in seen.found] == [("red", "cylinder")]
+
+
+def test_a_box_around_nothing_is_nothing(tabletop, perceive) -> None:
+    assert perceive("network", three(tabletop)[:1], {0: (0, 0.9, 150.0)}).found == ()
+
+
+def test_anything_finds_what_no_detector_knows_by_depth_alone(tabletop, perceive) -> None:
+    things = three(tabletop)
+    seen = perceive("anything", things, {})
+    assert [place.label for place in seen.located] == ["anything"] * 3
+    for thing in things:
+        assert min(np.abs(place.position - thing.position).max() for place in seen.located) < 0.003
+
+
+def test_anything_parts_what_stands_behind_another_and_leaves_the_robot_out(tabletop, perceive) -> None:
+    tall = tabletop.Thing("grey", "box", (0.05, 0.05, 0.12), 0.25, 0.0)
+    low = tabletop.Thing("grey", "box", (0.05, 0.05, 0.04), 0.19, 0.0)
+    assert len(perceive("anything", [tall, low], {}).found) == 2
+    robot = np.zeros((480, 640), np.bool_)
+    robot[:, :320] = True
+    left = perceive("anything", three(tabletop), {}, robot=robot)
+    assert len(left.found) == 2
+    assert all(d.origin[0] >= 320 for d in left.found)

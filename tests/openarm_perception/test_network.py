@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Networks in ONNX files: which are taken, which are refused by name, and what comes out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_perception.detector import rank
+from openarm_perception.network import NetworkConfig, NetworkDetector
+from tests.openarm_perception.onnx_file import boxes, write_network
+
+
+def make(path, output, **kwargs) -> NetworkDetector:
+    config = kwargs.pop("config", {})
+    return NetworkDetector(NetworkConfig(model=str(write_network(path / "net.onnx", output, **kwargs)), **config))
+
+
+IMAGE = np.zeros((480, 640, 3), np.uint8)
+
+
+def test_b36_b38_boxes_of_the_input_are_boxes_of_the_image(tmp_path) -> None:
+    """320x256 takes a 640x480 image at half its size, 8 rows lower."""
+    network = make(tmp_path, boxes((100, 58, 130, 88, 0, 0.9), (200, 108, 240, 168, 1, 0.6)))
+    found = {d.label: d for d in network.detect(IMAGE)}
+    assert found["box"].origin == (200, 100)
+    assert found["box"].size == (60, 60)
+    assert found["box"].score == pytest.approx(0.9)
+    assert found["ball"].centre == (439.5, 259.5)
+    assert not found["ball"].truncated
+    assert found["ball"].mask.all()
+
+
+def test_b26_the_threshold_is_one_half_by_default(tmp_path) -> None:
+    output = boxes((10, 20, 40, 60, 0, 0.49), (100, 58, 130, 88, 0, 0.51))
+    assert [d.score for d in make(tmp_path, output).detect(IMAGE)] == pytest.approx([0.51])
+    assert len(make(tmp_path, output, config={"threshold": 0.4}).detect(IMAGE)) == 2
+
+
+def test_b27_policies_choose_among_several(tmp_path) -> None:
+    found = make(tmp_path, boxes((10, 20, 40, 60, 0, 0.95), (150, 110, 180, 140, 0, 0.7))).detect(IMAGE)
+    assert rank(found, "score", (640, 480))[0].score == pytest.approx(0.95)
+    assert rank(found, "centre", (640, 480))[0].score == pytest.approx(0.7)
+
+
+def test_a_box_at_the_border_is_cut_and_one_beyond_it_is_dropped(tmp_path) -> None:
+    found = make(tmp_path, boxes((0, 58, 30, 88, 0, 0.9), (-50, 58, -20, 88, 1, 0.9))).detect(IMAGE)
+    assert [(d.label, d.truncated, d.origin[0]) for d in found] == [("box", True, 0)]
+
+
+def test_set_classes_looks_for_some_only_and_lists_what_it_knows(tmp_path) -> None:
+    network = make(tmp_path, boxes((10, 20, 40, 60, 0, 0.9), (100, 58, 130, 88, 1, 0.9)))
+    network.set_classes(["ball"])
+    assert [d.label for d in network.detect(IMAGE)] == ["ball"]
+    with pytest.raises(OpenArmError, match=r"net\.onnx knows no 'cube'; classes: box, ball"):
+        network.set_classes(["ball", "cube"])
+    network.set_classes([])
+    assert len(network.detect(IMAGE)) == 2
+
+
+@pytest.mark.parametrize("classes", [1, 2, 3, 17, 80])
+@pytest.mark.parametrize("size", [(256, 320), (480, 640), (640, 640)])
+def test_n15_any_layout_of_yolov8_is_read(tmp_path, classes: int, size: tuple[int, int]) -> None:
+    """The number of classes is that of the shape, the size of the input that of the file."""
+    cells = sum(size[0] // s * (size[1] // s) for s in (8, 16, 32))
+    names = [f"thing{i}" for i in range(classes)]
+    output = boxes((64, 64, 96, 96, classes - 1, 0.8), cells=cells, classes=classes)
+    network = make(tmp_path, output, shape=(1, 3, *size), names=str(names))
+    assert network.names == tuple(names)
+    assert network.size == size[::-1]
+    assert [d.label for d in network.detect(np.zeros((*size, 3), np.uint8))] == [names[-1]]
+
+
+def test_n15_sizes_that_the_file_leaves_free_are_those_of_the_configuration(tmp_path) -> None:
+    network = make(tmp_path, boxes(), shape=("n", 3, "h", "w"), config={"width": 416, "height": 320})
+    assert network.size == (416, 320)
+
+
+def test_names_come_from_the_configuration_the_file_or_a_yaml(tmp_path) -> None:
+    assert make(tmp_path, boxes(), config={"names": ("a", "b")}).names == ("a", "b")
+    (tmp_path / "net.yaml").write_text("names: {0: c, 1: d}\n")
+    assert make(tmp_path, boxes()).names == ("box", "ball")
+    assert make(tmp_path, boxes(), names="").names == ("c", "d")
+    (tmp_path / "net.yaml").unlink()
+    with pytest.raises(OpenArmError, match=r"2 classes have no names: give them .* net\.yaml"):
+        make(tmp_path, boxes(), names="")
+    with pytest.raises(OpenArmError, match="it has 2 classes, but its metadata names 1: box"):
+        make(tmp_path, boxes(), names="['box']")
+    with pytest.raises(OpenArmError, match=r"expected {0: 'a', 1: 'b', …} or a list"):
+        make(tmp_path, boxes(), names="box; ball")
+
+
+@pytest.mark.parametrize(
+    ("output", "kwargs", "words"),
+    [
+        (np.zeros((1, 100, 7)), {}, r"output has shape \(1, 100, 7\); that is the layout of YOLOv5"),
+        (np.zeros((1, 300, 6)), {}, "its own non-maximum suppression"),
+        (np.zeros((1, 4, 100)), {}, r"output has shape \(1, 4, 100\); expected the layout of YOLOv8"),
+        (np.zeros((7, 100)), {}, r"output has shape \(7, 100\)"),
+        (np.zeros((2, 7, 100)), {}, r"output has shape \(2, 7, 100\)"),
+        (np.full((1, 6, 100), 3.0), {}, "scores go from 3 to 3, expected 0 to 1; export it with its sigmoid"),
+        (np.full((1, 6, 100), np.nan), {}, "scores go from nan"),
+        (boxes(), {"shape": (1, 1, 256, 320)}, r"its input is images \[1, 1, 256, 320\]"),
+        (boxes(), {"shape": (1, 256, 320, 3)}, r"\[1, 256, 320, 3\]"),
+        (boxes(), {"shape": (4, 3, 256, 320)}, "it takes 4 images at a time, expected one"),
+        (boxes(), {"kind": 2}, r"tensor\(uint8\), of tensor\(float\)"),
+    ],
+)
+def test_n15_files_of_another_layout_are_refused_by_name(tmp_path, output, kwargs, words: str) -> None:
+    with pytest.raises(OpenArmError, match=words) as caught:
+        make(tmp_path, output, **kwargs)
+    assert caught.value.code is Code.CONFIG_INVALID
+    assert "net.onnx" in caught.value.message
+
+
+def test_missing_and_damaged_files_are_refused_by_name(tmp_path) -> None:
+    with pytest.raises(OpenArmError, match=r"there is no network .*nowhere\.onnx; models: ") as caught:
+        NetworkDetector(NetworkConfig(model=str(tmp_path / "nowhere.onnx")))
+    assert "shapes_640x480" in caught.value.message
+    path = write_network(tmp_path / "half.onnx", boxes())
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(OpenArmError, match=r"half\.onnx \(200 bytes\) is damaged or no ONNX file") as caught:
+        NetworkDetector(NetworkConfig(model=str(path)))
+    assert caught.value.code is Code.CONFIG_INVALID
+
+
+def test_b28_images_of_another_kind_are_refused(tmp_path) -> None:
+    network = make(tmp_path, boxes())
+    for image in (
+        np.zeros((480, 640), np.uint8),
+        np.zeros((480, 640, 4), np.uint8),
+        np.zeros((480, 640, 3), np.float32),
+    ):
+        with pytest.raises(OpenArmError, match=r"expected .h, w, 3. of uint8") as caught:
+            network.detect(image)
+        assert caught.value.code is Code.BAD_IMAGE
