@@ -107,7 +107,7 @@ class CalibrationClient(BackgroundNode):
         return AutoResult(
             success=answer.success,
             code=Code(answer.code) if answer.code in Code.__members__ else Code.INTERNAL,
-            message=answer.message,
+            message=answer.message or "the node ended the action without an answer; its log says why",
             grade=answer.grade,
             T_parent_link=pose_to_matrix(answer.mount) if answer.grade else None,
             sigma_translation=answer.sigma_translation,

@@ -50,6 +50,7 @@ class Result:
         return {
             "grade": self.verdict.grade,
             "reasons": list(self.verdict.reasons),
+            "checks": {check.name: check.ratio for check in self.verdict.checks},
             "figures": self.verdict.figures,
             "methods": self.methods,
             "calibration": self.calibration.model_dump(mode="json"),

@@ -49,12 +49,28 @@ class Held:
 
 
 @dataclass(frozen=True)
+class Check:
+    """One thing that is looked at.
+
+    Args:
+        name: What, in a word or two.
+        ratio: Over its limit; above 1 is a warning, above 3 a failure.
+        text: The figure in a sentence.
+    """
+
+    name: str
+    ratio: float
+    text: str
+
+
+@dataclass(frozen=True)
 class Verdict:
-    """Grade, why, and the figures (SI units, px)."""
+    """Grade, why, the figures (SI units, px), and everything that was looked at."""
 
     grade: Grade
     reasons: tuple[str, ...]
     figures: dict[str, Any]
+    checks: tuple[Check, ...] = ()
 
 
 def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
@@ -160,32 +176,35 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         "influence": {v.name: solution.tests[int(problem.pose[k])].influence for k, v in enumerate(problem.views)},
         "outliers": {outlier.name: outlier.reason for outlier in solution.outliers},
     }  # fmt: skip
-    checks: list[tuple[float, str]] = [
-        (sigma_t / limits.translation, f"predicted error of the position {sigma_t * 1e3:.2f} mm"),
-        (sigma_r / limits.rotation, f"predicted error of the rotation {math.degrees(sigma_r):.3f}°"),
+    checks = [
+        Check("position", sigma_t / limits.translation, f"predicted error of the position {sigma_t * 1e3:.3f} mm"),
+        Check("rotation", sigma_r / limits.rotation, f"predicted error of the rotation {math.degrees(sigma_r):.4f}°"),
     ]
     if not math.isnan(one_out.metres):
-        checks.append((one_out.metres / limits.held_out, f"held-out error {one_out.metres * 1e3:.2f} mm at the board"))
+        told = f"held-out error {one_out.metres * 1e3:.3f} mm at the board"
+        checks.append(Check("held out", one_out.metres / limits.held_out, told))
     beyond = max(abs(scale - 1.0) - 3.0 * scale_sigma, 0.0)
-    checks.append((beyond / limits.scale, f"the board seems {abs(scale - 1.0) * 100:.2f} % off its stated size"))
+    told = f"the board seems {abs(scale - 1.0) * 100:.2f} % off its stated size"
+    checks.append(Check("board size", beyond / limits.scale, told))
     away = max(abs(focal - 1.0) - 3.0 * focal_sigma, 0.0)
-    told = f"the focal length seems {(focal - 1.0) * 100:+.2f} % off what camera_info says; are these its intrinsics?"
-    checks.append((away / limits.focal, told))
+    told = f"the focal length seems {(focal - 1.0) * 100:+.2f} % off what camera_info says"
+    told += "; are these its intrinsics?" if away > limits.focal else ""
+    checks.append(Check("focal length", away / limits.focal, told))
     share = len(solution.outliers) / max(len(problem), 1)
-    checks.append((share / 0.1, f"{len(solution.outliers)} of {len(problem)} samples contradict the others"))
-    checks.append((1.5 if poses < limits.samples else 0.0, f"{poses} poses, {limits.samples} are wanted"))
+    told = f"{len(solution.outliers)} of {len(problem)} samples contradict the others"
+    checks.append(Check("contradictions", share / 0.1, told))
+    told = f"{poses} poses, {limits.samples} are wanted"
+    checks.append(Check("poses", 1.5 if poses < limits.samples else 0.0, told))
     if stored is not None:
         offset, angle = mount_error(solution.estimate.X[0], stored)
         figures |= {"drift": offset, "drift_rotation": angle}
         # a drift is no fault of this result: it is told, never more than a warning
-        moved = min(offset / limits.drift, 2.0)
-        checks.append(
-            (moved, f"the camera is {offset * 1e3:.1f} mm and {math.degrees(angle):.2f}° from what is stored")
-        )
-    reasons = tuple(text for ratio, text in checks if ratio > 1.0)
-    worst = max(ratio for ratio, _ in checks)
+        told = f"the camera is {offset * 1e3:.1f} mm and {math.degrees(angle):.2f}° from what is stored"
+        checks.append(Check("drift", min(offset / limits.drift, 2.0), told))
+    reasons = tuple(check.text for check in checks if check.ratio > 1.0)
+    worst = max(check.ratio for check in checks)
     grade: Grade = "fail" if worst > 3.0 else "warn" if worst > 1.0 else "pass"
-    return Verdict(grade, reasons, figures)
+    return Verdict(grade, reasons, figures, tuple(checks))
 
 
 def _focal(solution: Solution) -> tuple[float, float]:

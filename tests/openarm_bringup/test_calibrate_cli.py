@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -54,7 +55,9 @@ def test_p28_solve_check_save_report_list_rollback(capsys, session_file: Path, t
     page = tmp_path / "report.html"
     assert run(capsys, "report", str(session_file), str(page))[0] == 0
     text = page.read_text()
-    assert text.count("<svg") == 4
+    drawn = re.findall(r"<figcaption>(\S+ \S+ \S+)", text)
+    assert drawn == ["the camera as", "where the marks", "what the fit"]
+    assert text.count('<svg class="bare"') == 8 + 2 * 12
     assert "http" not in text.replace("http-equiv", "")
     code, out, _ = run(capsys, "check", str(session_file), "--json")
     data = json.loads(out)
