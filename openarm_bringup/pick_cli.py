@@ -20,6 +20,7 @@ def pick(
     label: str = "",
     *,
     arm: Literal["auto", "left", "right"] = "auto",
+    at: tuple[float, float] | None = None,
     place: tuple[float, float, float] | None = None,
     yaw: float | None = None,
     phase: Literal["all", "pick", "place"] = "all",
@@ -33,6 +34,7 @@ def pick(
     Args:
         label: What to pick, such as red; without one, what is seen best.
         arm: Which arm.
+        at: x y near which the object stands, base frame, m: which of several alike.
         place: Where to: x y z of the footprint centre, base frame, m (z is not read: the table); chosen when not given.
         yaw: Of the object where it is put down, degrees about the vertical; as the hand likes when not given.
         phase: pick ends with the object in the hand, place puts down what the hand holds; all does both.
@@ -60,6 +62,7 @@ def pick(
             result = client.pick(
                 label,
                 arm=arm,
+                object_at=at,
                 place=place,
                 place_yaw=None if yaw is None else math.radians(yaw),
                 phase=phase,

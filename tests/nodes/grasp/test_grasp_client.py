@@ -54,6 +54,24 @@ def test_p01_p02_the_client_picks_and_places_in_two_requests(bench):
     assert bench.world.objects["red"][:2] == pytest.approx((0.3, -0.3), abs=0.005)
 
 
+def test_p03_the_client_means_an_object_by_its_position_and_leaves_others(bench):
+    results = []
+
+    def script() -> None:
+        with GraspClient() as grasp:
+            results.append(grasp.pick(object_at=(0.26, 0.21), dry_run=True))
+            results.append(grasp.pick("red", leave=((0.26, -0.2),), dry_run=True))
+
+    thread = Thread(target=script)
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    thread.join()
+    meant, left = results
+    assert (meant.success, meant.label) == (True, "blue"), meant.message
+    assert left.code is Code.UNKNOWN_OBJECT
+    assert "shall stay where they are" in left.message
+
+
 def test_the_client_can_cancel_from_its_feedback(bench):
     results = []
 
