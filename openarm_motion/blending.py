@@ -8,7 +8,6 @@ was planned: it needs a certificate of its own. s, rad, rad/s, rad/s², rad/s³.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -16,7 +15,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_motion.trajectory import SPACING, JointLimits, Profile, Trajectory, joined, straight_profile, time_polyline
+from openarm_motion.trajectory import (
+    SPACING,
+    JointLimits,
+    Profile,
+    Trajectory,
+    joined,
+    segments,
+    straight_profile,
+    time_polyline,
+)
 
 Array = NDArray[np.float64]
 
@@ -83,24 +91,21 @@ def time_blended(names: Sequence[str], waypoints: Array, limits: JointLimits, pe
         limits: What no joint exceeds.
         period: Greatest time between two samples, s.
     """
-    segments: list[_Segment] = []
-    for start, end in itertools.pairwise(waypoints):
-        difference = end - start
-        if float(np.abs(difference).max()) < 1e-9:
-            continue
+    under_way: list[_Segment] = []
+    for _, _, difference in segments(waypoints):
         way = straight_profile(difference, limits)
         begin = 0.0
-        if segments:
-            last = segments[-1]
+        if under_way:
+            last = under_way[-1]
             ends = last.begin + last.way.duration
             begin = ends - _overlap(last, way, difference, ends, limits)
-        segments.append(_Segment(way, difference, begin))
-    if not segments:
+        under_way.append(_Segment(way, difference, begin))
+    if not under_way:
         return joined(tuple(names), [], waypoints[0], period)
-    end = max(segment.begin + segment.way.duration for segment in segments)
-    borders = np.concatenate([segment.begin + segment.way.t for segment in segments])
+    end = max(segment.begin + segment.way.duration for segment in under_way)
+    borders = np.concatenate([segment.begin + segment.way.t for segment in under_way])
     t = _thinned(np.linspace(0.0, end, max(2, int(np.ceil(end / period)) + 1)), borders)
-    parts = [segment.at(t) for segment in segments]
+    parts = [segment.at(t) for segment in under_way]
     q, v, a = (np.sum([part[k] for part in parts], axis=0) for k in range(3))
     q += waypoints[0]
     q[-1] = waypoints[-1]
@@ -119,11 +124,8 @@ def time_quintic(names: Sequence[str], waypoints: Array, limits: JointLimits, pe
         period: Greatest time between two samples, s.
     """
     parts: list[Trajectory] = []
-    for start, end in itertools.pairwise(waypoints):
-        difference = end - start
+    for start, _, difference in segments(waypoints):
         size = np.abs(difference)
-        if float(size.max()) < 1e-9:
-            continue
         slowest = [
             float(np.max(peak * size / limit)) ** (1.0 / (k + 1))
             for k, (peak, limit) in enumerate(

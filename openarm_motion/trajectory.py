@@ -10,7 +10,7 @@ follower's quintic interpolation is the profile itself on a straight joint line.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,10 +159,7 @@ def time_polyline(names: Sequence[str], waypoints: Array, limits: JointLimits, p
         period: Greatest time between two samples, s.
     """
     parts: list[Trajectory] = []
-    for start, end in itertools.pairwise(waypoints):
-        difference = end - start
-        if float(np.abs(difference).max()) < _NOTHING:
-            continue
+    for start, end, difference in segments(waypoints):
         way = straight_profile(difference, limits)
         t = _sample_times(way, period)
         s, ds, dds, _ = way.at(t)
@@ -211,6 +208,13 @@ def time_path(
     q = np.asarray(curve(x[:, 0]))
     q[0], q[-1] = path[0], path[-1]
     return _at_rest(tuple(names), t, q, q1 * dx, q2 * dx**2 + q1 * ddx)
+
+
+def segments(waypoints: Array) -> Iterator[tuple[Array, Array, Array]]:
+    """Start, end and difference (n,) of the straight segments of a polyline; those of no length are left out."""
+    for start, end in itertools.pairwise(waypoints):
+        if float(np.abs(end - start).max()) >= _NOTHING:
+            yield start, end, end - start
 
 
 def _sample_times(way: Profile, period: float) -> Array:
