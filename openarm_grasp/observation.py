@@ -149,6 +149,9 @@ def find(
         track += [min(near, key=lambda d: _distance(d, anchor))] if near else []
     # A detector may miss a thing in one frame; in most of them it must be in its place.
     if 3 * len(track) < 2 * len(frames):
+        blurred = [f for f in frames if any(not d.measured and _same_thing(d, anchor) for d in f.detections)]
+        if 3 * (len(track) + len(blurred)) >= 2 * len(frames):
+            raise _not_measured(anchor)
         raise OpenArmError(
             Code.STALE_DATA,
             f"{anchor.label!r} is in the same place in {len(track)} of {len(frames)} frames only: expected one within"
@@ -186,13 +189,20 @@ def _anchor(frame: Frame, label: str, at: Sequence[float] | None, leave: Sequenc
         meant = [min(near, key=lambda d: _from(d, at))]
     measured = [d for d in meant if d.measured]
     if not measured:
-        where = _text(meant[0].p_base)
-        raise OpenArmError(
-            Code.NOTHING_DETECTED,
-            f"{name!r} is in view at about {where}, but cannot be measured: something hides its outline, or the border"
-            " of the image cuts it",
-        )
+        raise _not_measured(meant[0])
     return max(measured, key=lambda d: d.score)
+
+
+def _same_thing(a: Detection, b: Detection) -> bool:
+    return a.label == b.label and _distance_xy(a, b) <= SAME_PLACE
+
+
+def _not_measured(d: Detection) -> OpenArmError:
+    return OpenArmError(
+        Code.NOTHING_DETECTED,
+        f"{d.label!r} is in view at about {_text(d.p_base)}, but cannot be measured: something hides its outline, or the"
+        " border of the image cuts it",
+    )
 
 
 def sticks_out(seen: Detection, stood: Detection) -> float:

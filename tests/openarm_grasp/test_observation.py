@@ -134,6 +134,16 @@ def test_what_is_not_measured_is_in_the_way_but_no_target() -> None:
     assert error.value.code is Code.NOTHING_DETECTED
 
 
+def test_what_is_measured_in_one_frame_of_three_alone_cannot_be_measured() -> None:
+    hidden = seen(x=0.27, score=0.0)
+    with pytest.raises(OpenArmError, match="cannot be measured") as error:
+        look(frames((hidden,), (hidden,), (seen(),)))
+    assert error.value.code is Code.NOTHING_DETECTED
+    with pytest.raises(OpenArmError, match="in 1 of 3 frames only") as error:
+        look(frames((), (), (seen(),)))
+    assert error.value.code is Code.STALE_DATA
+
+
 @pytest.mark.parametrize("yaw", [0.0, 0.6])
 def test_how_far_something_reaches_out_of_its_place(yaw) -> None:
     stood = seen(yaw=yaw)
