@@ -200,8 +200,8 @@ def _same_thing(a: Detection, b: Detection) -> bool:
 def _not_measured(d: Detection) -> OpenArmError:
     return OpenArmError(
         Code.NOTHING_DETECTED,
-        f"{d.label!r} is in view at about {_text(d.p_base)}, but cannot be measured: something hides its outline, or the"
-        " border of the image cuts it",
+        f"{d.label!r} is in view at about {_text(d.p_base)}, but cannot be measured: something hides its outline, or"
+        " the border of the image cuts it",
     )
 
 

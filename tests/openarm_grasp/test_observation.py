@@ -149,7 +149,9 @@ def test_how_far_something_reaches_out_of_its_place(yaw) -> None:
     stood = seen(yaw=yaw)
     shift = se3.make(p=(*(se3.rot_z(yaw)[:2, 0] * 0.02), 0.0))
     moved = Detection("red", 0.9, shift @ stood.T_base_object, stood.size)
-    assert sticks_out(stood, stood) == 0.0
+    assert sticks_out(stood, stood) == pytest.approx(0.0, abs=1e-12)
     assert sticks_out(moved, stood) == pytest.approx(0.02)
     # the corners of a box around something round are no part of it
-    assert sticks_out(seen(size=(0.04, 0.04, 0.05), yaw=0.8), seen(size=(0.04, 0.04, 0.05))) == 0.0
+    assert sticks_out(seen(size=(0.04, 0.04, 0.05), yaw=0.8), seen(size=(0.04, 0.04, 0.05))) == pytest.approx(
+        0.0, abs=1e-12
+    )
