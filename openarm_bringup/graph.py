@@ -208,7 +208,7 @@ def load_graph(
     }
     graph = _in_lockstep(graph.model_copy(update={"nodes": nodes}), str(path))
     for item in sets:
-        _set(graph, item)
+        set_parameter(graph, item)
     return graph
 
 
@@ -320,8 +320,12 @@ def _in_lockstep(graph: Graph, where: str) -> Graph:
     return graph.model_copy(update={"nodes": nodes})
 
 
-def _set(graph: Graph, item: str) -> None:
-    """Apply one `node.param=value`; the parameter dictionaries were made by load_graph, so they are its own."""
+def set_parameter(graph: Graph, item: str) -> None:
+    """Apply one `node.param=value` to a graph that load_graph made: its dictionaries of parameters are its own.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for another form, an unknown node or a value that is not YAML.
+    """
     target, equals, text = item.partition("=")
     node, dot, param = target.partition(".")
     if not (equals and dot and param):

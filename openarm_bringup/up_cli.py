@@ -10,9 +10,9 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from openarm_bringup.graph import Discovery, Graph, load_graph
+from openarm_bringup.graph import Discovery, Graph, load_graph, set_parameter
 from openarm_bringup.outcome import Outcome, failure
-from openarm_bringup.viz import app_link, with_viz
+from openarm_bringup.viz import NODE, app_link, with_viz
 from openarm_common.errors import Code, OpenArmError
 
 STYLES = {"ready": "green", "failed": "bold red", "backoff": "yellow", "exited": "yellow", "stopped": "dim"}
@@ -44,7 +44,8 @@ def up(
         viz_port: TCP port for that.
     """
     overrides = {"scene": scene, "seed": seed, "mount_seed": mount_seed, "domain": domain, "discovery": discovery}
-    loaded = load_graph(graph, overrides=overrides, sets=set_)
+    of_viz = tuple(item for item in set_ if viz and item.startswith(f"{NODE}."))
+    loaded = load_graph(graph, overrides=overrides, sets=[item for item in set_ if item not in of_viz])
     from openarm_bringup.runs import new_run_dir
     from openarm_common.scene import load_scene
 
@@ -52,6 +53,8 @@ def up(
     address = ""
     if viz:
         loaded, address = with_viz(loaded, viz_port)
+    for item in of_viz:
+        set_parameter(loaded, item)
     return asyncio.run(_up(loaded, new_run_dir(), address))
 
 

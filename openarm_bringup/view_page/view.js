@@ -80,13 +80,18 @@ function connect() {
 
 function receive(data) {
   if (typeof data === "string") {
-    const message = JSON.parse(data);
-    handlers[message.kind](message);
+    show(JSON.parse(data));
     return;
   }
   const length = new DataView(data).getUint32(0, true);
-  const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
-  handlers[head.kind](head, data.slice(4 + length));
+  show(JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length))), data.slice(4 + length));
+}
+
+function show(head, body) {
+  const layer = head.kind === "fault" ? head.layer : head.kind === "image" ? `image:${head.camera}` : head.kind;
+  const optional = layer in LAYERS || layer.startsWith("image:");
+  if (optional && !wanted.has(layer)) return; // it was on its way when it was switched off
+  handlers[head.kind](head, body);
 }
 
 function want() {

@@ -13,8 +13,10 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
+from openarm_bringup import up_cli
 from openarm_bringup.definitions import full_definition
-from openarm_bringup.graph import load_graph
+from openarm_bringup.graph import Graph, load_graph
+from openarm_bringup.outcome import Outcome
 from openarm_bringup.viz import NODE, TOKEN_VARIABLE, app_link, with_viz
 from openarm_bringup.viz_proxy import hidden_address
 from openarm_common.errors import Code, OpenArmError
@@ -46,6 +48,24 @@ def test_the_node_is_added_and_its_token_is_in_no_parameter() -> None:
     assert len(graph.nodes) == len(load_graph("sim_only").nodes) + 1
     assert parse_qs(urlsplit(app_link(address)).query)["ds.url"] == [address]
     assert with_viz(load_graph("sim_only"), free_port())[1] != address
+
+
+@pytest.mark.usefixtures("sdk")
+def test_up_sets_parameters_of_the_added_node_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("OPENARM_RUNS", str(tmp_path))
+    started: list[Any] = []
+
+    async def note(graph: Graph, run_dir: Path, address: str) -> Outcome:
+        started.append(graph)
+        return Outcome(True)
+
+    monkeypatch.setattr(up_cli, "_up", note)
+    sets = ("foxglove.origins=[http://localhost:8080]", "mujoco_bridge.images=false")
+    assert up_cli.up("sim_only", set_=sets, viz=True, viz_port=free_port()).success
+    assert started[0].nodes[NODE].params["origins"] == ["http://localhost:8080"]
+    assert started[0].nodes["mujoco_bridge"].params["images"] is False
+    with pytest.raises(OpenArmError, match="no node 'foxglove'"):
+        up_cli.up("sim_only", set_=sets)
 
 
 def test_a_missing_sdk_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
