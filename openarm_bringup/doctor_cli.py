@@ -16,6 +16,7 @@ from importlib import metadata
 from pathlib import Path
 
 from openarm_bringup import doctor as checks
+from openarm_bringup import doctor_graph
 from openarm_bringup.doctor import Finding
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code
@@ -45,7 +46,7 @@ with mujoco.Renderer(model, 240, 320) as renderer:
 
 
 def doctor(*, graph: str = "sim") -> Outcome:
-    """Look at versions, ROS, rendering, shared memory and ports, and say what to do about each fault.
+    """Look at versions, ROS, rendering, shared memory, ports and running graphs; say what to do about each fault.
 
     Args:
         graph: The graph whose needs are held against the machine.
@@ -110,11 +111,14 @@ def _graph_findings(name: str) -> list[Finding]:
     need = shm.shm_need_mib(load_graph(name), extra_participants=4)
     findings = [checks.check_shm(usage.total / 2**20, usage.free / 2**20, need, name)]
     running = runs.running()
-    if running:
-        seen = "; ".join(f"{record.graph} in domain {record.domain} (pid {record.pid})" for record in running)
-        findings.append(Finding("graphs", "note", f"running: {seen}", "two graphs in one domain disturb each other"))
-    else:
-        findings.append(Finding("graphs", "ok", "none is running"))
+    seen = "; ".join(f"{run.graph} in domain {run.domain}: {run.health} (pid {run.pid})" for run in running)
+    findings.append(Finding("graphs", "ok", seen or "none is running"))
+    for run in running:
+        findings += doctor_graph.check_nodes(run)
+        if run.ready_nodes:
+            from openarm_bringup.doctor_client import listen
+
+            findings += doctor_graph.check_heard(run, listen(run))
     return findings
 
 

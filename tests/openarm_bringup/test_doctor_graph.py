@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Doctor of a graph that runs: each fault of it is found, with what to do."""
+
+from __future__ import annotations
+
+import pytest
+
+from openarm_bringup.doctor_graph import Heard, check_heard, check_nodes
+from openarm_bringup.runs import NodeRecord, RunRecord
+
+NODES = {name: NodeRecord(state="ready") for name in ("mujoco_bridge", "detector", "grasp")}
+WELL = {name: (True, "fine") for name in NODES}
+RATES = {"/joint_states": 99.8, "/clock": 100.1, "/tf": 50.0}
+
+
+def run(**nodes: NodeRecord) -> RunRecord:
+    return RunRecord(
+        graph="sim",
+        pid=1,
+        pid_created=0.0,
+        domain=7,
+        discovery="localhost",
+        run_dir="",
+        started="",
+        nodes={**NODES, **nodes},
+    )
+
+
+def test_a_sound_graph_is_ok_throughout() -> None:
+    findings = check_nodes(run()) + check_heard(run(), Heard(RATES, WELL, [*NODES, "someone"]))
+    assert {finding.level for finding in findings} == {"ok"}
+    assert {"nodes", "/joint_states", "diagnostics", "domain clash"} <= {finding.name for finding in findings}
+
+
+@pytest.mark.parametrize(
+    ("node", "level", "seen"),
+    [
+        (NodeRecord(state="failed", restarts=5), "error", "failed"),
+        (NodeRecord(state="backoff", restarts=1), "note", "backoff"),
+        (NodeRecord(state="ready", restarts=2), "note", "ready, after 2 restarts"),
+    ],
+)
+def test_nodes_that_are_not_as_they_should_be(node: NodeRecord, level: str, seen: str) -> None:
+    (finding,) = check_nodes(run(detector=node))
+    assert (finding.name, finding.level, finding.seen) == ("node detector", level, seen)
+    assert "openarm logs detector" in finding.advice
+
+
+@pytest.mark.parametrize(
+    ("heard", "name", "level"),
+    [
+        (Heard({**RATES, "/joint_states": 40.0}, WELL, [*NODES]), "/joint_states", "error"),
+        (Heard({**RATES, "/tf": 42.0}, WELL, [*NODES]), "/tf", "note"),
+        (Heard({**RATES, "/clock": 0.0}, WELL, [*NODES]), "/clock", "error"),
+        (Heard(RATES, {**WELL, "grasp": (False, "no camera")}, [*NODES]), "node grasp", "error"),
+        (Heard(RATES, {n: WELL[n] for n in ("mujoco_bridge", "grasp")}, [*NODES]), "node detector", "note"),
+        (Heard(RATES, WELL, [*NODES, "grasp"]), "domain clash", "error"),
+        (Heard({}, {}, []), "graph", "error"),
+    ],
+)
+def test_what_is_heard_of_a_sick_graph(heard: Heard, name: str, level: str) -> None:
+    sick = [finding for finding in check_heard(run(), heard) if finding.level != "ok"]
+    assert [(finding.name, finding.level) for finding in sick] == [(name, level)]
+    assert sick[0].advice
