@@ -101,7 +101,9 @@ def _diagnostics(run: RunRecord, heard: Heard) -> list[Finding]:
 
 def _clash(run: RunRecord, heard: Heard) -> list[Finding]:
     """Two graphs in one domain: nodes with the same name, which no graph has."""
-    twice = sorted(name for name, count in Counter(heard.nodes).items() if count > 1 and name in run.nodes)
+    # One that was killed and started again is met twice until the others have forgotten it.
+    own = {name for name, node in run.nodes.items() if not node.restarts}
+    twice = sorted(name for name, count in Counter(heard.nodes).items() if count > 1 and name in own)
     if not twice:
         return [Finding("domain clash", "ok", f"no node is twice in domain {run.domain}")]
     advice = "another graph is in the same domain: stop it, or start one with --domain"
