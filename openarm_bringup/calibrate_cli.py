@@ -65,6 +65,7 @@ def solve(
     *,
     algorithm: str = "REFINED",
     exclude: tuple[str, ...] = (),
+    free_intrinsics: Annotated[bool, Parameter(negative=())] = False,
     save: Annotated[bool, Parameter(negative=())] = False,
     store: Path | None = None,
     recording: Recording = NOT_GIVEN,
@@ -75,12 +76,21 @@ def solve(
         samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
         algorithm: REFINED, or a closed form: TSAI PARK HORAUD ANDREFF DANIILIDIS SHAH LI.
         exclude: Names of samples to leave out.
+        free_intrinsics: Find focal lengths and principal point as well, where those of camera_info are in doubt.
         save: Store the result, unless it fails.
         store: Folder of stored calibrations.
         recording: What a bag does not say.
     """
     place = store_in(store) if save else None
-    return with_solved(samples, recording, exclude, store, lambda done: _outcome(done, place), algorithm=algorithm)
+    return with_solved(
+        samples,
+        recording,
+        exclude,
+        store,
+        lambda done: _outcome(done, place),
+        algorithm=algorithm,
+        free_intrinsics=free_intrinsics,
+    )
 
 
 @app.command

@@ -63,15 +63,20 @@ def with_solved(
     then: Callable[[Solved], Outcome],
     *,
     algorithm: str = "REFINED",
+    free_intrinsics: bool = False,
 ) -> Outcome:
     """Open a session file or a bag, solve it, and go on; what a bag lacks for that is told with its stills.
 
     Raises:
         OpenArmError: What is wrong with the file or the options; DEGENERATE, when a session determines nothing.
     """
-    from openarm_calibration.offline import calibrate, checked_algorithm, without_named
+    from openarm_calibration.offline import REFINED, calibrate, checked_algorithm, without_named
+    from openarm_calibration.solve import SolveConfig
 
-    checked_algorithm(algorithm)
+    name = checked_algorithm(algorithm)
+    if free_intrinsics and name != REFINED:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--free-intrinsics: only {REFINED} finds intrinsics, not {name}")
+    config = SolveConfig(extras=("intrinsics",)) if free_intrinsics else None
     stills: list[dict[str, Any]] = []
     text = ""
     if source.is_dir() or source.suffix == ".mcap":
@@ -81,7 +86,7 @@ def with_solved(
     without_named(samples, exclude)
     stored = stored_of(samples, store)
     try:
-        result = calibrate(samples, algorithm=algorithm, session=digest, created=now(), stored=stored)
+        result = calibrate(samples, algorithm=name, config=config, session=digest, created=now(), stored=stored)
     except OpenArmError as error:
         if not stills:
             raise

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -53,6 +53,7 @@ class Result:
             "checks": {check.name: check.ratio for check in self.verdict.checks},
             "figures": self.verdict.figures,
             "methods": self.methods,
+            "intrinsics": asdict(self.solution.problem.intrinsics[0]),
             "calibration": self.calibration.model_dump(mode="json"),
         }
 
@@ -94,7 +95,23 @@ def calibrate(
     """
     name = checked_algorithm(algorithm)
     solution = solve(samples.problem(), config)
+    if "intrinsics" in solution.estimate.extras:
+        solution = _with_found_intrinsics(solution)
     return judged(samples, solution, algorithm=name, limits=limits, session=session, created=created, stored=stored)
+
+
+def _with_found_intrinsics(solution: Solution) -> Solution:
+    """The same answer with the intrinsics that were found in place of those that were stated."""
+    estimate, problem = solution.estimate, solution.problem
+    if estimate.intrinsics is None:
+        return solution
+    found = [
+        replace(stated, fx=stated.fx + float(d[0]), fy=stated.fy + float(d[1]), cx=stated.cx + float(d[2]),
+                cy=stated.cy + float(d[3]))
+        for stated, d in zip(problem.intrinsics, estimate.intrinsics, strict=True)
+    ]  # fmt: skip
+    settled = replace(estimate, intrinsics=np.zeros_like(estimate.intrinsics))
+    return replace(solution, problem=problem.with_intrinsics(found), estimate=settled)
 
 
 def judged(

@@ -113,6 +113,10 @@ class Problem:
         views = tuple(self.views[i] for i in chosen)
         return _pack(views, self.intrinsics, self.free[chosen], self.free_cost[chosen])
 
+    def with_intrinsics(self, intrinsics: Sequence[Intrinsics]) -> Problem:
+        """The same views by cameras of other intrinsics."""
+        return assemble(self.views, intrinsics, list(self.free))
+
     def with_poses(self, A: Array) -> Problem:
         """The same views with other robot poses (n, 4, 4)."""
         views = tuple(replace(view, A=a) for view, a in zip(self.views, A, strict=True))

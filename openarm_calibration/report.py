@@ -49,6 +49,11 @@ def summary(result: Result) -> str:
         f" {f['five_fold'] * 1e3:.3f} mm, {f['five_fold_px']:.3f} px (five folds)",
         f"board scale  {f['scale']:.5f} ± {f['scale_sigma']:.5f}    condition {f['condition']:.2g}",
     ]
+    if "intrinsics" in result.solution.estimate.extras:
+        k = result.solution.problem.intrinsics[0]
+        lines.append(
+            f"intrinsics   fx {k.fx:.2f}  fy {k.fy:.2f}  cx {k.cx:.2f}  cy {k.cy:.2f} px, found with the mount"
+        )
     if "drift" in f:
         lines.append(f"from stored  {f['drift'] * 1e3:.2f} mm, {math.degrees(f['drift_rotation']):.3f}°")
     lines += [f"outlier      {name}: {reason}" for name, reason in f["outliers"].items()]

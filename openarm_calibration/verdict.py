@@ -93,6 +93,8 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
         left = problem.subset(used[out])
         T, _ = chain(left, estimate.X, estimate.Z, np.zeros((len(left), 6)))
         rows = left.camera_rows()
+        if estimate.intrinsics is not None:
+            rows = rows + estimate.intrinsics[left.camera]
         for k, view in enumerate(left.views):
             away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
             px = float(np.mean(np.sum(away**2, axis=1)))

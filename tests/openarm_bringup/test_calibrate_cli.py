@@ -13,6 +13,7 @@ from openarm_bringup import calibration_run, cli
 from openarm_calibration.client import AutoResult
 from openarm_calibration.synthetic_session import make_session
 from openarm_common import se3
+from openarm_common.cameras import T_LINK_OPTICAL
 from openarm_common.errors import Code, OpenArmError
 
 
@@ -76,6 +77,27 @@ def test_a43_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) ->
     assert "mm" in out
 
 
+def test_wrong_intrinsics_are_found_with_the_mount(capsys, tmp_path: Path) -> None:
+    """A camera_info 3 % off fails by name; with free intrinsics the right ones and the true mount come out."""
+    known = make_session("in_hand", 15)
+    head = known.samples.head
+    width, height, fx, fy, cx, cy = head.intrinsics
+    known.samples.head = head.model_copy(update={"intrinsics": (width, height, 1.03 * fx, 1.03 * fy, cx, cy)})
+    path = tmp_path / "wrong.npz"
+    known.samples.save(path)
+    code, _, err = run(capsys, "solve", str(path))
+    assert code == 1
+    assert "are these its intrinsics?" in err
+    code, out, err = run(capsys, "solve", str(path), "--free-intrinsics", "--json")
+    assert code == 0, err
+    data = json.loads(out)
+    assert data["grade"] == "pass", data["reasons"]
+    assert data["intrinsics"]["fx"] == pytest.approx(fx, rel=2e-3)
+    true = (known.X @ se3.inverse(T_LINK_OPTICAL))[:3, 3]
+    assert data["calibration"]["position"] == pytest.approx(true, abs=1e-3)
+    assert "fx " in run(capsys, "solve", str(path), "--free-intrinsics")[1]
+
+
 def test_a45_a_stored_file_that_would_run_something_is_told_and_not_run(capsys, tmp_path: Path) -> None:
     """Also one that is cut short, and one whose name is a trick."""
     store = tmp_path / "store"
@@ -102,6 +124,7 @@ def test_a45_a_stored_file_that_would_run_something_is_told_and_not_run(capsys, 
         (["solve"], 2, "samples"),
         (["solve", "nowhere.npz"], 1, "does not exist"),
         (["solve", "SESSION", "--algorithm", "tsay"], 2, "algorithms: REFINED, TSAI"),
+        (["solve", "SESSION", "--algorithm", "park", "--free-intrinsics"], 2, "only REFINED finds intrinsics"),
         (["solve", "SESSION", "--exclude", "s999"], 2, "samples: s001"),
         (["solve", __file__], 1, "is no session file"),
         (["solve", "SESSION", "--store", "SESSION"], 2, "is a file, expected a folder"),
@@ -178,7 +201,9 @@ def result(camera: str, **more) -> AutoResult:
         ({"overhead": result("overhead")}, OpenArmError(Code.CANCELLED, "stopped"), 1, "CANCELLED: stopped"),
     ],
 )  # fmt: skip
-def test_auto_tells_what_came_out(capsys, tmp_path: Path, monkeypatch, results, error, code: int, words: str) -> None:
+def test_b15_auto_takes_the_fixed_camera_first_and_tells_what_came_out(
+    capsys, tmp_path: Path, monkeypatch, results, error, code: int, words: str
+) -> None:
     """Exit code and sentence follow the worst camera; pages are written of the sessions that there are."""
     asked: list[calibration_run.CalibrationOptions] = []
 
