@@ -28,7 +28,7 @@ PATH=$env/bin:$PATH
 export PATH
 
 say "copy of the tree in $work/ws/src"
-rm -rf "$work/ws/src"
+rm -rf "$work/ws"
 mkdir -p "$work/ws/src/openarm"
 git -C "$root" archive HEAD | tar -x -C "$work/ws/src/openarm"
 

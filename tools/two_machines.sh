@@ -97,7 +97,7 @@ fi
 up "$one" control
 up "$two" vision
 for topic in /joint_states /overhead/depth/image_raw; do
-    (on "$two" "$openarm" topic hz "$topic" --seconds 5 --json "$out/$(basename "$(dirname "$topic")")_$(basename "$topic").json") || :
+    (on "$two" "$openarm" topic hz "$topic" --seconds 5 --json "$out/$(echo "$topic" | tr / _).json") || :
 done
 (on "$one" "$openarm" pick red --json "$out/two.json") || :
 
@@ -111,7 +111,7 @@ out = Path(sys.argv[1])
 one, two = (json.loads((out / f"{name}.json").read_text()) for name in ("one", "two"))
 for name, answer in (("one host", one), ("two hosts", two)):
     print(f"{name}: {answer['code']}: {answer['message']} (place {answer.get('place_position')})")
-for path in sorted(out.glob("*_*.json")):
+for path in sorted(out.glob("_*.json")):
     link = json.loads(path.read_text())
     print(
         f"{link['topic']}: {link['rate_hz']:.1f} Hz, {link['lost']} of {link['messages'] + link['lost']} lost, "

@@ -72,16 +72,16 @@ Starter = Callable[..., Up]
 
 @pytest.fixture(scope="module")
 def start_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Starter]:
-    """A function that starts a graph; all of them are stopped at the end of the module."""
+    """A function that starts a graph, in the domain of another when asked; all are stopped at the end of the module."""
     started: list[Up] = []
 
-    def start(*args: str) -> Up:
+    def start(*args: str, beside: Up | None = None) -> Up:
         folder = tmp_path_factory.mktemp("graph")
-        domain = reserve_domain()
+        domain = beside.domain if beside else reserve_domain()
         env = {
             **os.environ,
             "OPENARM_RUNS": str(folder / "runs"),
-            "XDG_RUNTIME_DIR": str(folder),
+            "XDG_RUNTIME_DIR": beside.env["XDG_RUNTIME_DIR"] if beside else str(folder),
             "ROS_DOMAIN_ID": str(domain),
             "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH", "")))),
         }

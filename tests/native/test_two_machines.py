@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A-05, P-32: the graph split over two hosts gives the same grasp as on one. Two minutes, as root: OPENARM_TWO_MACHINES=1."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.skipif(
+    os.geteuid() != 0 or shutil.which("ip") is None or not os.environ.get("OPENARM_TWO_MACHINES"),
+    reason="needs root, iproute2 and two minutes; set OPENARM_TWO_MACHINES=1",
+)
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("mode", ["multicast", "server"])
+def test_a05_perception_and_control_on_two_hosts_place_the_object_as_one_does(mode: str, tmp_path: Path) -> None:
+    command = [str(ROOT / "tools" / "two_machines.sh"), mode, str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    one, two = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("one", "two"))
+    assert one["success"]
+    assert two["success"]
+    assert two["place_position"] == pytest.approx(one["place_position"], abs=0.01)
+    assert two["arm"] == one["arm"]
+    states = json.loads((tmp_path / "_joint_states.json").read_text())
+    assert states["lost"] == 0
