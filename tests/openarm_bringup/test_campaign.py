@@ -148,8 +148,8 @@ def test_n03_n05_a_nudged_object_is_looked_for_again_and_placed(tmp_path) -> Non
 
 
 def test_n03_a_gap_of_joint_states_while_the_hand_is_read_is_waited_out(tmp_path) -> None:
-    task = make_task("faults", 10090)
-    assert task.kind == "joint_states_gap"
+    tasks = (make_task("faults", seed) for seed in range(10000, 10100))
+    task = next(task for task in tasks if task.kind == "joint_states_gap")
     found = trials(task, tmp_path).run()
     assert found["placed"], found["message"]
 
