@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A-05, P-32: the graph split over two hosts gives the same grasp as on one. Two minutes, as root: OPENARM_TWO_MACHINES=1."""
+"""The graph split over two hosts gives the same grasp as on one. Two minutes, as root: OPENARM_TWO_MACHINES=1."""
 
 from __future__ import annotations
 
