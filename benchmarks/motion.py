@@ -164,7 +164,7 @@ def _through_ros(planner: str, count: int) -> list[float]:
     from benchmarks.motion_ros import Client
 
     environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    parameters = ["scene:=demo", "map.use:=off", f"planning.planner:={planner}"]
+    parameters = ["scene:=demo", f"planning.planner:={planner}"]
     command = [sys.executable, "-m", "openarm_motion.node", "--ros-args", *(x for p in parameters for x in ("-p", p))]
     arms, home = arms_and_home()
     node = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
