@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm view` as a user runs it."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def start(port: str, folder: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "openarm_bringup.cli", "view", "--port", port]
+    env = {**os.environ, "XDG_RUNTIME_DIR": str(folder)}  # a graph that runs on this machine is not found
+    return subprocess.Popen(command, env=env, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+
+
+def test_it_prints_an_address_that_opens_and_ends_with_ctrl_c(tmp_path: Path) -> None:
+    first = start("0", tmp_path)
+    assert first.stderr is not None
+    try:
+        printed = re.search(r"the page is at (http://127\.0\.0\.1:(\d+)/)(\?token=[\w-]{32})$", first.stderr.readline())
+        assert printed is not None
+        with urllib.request.urlopen(printed[1] + printed[3], timeout=10.0) as page:
+            assert "<title>OpenArm</title>" in page.read().decode()
+        try:
+            urllib.request.urlopen(printed[1], timeout=10.0)
+            status = 200
+        except urllib.error.HTTPError as error:
+            status = error.code
+        assert status == 403
+
+        second = start(printed[2], tmp_path)
+        said = second.communicate(timeout=60.0)[1]
+        assert second.returncode == 1
+        assert f"can't listen on 127.0.0.1:{printed[2]}" in said
+        assert "--port" in said
+    finally:
+        first.send_signal(signal.SIGINT)
+        assert first.wait(timeout=30.0) == 0
