@@ -53,7 +53,7 @@ def train(
     *,
     data: Path = DATA,
     out: Path = RUN,
-    steps: int = 5500,
+    steps: int = 7000,
     rate: float = 2e-3,
     batch: int = 16,
     threads: int = 1,

@@ -33,7 +33,7 @@ _KEEP = 100
 class FitConfig(Config):
     """How to train."""
 
-    steps: int = Field(default=5500, ge=1, description="batches")
+    steps: int = Field(default=7000, ge=1, description="batches")
     batch: int = Field(default=16, ge=1, le=256, description="pictures a batch")
     width: int = Field(default=320, ge=64, le=1280, multiple_of=32, description="of a crop, pixels")
     height: int = Field(default=256, ge=64, le=1280, multiple_of=32, description="of a crop, pixels")
