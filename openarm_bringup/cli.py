@@ -33,6 +33,7 @@ def build_app() -> App:
         calibrate_cli,
         campaign_cli,
         checks_cli,
+        completion_cli,
         demo_cli,
         detector_cli,
         doctor_cli,
@@ -78,6 +79,7 @@ def build_app() -> App:
         app.command(group)
     app.command(grasp_cli.app)
     app.command(calibrate_cli.app)
+    app.command(completion_cli.completion_of(app))
     app.command(detector_cli.app)
     return app
 

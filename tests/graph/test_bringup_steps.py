@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import rclpy
 from control_msgs.action import ParallelGripperCommand
@@ -15,9 +18,13 @@ from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState, PointCloud2
 from vision_msgs.msg import Detection3DArray
 
+from openarm_bringup.bag import open_bag
+from openarm_common.convert import points_from_cloud
+from openarm_common.description import RobotDescription
 from openarm_common.scene import load_scene
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow]
@@ -118,3 +125,31 @@ def test_b66_step_3_an_arm_moves_to_a_posture_without_eyes(start_graph: Any) -> 
         )
         assert home.success, f"{home.code}: {home.message}"
     assert up.stop() == 0
+
+
+def test_a77_b66_the_map_shows_the_objects_and_not_the_arms_and_the_step_is_recorded(
+    start_graph: Any, tmp_path: Path
+) -> None:
+    """The step between eyes and hands, and what a recording of it holds."""
+    up = start_graph("map")
+    up.wait_ready()
+    bag = tmp_path / "step"
+    topics = "/joint_states|/robot_description|/tf_static|/octomap_point_cloud_centers"
+    done = up.openarm("record", str(bag), "--topics", topics, "--duration", "6", "--json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert up.stop() == 0
+    told = json.loads(done.stdout)
+    assert told["lost"] == 0
+    assert set(told["topics"]) == set(topics.split("|"))
+    with open_bag(bag) as recorded:
+        newest = {record.topic: record.data for record in recorded.records()}
+    cells = points_from_cloud(deserialize_message(newest["/octomap_point_cloud_centers"], PointCloud2))
+    for item in load_scene("demo").objects:
+        x, y = item.position[:2]
+        beside = np.hypot(cells[:, 0] - x, cells[:, 1] - y) < 0.04
+        assert cells[beside, 2].max() > load_scene("demo").table.top_z + 0.03, item.name
+    state = deserialize_message(newest["/joint_states"], JointState)
+    joints = dict(zip(state.name, state.position, strict=True))
+    for side in ("left", "right"):
+        hand = RobotDescription.load().link_pose(f"openarm_{side}_hand", joints)[:3, 3]
+        assert np.linalg.norm(cells - hand, axis=1).min() > 0.05

@@ -245,3 +245,17 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
     assert done.stdout.rstrip().endswith("[]")
     # CPU time, not the clock: tests run beside other work. It takes 0.4 s.
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.0
+
+
+def test_the_shell_completes_commands_and_choices(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["completion", "bash"]) == 0
+    script = tmp_path / "openarm.bash"
+    script.write_text(capsys.readouterr().out)
+    ask = f"source {script}; spec=$(complete -p openarm); f=${{spec#*-F }}; f=${{f%% *}}; "
+    for words, expected in (("openarm topic", "topic"), ("openarm topic ec", "echo"), ("openarm param du", "dump")):
+        last = len(words.split()) - 1
+        line = f"COMP_WORDS=({words}); COMP_CWORD={last}; COMP_LINE='{words}'; COMP_POINT={len(words)}; $f; "
+        done = subprocess.run(
+            ["bash", "-c", ask + line + 'echo "${COMPREPLY[@]}"'], capture_output=True, text=True, check=True
+        )
+        assert expected in done.stdout.split(), (words, done.stdout, done.stderr)
