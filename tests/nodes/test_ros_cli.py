@@ -76,7 +76,10 @@ def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsy
     assert "data: ready" in capsys.readouterr().out
     assert cli.run(["topic", "echo", "status", "-n", "1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["messages"] == [{"data": "ready"}], "JSON, and nothing else"
-    assert 20.0 < ros_cli.hz("/ticks", seconds=1.0).data["rate_hz"] < 80.0
+    measured = ros_cli.hz("/ticks", seconds=1.0).data
+    assert 20.0 < measured["rate_hz"] < 80.0
+    assert measured["lost"] == 0
+    assert 0.0 <= measured["delay_median_ms"] <= measured["delay_max_ms"] < 5000.0
     assert ros_cli.pub("/talk", "{data: hello}", count=2, rate=20.0).success
     deadline = time.monotonic() + 5.0
     while len(heard) < 2 and time.monotonic() < deadline:
@@ -87,7 +90,8 @@ def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsy
 
 
 def test_services_and_actions_are_called_and_the_exit_code_follows_the_answer(heard: list[str]) -> None:
-    assert ros_cli.service_list().data["services"]["/pause"] == "openarm_interfaces/srv/SetPause"
+    assert ros_cli.service_list().data["services"] == {"/pause": "openarm_interfaces/srv/SetPause"}
+    assert "/probe/set_parameters" in ros_cli.service_list(all_=True).data["services"]
     assert ros_cli.call("/pause", "{paused: true}").exit_code == 0
     refused = ros_cli.call("pause", "{paused: false}")
     assert (refused.exit_code, refused.message) == (1, "only true is taken")
