@@ -83,9 +83,11 @@ def detections_3d(located: Sequence[Detection3D], frame_id: str, t_ns: int) -> D
 
 def names_of(detection: Detection3D) -> tuple[str, ...]:
     """What an object may be called, its label first, then its shape: told by a network, else by its outline."""
-    shape = detection.source.kind or {"rectangle": "box", "circle": "cylinder"}.get(detection.method, "")
-    if detection.score == 0.0:  # not measured
-        shape = detection.source.kind
+    shape = detection.source.kind
+    if detection.score > 0.0:
+        outline = {"rectangle": "box", "circle": "cylinder"}.get(detection.method, "")
+        # no box has a round outline; that of a cylinder that lies is a rectangle
+        shape = outline if shape == "" or (shape, outline) == ("box", "cylinder") else shape
     names = (detection.label, kind_of(shape, detection.size), shape)
     return tuple(dict.fromkeys(name for name in names if name))
 

@@ -155,9 +155,10 @@ def cut_out(box: Detection2D, view: View, localizer: Localizer) -> Detection2D |
     core &= standing & (solid if (solid & core).any() else True)
     if not core.any():
         return None
-    mask = _largest(standing & _alike(view.rgb[rows, columns], core))
-    if mask.sum() < 0.3 * standing.sum():  # of more than one colour: depth alone says what it is
-        mask = _largest(standing)
+    alike = _alike(view.rgb[rows, columns], core)
+    plain = np.count_nonzero(alike & core) >= 0.5 * np.count_nonzero(core)
+    # what is of many colours is told from its surroundings by depth alone
+    mask = _largest(standing & alike if plain else standing)
     return _detection(mask, (columns.start, rows.start), (width, height), box.label, box.score, kind=box.label)
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 from pydantic import Field
 
@@ -205,7 +204,14 @@ def model_path(model: str) -> Path:
     return path
 
 
-def _open(path: Path) -> onnxruntime.InferenceSession:
+def _open(path: Path) -> Any:
+    """A session of onnxruntime, which is imported here alone: who sees by colour does without."""
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise OpenArmError(
+            Code.ENVIRONMENT, f"network {path} needs onnxruntime, which is not installed: pip install onnxruntime"
+        ) from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # cores are for the other nodes
     options.log_severity_level = 4  # what is wrong is told by the exception

@@ -28,7 +28,7 @@ class Scores:
     """Figures of one set.
 
     Attributes:
-        map50: Mean over the classes of the average precision at an overlap of one half.
+        map50: Mean over the classes that are there of the average precision at an overlap of one half.
         map: The same, mean over overlaps from 0.5 to 0.95.
         ap50: By class.
         any50: Average precision when the class does not matter.
@@ -58,6 +58,8 @@ class Scores:
 def score(found: Sequence[Candidates], truth: Sequence[Truth], classes: int) -> Scores:
     """Figures of detections (score 0.05 and up) of pictures, and what is in these."""
     ap = np.array([_average_precision(found, truth, kind) for kind in range(classes)])
+    there = [any((kinds == kind).any() for kinds, _ in truth) for kind in range(classes)]
+    counted = ap[there] if any(there) else ap
     anything = [Candidates(np.zeros_like(f.classes), f.scores, f.boxes) for f in found]
     any50 = _average_precision(anything, [(np.zeros_like(kinds), boxes) for kinds, boxes in truth], 0)[0]
     confusion = np.zeros((classes + 1, classes + 1), np.int64)
@@ -66,8 +68,8 @@ def score(found: Sequence[Candidates], truth: Sequence[Truth], classes: int) -> 
         errors += _confuse(candidates, kinds, boxes, confusion)
     right, shown, objects = int(np.trace(confusion)), int(confusion[:, :-1].sum()), int(confusion[:-1].sum())
     return Scores(
-        map50=float(ap[:, 0].mean()),
-        map=float(ap.mean()),
+        map50=float(counted[:, 0].mean()),
+        map=float(counted.mean()),
         ap50=tuple(float(value) for value in ap[:, 0]),
         any50=float(any50),
         centre_median_px=float(np.median(errors)) if errors else float("nan"),

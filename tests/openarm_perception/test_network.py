@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -123,6 +125,13 @@ def test_missing_and_damaged_files_are_refused_by_name(tmp_path) -> None:
     with pytest.raises(OpenArmError, match=r"half\.onnx \(200 bytes\) is damaged or no ONNX file") as caught:
         NetworkDetector(NetworkConfig(model=str(path)))
     assert caught.value.code is Code.CONFIG_INVALID
+
+
+def test_without_onnxruntime_networks_are_refused_and_say_what_to_install(tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(OpenArmError, match="needs onnxruntime, which is not installed") as caught:
+        make(tmp_path, boxes())
+    assert caught.value.code is Code.ENVIRONMENT
 
 
 def test_b28_images_of_another_kind_are_refused(tmp_path) -> None:
