@@ -75,12 +75,16 @@ def test_mass_follows_from_the_volume_where_none_is_given() -> None:
     assert SceneObject(**cube()).mass_kg == pytest.approx(0.05**3 * 700)
     can = SceneObject(**cube(shape="cylinder", size=[0.066, 0.066, 0.115]))
     assert can.volume == pytest.approx(np.pi * 0.033**2 * 0.115)
+    ball = SceneObject(**cube(shape="sphere"))
+    assert ball.volume == pytest.approx(4.0 / 3.0 * np.pi * 0.025**3)
+    assert np.hypot(*(ball.outline() - ball.position[:2]).T) == pytest.approx(0.025)
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({"shape": "ball"}, "objects.0.shape: .*unknown shape; shapes: box, cylinder, sphere, got 'ball'"),
+        ({"shape": "sphere", "size": [0.05, 0.05, 0.06]}, "objects.0: .*a sphere has one diameter"),
         ({"color": "pink"}, "objects.0.color: .*colours: red, orange, yellow, green, blue, purple, got 'pink'"),
         ({"size": [0.05, 0.05, 0.31]}, "objects.0.size: .*too large .*0.01 .. 0.3 m"),
         ({"size": [0.05, 0.05, 0.001]}, "objects.0.size: .*too small"),
