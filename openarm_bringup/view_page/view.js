@@ -190,7 +190,7 @@ function drawDetections() {
   boxes.forEach((box, i) => {
     const [name, score] = labels.children[i].children;
     name.textContent = box.label;
-    score.textContent = `${Math.round(100 * box.score)} %`;
+    score.textContent = box.score > 0 ? `${Math.round(100 * box.score)} %` : "not measured"; // in the way, no more
     labels.children[i].title = `${box.size.map((v) => (100 * v).toFixed(1)).join(" × ")} cm`;
   });
   markChosen(asking.label);
