@@ -11,7 +11,6 @@ def test_without_calibration_the_grasp_of_a_narrow_box_misses_and_with_it_it_hol
     without, calibrated = compare("narrow", "red", 1, shipped_mounts())
     assert not without["placed"]
     assert any("never lifted" in reason for reason in without["reasons"])
-    assert without["attempts"] > 1
     assert not without["false_success"]
     assert calibrated["placed"]
     assert calibrated["attempts"] == 1
