@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Mapping, Sequence
+from copy import copy
 from typing import Any, TypeVar
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from openarm_bringup.campaign_planner import arms_behind, boxes_of, request_of
 from openarm_bringup.campaign_robot import SimRobot
+from openarm_bringup.campaign_traffic import Traffic
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.held import HeldBox
@@ -23,7 +25,7 @@ from openarm_grasp.performer import check_deadline
 from openarm_motion import moves
 from openarm_motion.approach import plan_approach
 from openarm_motion.arm import Arm, Situation
-from openarm_motion.checks import Motion, check_against_others, check_trajectory
+from openarm_motion.checks import check_trajectory
 from openarm_motion.collision import Box
 from openarm_motion.memory import HeldMemory
 from openarm_motion.trajectory import Trajectory
@@ -60,15 +62,23 @@ class DirectLink:
         table = robot.scene.table
         self._arms = arms_behind(table.top_z, table.centre, table.extents)
         self._held = HeldMemory()
-        self._running: dict[str, tuple[Motion, int]] = {}
+        self._traffic = Traffic(self._arms)
         self.planning_s: list[float] = []
         self.warnings: list[str] = []
         self.cancelled = ""
         self.deadline_ns = 0
+        #: Longest rest before a motion until the other arm leaves room, s; 0: both never move at once.
+        self.max_wait = 0.0
         #: So many plans find no way, on purpose.
         self.plans_to_fail = 0
         #: Called after each tick; what it raises ends what is waited for.
         self.watch: Callable[[], None] = lambda: None
+
+    def beside(self, max_wait: float) -> DirectLink:
+        """Another link to the same robot, for an arm that moves while another does."""
+        link = copy(self)
+        link.max_wait = max_wait
+        return link
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
         """Carry out a coroutine of this link, one tick a turn."""
@@ -214,7 +224,8 @@ class DirectLink:
         return {arm: float(best.position_error)}
 
     def _situation(self, arm: Arm, start: Sequence[float] | Array = ()) -> Situation:
-        return arm.situation(self.robot.states.latest()[1], list(start), self._config.velocity_scale)
+        state = self._traffic.arrived(arm.name, self.robot.states.latest()[1])
+        return arm.situation(state, list(start), self._config.velocity_scale)
 
     async def pass_time(self, seconds: float) -> None:
         """Let simulated time pass."""
@@ -242,33 +253,33 @@ class DirectLink:
 
     async def _follow(self, arm: Arm, plan: Trajectory, what: str, guard: Callable[[], None] | None) -> None:
         robot, state = self.robot, self.robot.states.latest()[1]
-        motion = check_trajectory(arm, plan.names, plan.t, plan.q, plan.v, state)
-        others = [
-            Motion(m.names, m.t - (robot.t_ns - since) * 1e-9, m.q)
-            for name, (m, since) in self._running.items()
-            if name != arm.name
-        ]
-        check_against_others(arm, motion, state, others)
-        held = self._held.expected(arm.name, motion)
-        if held is not None:
-            self._hold(arm, held)
+        motion = check_trajectory(arm, plan.names, plan.t, plan.q, plan.v, state, plan.a)
+        expected, known = self._held.expected(arm.name, motion), self._held.held
+        boxes = {**known, arm.name: known.get(arm.name, ()) if expected is None else expected}
+        wait = self._traffic.room(arm, motion, robot.t_ns, state, boxes, self.max_wait)
+        if expected is not None:
+            self._hold(arm, expected)
         follower = robot.controller.arms[arm.name]
         ends: list[TrajectoryOutcome] = []
-        checked = follower.check(FollowedTrajectory(tuple(plan.names), plan.t, plan.q, plan.v, plan.a))
-        measured = robot.world.read_joints().position[robot.columns(arm.names)]
-        follower.start(checked, robot.t_ns, measured, ends.append)
-        self._running[arm.name] = (motion, robot.t_ns)
+        start_ns = robot.t_ns + round(wait * 1e9)
+        self._traffic.enter(arm.name, motion, start_ns)
         try:
-            await self.until(lambda: bool(ends), motion.duration + arm.config.execution.overtime, what, guard)
+            await self.until(lambda: robot.t_ns >= start_ns, wait + 1.0, what, guard)
+            checked = follower.check(FollowedTrajectory(tuple(plan.names), plan.t, plan.q, plan.v, plan.a))
+            measured = robot.world.read_joints().position[robot.columns(arm.names)]
+            follower.start(checked, robot.t_ns, measured, ends.append)
+            limit = motion.duration + arm.config.execution.overtime
+            await self.until(lambda: bool(ends), limit, what, lambda: self._traffic.look_out(arm.name, guard))
         except OpenArmError:
             follower.cancel()
-            for _ in range(100):
+            for _ in range(100 if robot.t_ns > start_ns else 0):
                 if ends:
                     break
                 await _Turn()
             raise
         finally:
-            del self._running[arm.name]
+            arrived = bool(ends) and ends[0].end is End.SUCCEEDED
+            self._traffic.leave(arm.name, robot.t_ns, robot.states.latest()[1], arrived=arrived)
         if ends[0].end is not End.SUCCEEDED:
             raise OpenArmError(Code.EXECUTION_FAILED, f"controller of the {arm.name} arm: {ends[0].text}")
 

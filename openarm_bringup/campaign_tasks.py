@@ -60,6 +60,7 @@ class Task:
         posture: Joints that start elsewhere than at home, rad by name.
         clear: Labels that come more than once are so many objects: what was placed stays where it is.
         route: By which it must come to its place, as `GraspOutcome.route`; "": any.
+        together: Both labels are asked for at once, of both arms.
     """
 
     set_name: str
@@ -75,6 +76,7 @@ class Task:
     posture: Mapping[str, float] = field(default_factory=dict[str, float])
     clear: bool = False
     route: str = ""
+    together: bool = False
 
     @property
     def possible(self) -> bool:
@@ -128,6 +130,8 @@ def sets() -> Mapping[str, Callable[[int], Task]]:
         "faults": campaign_faults.fault_task,
         "handover": campaign_two_arms.handover_task,
         "push": campaign_two_arms.push_task,
+        "pairs": campaign_two_arms.pair_task,
+        "pairs_in_turn": campaign_two_arms.in_turn_task,
     }
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_bringup import campaign_record
+from openarm_bringup.campaign_gap import LEAST_GAP, ArmGap
 from openarm_bringup.campaign_link import DirectLink
 from openarm_bringup.campaign_robot import SimRobot, SimulatedSenses
 from openarm_bringup.campaign_tasks import MISSES, PLAN_FAILS, Task
 from openarm_bringup.judge import JudgeConfig, Sample, Verdict, at_rest, judge
 from openarm_bringup.report import scene_hash
 from openarm_bringup.trial import Trial
+from openarm_common.description import Side
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import GraspOutcome, GraspRequest
@@ -28,12 +30,15 @@ from openarm_grasp.legs import run_task
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.orders import Ask, Order
-from openarm_grasp.performer import Performer
+from openarm_grasp.pair import PairRunner
+from openarm_grasp.performer import Link, Performer
 from openarm_grasp.routing import ARMS
 from openarm_sim_bridge.faults import checked_fault
 
 Array = NDArray[np.float64]
 
+#: An arm rests no longer than this before a motion until the other leaves room, s.
+_MOST_WAIT_S = 20.0
 _SETTLE_S = 0.5
 _REST_LIMIT_S = 5.0
 #: Directions that a push tries before something stands in its way on every side.
@@ -94,9 +99,15 @@ class Trials:
         began = time.monotonic()
         self.robot.pass_time(_SETTLE_S)
         self._begin_fault("")
-        trials = self._all_in_turn()
+        gap = ArmGap(self.robot) if self._task.set_name.startswith("pairs") else None
+        began_ns = self.robot.t_ns
+        trials = self._both() if self._task.together else self._all_in_turn()
         row = row_of(self._task, trials, time.monotonic() - began)
         row["again"] = self._again
+        if gap is not None:
+            row["arm_gap_mm"] = round(1e3 * gap.least, 1)
+            row["as_expected"] = bool(row["as_expected"] and gap.least >= LEAST_GAP)
+            row["sim_s"] = round((self.robot.t_ns - began_ns) * 1e-9, 2)
         row["planning_ms_median"] = round(1e3 * float(np.median(self.link.planning_s or [math.nan])), 1)
         if self._keep is not None and not row["as_expected"]:
             self._keep.write(row, [step.__dict__ for step in self.steps])
@@ -135,15 +146,41 @@ class Trials:
         wall_s = time.monotonic() - began
         outcome = result if isinstance(result, GraspOutcome) else GraspOutcome(result.code, result.message, ask.label)
         self._stands = outcome.place_position
+        return self._trial(outcome, self.steps[first:], wall_s)
+
+    def _both(self) -> list[Trial]:
+        """Ask for two objects at once, of both arms."""
+        robot, task = self.robot, self._task
+        began = time.monotonic()
+        second = GraspMachine(self.machine.around)
+        steps: dict[int, list[Step]] = {id(self.machine): [], id(second): []}
+
+        def tell(machine: GraspMachine) -> None:
+            self._tell(machine)
+            steps[id(machine)].append(self.steps[-1])
+
+        links: dict[Side, Link] = {arm: self.link.beside(_MOST_WAIT_S) for arm in ARMS}
+        pair = PairRunner((self.machine, second), links, (self.link, self.performer), self._config, tell)
+        robot.pass_time(0.1)
+        outcomes: Sequence[GraspOutcome]
+        try:
+            outcomes = self.link.run(pair.run((GraspRequest(task.labels[0]), GraspRequest(task.labels[1]))))
+        except OpenArmError as error:
+            outcomes = [GraspOutcome(error.code, error.message, label) for label in task.labels]
+        wall_s = 0.5 * (time.monotonic() - began)
+        return [self._trial(outcome, mine, wall_s) for outcome, mine in zip(outcomes, steps.values(), strict=True)]
+
+    def _trial(self, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
+        """What came of a request, judged."""
+        task = self._task
+        ends = [*(step.t_ns for step in steps[1:]), self.robot.t_ns]
         target, verdict = self._judge(outcome)
-        steps = self.steps[first:]
-        ends = [*(step.t_ns for step in steps[1:]), robot.t_ns]
         return Trial(
             seed=task.seed,
             scene=task.scene.name,
             scene_hash=scene_hash(task.scene),
             target=target,
-            label=ask.label,
+            label=outcome.label,
             arm=outcome.arm,
             attempts=outcome.attempts,
             claimed=outcome.success,
@@ -152,7 +189,7 @@ class Trials:
             verdict=verdict,
             states=tuple(
                 (step.state, (end - step.t_ns) * 1e-9, step.attempt, step.reason)
-                for step, end in zip(steps, ends, strict=True)
+                for step, end in zip(steps, ends, strict=bool(steps))
                 if step.state != "IDLE"
             ),
             sim_s=(steps[-1].t_ns - steps[0].t_ns) * 1e-9 if steps else 0.0,
@@ -161,8 +198,8 @@ class Trials:
         )
 
     # --- while it runs
-    def _tell(self) -> None:
-        machine = self.machine
+    def _tell(self, machine: GraspMachine | None = None) -> None:
+        machine = machine or self.machine
         step = Step(
             self.robot.t_ns, machine.state.value, machine.previous.value, machine.reason, machine.attempt, machine.arm
         )

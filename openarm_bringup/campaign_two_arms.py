@@ -7,6 +7,7 @@ Base frame, m; all is drawn from the seed. `Task.route` says by which way the ob
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,8 +24,8 @@ from openarm_grasp.observation import Detection
 from openarm_grasp.rehearsal import NO_WAY
 from openarm_motion.approach import plan_approach
 
-#: Objects of the hand-over stand, and are wanted, at least so far on one arm's side, m.
-_ASIDE = 0.20
+#: Objects of the hand-over stand, and are wanted, at least so far on one arm's side: the other reaches over to 0.21, m.
+_ASIDE = 0.26
 #: Between the middles of a place and any object, m.
 _ROOM = 0.13
 #: Where objects are looked for that no arm can grasp and a hand comes behind: before the robot, between the arms.
@@ -41,12 +42,30 @@ def handover_task(seed: int) -> Task:
         if abs(first.position[1]) < _ASIDE or any(abs(p[1]) < 0.16 for p in others):
             continue
         side = -np.sign(first.position[1])
-        place = np.array([rng.uniform(0.18, 0.34), side * rng.uniform(_ASIDE, 0.38)]).round(3)
+        place = np.array([rng.uniform(0.18, 0.34), side * rng.uniform(_ASIDE, 0.40)]).round(3)
         if all(np.linalg.norm(place - p) >= _ROOM for p in others):
             break
     named = scene.model_copy(update={"name": f"handover_{seed}"})
     xy = (float(place[0]), float(place[1]))
     return Task("handover", seed, named, (first.label,), kind="handover", place=xy, route="hand_over")
+
+
+def pair_task(seed: int) -> Task:
+    """Two objects, one for each arm, asked for at once; up to two others stand about."""
+    rng = np.random.default_rng([seed, 6])
+    while True:
+        scene = random_scene(int(rng.integers(1 << 31)), count=int(rng.integers(2, 5)))
+        left = [item for item in scene.objects if item.position[1] > 0.0]
+        right = [item for item in scene.objects if item.position[1] < 0.0]
+        if left and right:
+            break
+    named = scene.model_copy(update={"name": f"pair_{seed}"})
+    return Task("pairs", seed, named, (left[0].label, right[0].label), kind="pair", together=True)
+
+
+def in_turn_task(seed: int) -> Task:
+    """The same, one after the other: what the time of a pair is held against."""
+    return replace(pair_task(seed), set_name="pairs_in_turn", kind="pair in turn", together=False)
 
 
 def push_task(seed: int) -> Task:

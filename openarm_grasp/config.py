@@ -214,6 +214,9 @@ class LimitsConfig(Config):
         default=5.0, gt=0.0, le=60.0, description="an action server accepts within, wall clock, s"
     )
     plan_timeout: float = Field(default=30.0, gt=0.0, le=300.0, description="one planning request, wall clock, s")
+    beside_timeout: float = Field(
+        default=60.0, gt=0.0, le=600.0, description="an arm waits for the other one, s (robot time in simulation)"
+    )
     move_timeout: float = Field(default=60.0, gt=0.0, le=600.0, description="one motion, wall clock, s")
     gripper_timeout: float = Field(default=20.0, gt=0.0, le=120.0, description="one gripper motion, wall clock, s")
 

@@ -135,10 +135,12 @@ class Performer:
     Args:
         link: To the robot.
         config: Parameters.
+        arms: That it may send home.
     """
 
-    def __init__(self, link: Link, config: GraspConfig) -> None:
+    def __init__(self, link: Link, config: GraspConfig, *, arms: Sequence[str] = ARMS) -> None:
         self._link = link
+        self._arms = frozenset(arms)
         self._config = config
         self._hands = {arm: HandReader(link.description, link.states, arm) for arm in ARMS}
 
@@ -255,6 +257,8 @@ class Performer:
     async def _home(self, effect: effects.GoHome) -> None:
         config, link = self._config, self._link
         for arm in effect.arms:
+            if arm not in self._arms:
+                continue
             home = link.description.group_state(f"{arm}_arm", config.home_state)
             _, q = link.states.latest()
             if max(abs(q[name] - value) for name, value in home.items()) <= config.home_tolerance:

@@ -236,7 +236,7 @@ def destinations(target: Detection, others: Sequence[Detection], around: Surroun
     return tuple(np.array([x, y]) for _, _, x, y in sorted(found))
 
 
-def push_ways(target: Detection, end: Array, config: GraspConfig, hand: Sequence[Array]) -> tuple[GraspCandidate, ...]:
+def push_ways(target: Detection, end: Array, config: GraspConfig, hand: Array) -> tuple[GraspCandidate, ...]:
     """How a closed hand may stand behind the object, the most upright first.
 
     One of its four faces looks ahead, so that a flat side of the object is met flat; it leans sideways, or with its
