@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One arm beside the other: it waits where the other stands, gives way when both wait, looks when nothing is hidden."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from openarm_common.description import RobotDescription
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.beside import BesideLink, Company
+from openarm_grasp.config import GraspConfig
+
+
+class Robot:
+    """A link whose waits let a scripted world go on, step by step."""
+
+    def __init__(self) -> None:
+        self.description = RobotDescription.load()
+        self.states = self
+        self.now_ns, self.deadline_ns, self.steps, self.looks = 1, 0, 0, 0
+        config = GraspConfig()
+        self.q: dict[str, float] = {}
+        for arm in ("left", "right"):
+            self.q |= self.description.group_state(f"{arm}_arm", config.home_state)
+        self.on_step: Callable[[int], None] = lambda step: None
+        self.faults: list[Code] = []
+
+    def latest(self) -> tuple[int, dict[str, float]]:
+        return self.now_ns, self.q
+
+    def away(self, arm: str, by: float = 0.5) -> None:
+        self.q[f"openarm_{arm}_joint1"] += by
+
+    async def until(self, done: Callable[[], bool], limit: float, what: str, guard: object = None) -> None:
+        for _ in range(20):
+            if done():
+                return
+            self.steps += 1
+            self.now_ns += 10**9
+            self.on_step(self.steps)
+        raise OpenArmError(Code.TIMEOUT, what)
+
+    async def plan(self, effect: object) -> str:
+        if self.faults:
+            raise OpenArmError(self.faults.pop(0), "the other arm is in the way")
+        return "plan"
+
+    async def observe(self, count: int, *, near: bool = False) -> str:
+        self.looks += 1
+        return "frames"
+
+    def stop_looking(self) -> None:
+        pass
+
+
+def run(work: Coroutine[Any, Any, Any]) -> Any:
+    try:
+        work.send(None)
+    except StopIteration as end:
+        return end.value
+    raise AssertionError("it waits for something that nobody does")
+
+
+def link(robot: Robot, arm: Any, company: Company | None = None) -> BesideLink:
+    return BesideLink(arm, robot, company or Company(), GraspConfig())  # type: ignore[arg-type]
+
+
+def test_an_arm_waits_until_the_other_has_gone_on_and_plans_again() -> None:
+    robot = Robot()
+    robot.away("right")
+    robot.faults = [Code.IN_COLLISION]
+    robot.on_step = lambda step: robot.away("right", 0.2) if step == 3 else None
+    assert run(link(robot, "left").plan(None)) == "plan"  # type: ignore[arg-type]
+    assert robot.steps == 3
+
+
+def test_what_is_not_the_other_arms_doing_is_told_at_once() -> None:
+    robot = Robot()
+    robot.faults = [Code.IN_COLLISION]
+    with pytest.raises(OpenArmError, match="in the way"):
+        run(link(robot, "left").plan(None))  # type: ignore[arg-type]
+    robot.away("right")
+    robot.faults = [Code.UNREACHABLE]
+    with pytest.raises(OpenArmError):
+        run(link(robot, "left").plan(None))  # type: ignore[arg-type]
+    assert robot.steps == 0
+
+
+def test_of_two_arms_that_wait_for_each_other_the_right_one_gives_way() -> None:
+    robot, company = Robot(), Company(waiting={"left"})
+    robot.away("left")
+    robot.faults = [Code.IN_COLLISION]
+    with pytest.raises(OpenArmError, match="in the way"):
+        run(link(robot, "right", company).plan(None))  # type: ignore[arg-type]
+    robot, company = Robot(), Company(waiting={"right"})
+    robot.away("right")
+    robot.faults = [Code.IN_COLLISION]
+    robot.on_step = lambda step: robot.away("right", -0.5) if step == 2 else None
+    assert run(link(robot, "left", company).plan(None)) == "plan"  # type: ignore[arg-type]
+    assert company.waiting == {"right"}
+
+
+def test_an_arm_at_home_looks_when_the_other_hides_nothing_and_one_at_work_does_not_wait() -> None:
+    robot = Robot()
+    robot.away("right")
+    robot.on_step = lambda step: robot.away("right", -0.5) if step == 4 else None
+    run(link(robot, "left").observe(3))
+    assert (robot.steps, robot.looks) == (4, 1)
+    robot.away("right")
+    robot.away("left")
+    run(link(robot, "left").observe(3))
+    assert (robot.steps, robot.looks) == (4, 2)
+
+
+def test_an_arm_whose_work_is_done_hides_nothing() -> None:
+    robot = Robot()
+    robot.away("right")
+    run(link(robot, "left", Company(done={"right"})).observe(3))
+    assert robot.looks == 1
