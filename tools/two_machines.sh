@@ -88,8 +88,11 @@ started=
 
 echo "== two hosts ($mode): control on 10.77.0.1, vision on 10.77.0.2"
 if [ "$mode" = server ]; then
-    (on "$one" "$(dirname -- "$openarm")/fast-discovery-server" -i 0 -l 10.77.0.1 -p 11811) >"$out/server.log" 2>&1 &
+    # Libraries of the wheels are known to their Python alone.
+    libraries=$("$(dirname -- "$openarm")/python" -c 'import os; print(os.environ.get("LD_LIBRARY_PATH", ""))')
+    (on "$one" env LD_LIBRARY_PATH="$libraries" "$(dirname -- "$openarm")/fast-discovery-server" -i 0 -l 10.77.0.1 -p 11811) >"$out/server.log" 2>&1 &
     started="$started $!"
+    wait_for "$out/server.log" 'Server is running' "$!"
     ROS_DISCOVERY_SERVER=10.77.0.1:11811
     ROS_SUPER_CLIENT=TRUE
     export ROS_DISCOVERY_SERVER ROS_SUPER_CLIENT
