@@ -193,6 +193,8 @@ def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) 
     nearest = min(near, key=lambda d: _apart(d, before), default=None)
     if nearest is None or _apart(nearest, before) > _ELSEWHERE:
         return True, "the hand hides the object"
+    if max(nearest.size[:2]) > max(before.size[:2]) + config.moved:
+        return True, "the hand is in front of the object: what is seen is larger than it"
     off, limit = sticks_out(nearest, before) * 1e3, config.moved * 1e3
     if off > limit:
         return False, f"{before.label!r} has moved: it reaches {off:.0f} mm out of where it stood, expected {limit:.0f}"

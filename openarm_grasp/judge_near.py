@@ -53,7 +53,11 @@ def move_to_grasp(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) 
         if not outcome.ok:
             return fail(m, outcome.code, outcome.message)
         m.hand.looked = True
-        still, reason = judge_still(m.need_sighting().target, outcome.last(Frames).frames, around.config.held)
+        target = m.need_sighting().target
+        still, reason = judge_still(target, outcome.last(Frames).frames, around.config.held)
+        if not still and m.moved_from is not None and _apart(target, m.moved_from) < around.config.detect.agree_within:
+            still, reason = True, f"{reason}; so it seemed before, and it had not: the hand hides a part of it"
+        m.moved_from = target
         return (Event.MORE, reason) if still else fail(m, Code.GRASP_MISSED, reason)
     m.hand.at_object = True
     if not outcome.ok:
@@ -96,6 +100,10 @@ def _near(frame: Frame, target: Detection, largest: float) -> Frame:
         if d.label == target.label and float(np.linalg.norm((d.p_base - target.p_base)[:2])) <= largest
     )
     return Frame(frame.t_ns, tuple(kept))
+
+
+def _apart(a: Detection, b: Detection) -> float:
+    return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
 
 
 def _same_way(chosen: GraspCandidate, offered: tuple[GraspCandidate, ...]) -> GraspCandidate:

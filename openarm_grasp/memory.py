@@ -129,6 +129,7 @@ class Memory:
         residual: Direction (2,) and how far along it the camera saw the object from where the hand put it.
         kept: What an earlier request left in the hand, to be placed by this one.
         height: Of the object when it was first seen, m; None before that.
+        moved_from: The object as it stood when the hand was last about to go down.
     """
 
     request: GraspRequest
@@ -157,6 +158,7 @@ class Memory:
     residual: tuple[NDArray[np.float64], float] | None = None
     kept: Kept | None = None
     height: float | None = None
+    moved_from: Detection | None = None
 
     @property
     def label(self) -> str:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,10 @@ GOOD = Evidence(gap=0.0503, expected=0.05, effort=-30.0, speed=0.0)
 
 def seen(label="red", x=0.26, y=-0.2, top=0.45, height=0.05) -> Detection:
     return Detection(label, 0.9, se3.make(p=(x, y, top - height / 2.0)), np.array([0.05, 0.05, height]))
+
+
+def larger(**kwargs) -> Detection:
+    return replace(seen(**kwargs), size=np.array([0.05, 0.09, 0.05]))
 
 
 @pytest.mark.parametrize(
@@ -142,6 +148,7 @@ def test_p08_a_twin_elsewhere_is_not_taken_for_the_lifted_object() -> None:
         ((seen(x=0.28),), False),
         ((seen(x=0.40),), True),  # another one
         ((seen("blue", x=0.28),), True),
+        ((larger(x=0.29),), True),  # pixels of the hand are in it
     ],
 )
 def test_n03_an_object_that_has_moved_is_noticed_before_the_hand_goes_down(found, still) -> None:

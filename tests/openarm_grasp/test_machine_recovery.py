@@ -85,6 +85,23 @@ def test_n03_a_placed_object_that_the_detector_misses_is_looked_for_again(world)
     assert (outcome.attempts, missed) == (1, [3])
 
 
+def test_an_alarm_that_the_look_from_home_does_not_confirm_is_raised_once(world, box):
+    """From above the hand the object always seems to have moved; from home it stands where it stood."""
+    real = world.frames
+    shifted = box("red", 0.28, -0.2)
+
+    def frames(count):
+        found = real(count)
+        if world.machine.state is not State.MOVE_TO_GRASP:
+            return found
+        return fx.Frames(tuple(Frame(frame.t_ns, (shifted,)) for frame in found.frames), "base")
+
+    world.frames = frames
+    outcome = world.grasp()
+    assert outcome.success, outcome.message
+    assert outcome.attempts == 2
+
+
 def test_p09_an_object_that_has_fallen_over_is_told(world, box):
     """It stands at its target, lower than it was: nothing that the hand could try again would right it."""
     world.objects["red"] = box("red", 0.26, -0.2, size=0.06)
