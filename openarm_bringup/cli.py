@@ -87,7 +87,14 @@ def build_app() -> App:
 def run(argv: Sequence[str]) -> int:
     """Run one command line and return its exit code."""
     tokens, sink = take_json(argv)
-    FOR_PEOPLE.set(sink != "-")
+    before = FOR_PEOPLE.set(sink != "-")
+    try:
+        return _run(tokens, sink)
+    finally:
+        FOR_PEOPLE.reset(before)
+
+
+def _run(tokens: Sequence[str], sink: str | None) -> int:
     app = build_app()
     try:
         result = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")

@@ -14,7 +14,7 @@ from vision_msgs.msg import Detection3DArray
 
 from openarm_common import se3
 from openarm_common.cameras import T_LINK_OPTICAL, load_cameras
-from openarm_common.convert import array_to_image, info_from_intrinsics, matrix_to_transform
+from openarm_common.convert import array_to_image, info_from_intrinsics, matrix_to_transform, stamp_to_ns
 from openarm_common.node import BASE_FRAME, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, reliable
 from openarm_perception.detect_node import DetectNode
 
@@ -121,9 +121,9 @@ class Bench:
         self.ros.spin_until(step, 10.0, what)
 
     def detect(self, what: str = "a detection") -> Detection3DArray:
-        """The answer to a new frame."""
-        before = len(self.watch.got)
-        self.pump(lambda: len(self.watch.got) > before, what)
+        """The answer to a frame that is newer than every one before."""
+        before = self.t_ns
+        self.pump(lambda: bool(self.watch.got) and stamp_to_ns(self.watch.got[-1].header.stamp) > before, what)
         return self.watch.got[-1]
 
     def said(self, text: str, **make) -> None:

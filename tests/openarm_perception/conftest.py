@@ -94,7 +94,7 @@ class Tabletop:
     Thing = Thing
     look_at = staticmethod(look_at)
     table_height = TABLE
-    labels = tuple(RGBA)
+    labels = tuple(label for label in RGBA if label != "grey")  # those that the colour detector knows
 
     def __init__(self) -> None:
         kinds = ["box"] * 4 + ["cylinder"] * 4
