@@ -90,12 +90,13 @@ def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsy
 
 
 def test_services_and_actions_are_called_and_the_exit_code_follows_the_answer(heard: list[str]) -> None:
-    assert ros_cli.service_list().data["services"] == {"/pause": "openarm_interfaces/srv/SetPause"}
+    listed = ros_cli.service_list().data["services"]
+    assert (listed["/pause"], "/probe/set_parameters" in listed) == ("openarm_interfaces/srv/SetPause", False)
     assert "/probe/set_parameters" in ros_cli.service_list(all_=True).data["services"]
     assert ros_cli.call("/pause", "{paused: true}").exit_code == 0
     refused = ros_cli.call("pause", "{paused: false}")
     assert (refused.exit_code, refused.message) == (1, "only true is taken")
-    assert ros_cli.action_list().data["actions"] == {"/pick": "openarm_interfaces/action/Pick"}
+    assert ros_cli.action_list().data["actions"]["/pick"] == "openarm_interfaces/action/Pick"
     assert ros_cli.send("/pick", "{label: red}").data["answer"]["label"] == "red"
 
 
