@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -90,7 +91,7 @@ class Polled:
         self._node.destroy_subscription(self._subscription)
 
 
-class Layer:
+class Layer(ABC):
     """One thing to look at.
 
     Attributes:
@@ -105,9 +106,9 @@ class Layer:
         self._node = node
         self._polled: list[Polled] = []
 
+    @abstractmethod
     def look(self) -> Items:
         """What is new since the last look."""
-        raise NotImplementedError
 
     def close(self) -> None:
         """Stop listening."""
