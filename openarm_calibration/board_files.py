@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 import zlib
 from pathlib import Path
@@ -12,14 +11,13 @@ import cv2
 import numpy as np
 
 from openarm_calibration.board import Board, CircleGrid
+from openarm_common import pdf as pdf_page
 from openarm_common.errors import Code, OpenArmError
 
 SUFFIXES = (".png", ".pdf", ".xml")
 _POINT = 72.0 / 0.0254  # PDF points in a metre
 _A4 = (0.210, 0.297)
 _MARGIN = 0.008  # that printers can't reach, m
-#: Of a quarter circle as a cubic curve.
-_KAPPA = 4.0 / 3.0 * (math.sqrt(2.0) - 1.0)
 _THICKNESS = 0.003
 #: Edge of a simulated board's texture, pixels. A power of two: half of an odd edge is no whole number of pixels, so
 #: that the smaller copies that a renderer makes of it do not quite lie on it, and the board seems 0.06 % too large.
@@ -82,7 +80,8 @@ def pdf(board: Board) -> bytes:
     lines = ["0 g"]
     if isinstance(board, CircleGrid):
         for x, y in board.points[:, :2]:
-            lines.append(_circle(origin[0] + x, origin[1] - y, board.radius))
+            centre = (origin[0] + float(x)) * _POINT, (origin[1] - float(y)) * _POINT
+            lines.append(f"{pdf_page.circle(*centre, board.radius * _POINT)} f")
     else:
         lines += _squares(board, origin)
     base = top - height - 0.010
@@ -90,29 +89,13 @@ def pdf(board: Board) -> bytes:
     lines.append(f"{_pt(start)} {_pt(base)} {_pt(0.1)} {_pt(0.001)} re f")
     for x in (start, start + 0.1):
         lines.append(f"{_pt(x - 0.0001)} {_pt(base - 0.002)} {_pt(0.0002)} {_pt(0.005)} re f")
-    text = f"{board.label}. The bar is 100 mm."
-    lines.append(f"BT /F1 8 Tf {_pt(start)} {_pt(base - 0.006)} Td ({text}) Tj ET")
-    return _document("\n".join(lines), page)
+    words = f"{board.label}. The bar is 100 mm."
+    lines.append(pdf_page.text(start * _POINT, (base - 0.006) * _POINT, 8, words))
+    return pdf_page.document("\n".join(lines), page[0] * _POINT, page[1] * _POINT)
 
 
 def _pt(metres: float) -> str:
     return f"{metres * _POINT:.4f}"
-
-
-def _circle(x: float, y: float, r: float) -> str:
-    k = _KAPPA * r
-    corners = [(x + r, y), (x, y + r), (x - r, y), (x, y - r)]
-    inner = [
-        ((x + r, y + k), (x + k, y + r)),
-        ((x - k, y + r), (x - r, y + k)),
-        ((x - r, y - k), (x - k, y - r)),
-        ((x + k, y - r), (x + r, y - k)),
-    ]
-    out = [f"{_pt(corners[0][0])} {_pt(corners[0][1])} m"]
-    for n, (a, b) in enumerate(inner):
-        end = corners[(n + 1) % 4]
-        out.append(" ".join(_pt(v) for p in (a, b, end) for v in p) + " c")
-    return " ".join(out) + " f"
 
 
 def _squares(board: Board, origin: tuple[float, float]) -> list[str]:
@@ -129,29 +112,6 @@ def _squares(board: Board, origin: tuple[float, float]) -> list[str]:
             y = origin[1] + height / 2.0 - (row + 1) * pixel_h
             out.append(f"{_pt(x)} {_pt(y)} {_pt((end - begin) * pixel_w)} {_pt(pixel_h * 1.02)} re f")
     return out
-
-
-def _document(content: str, page: tuple[float, float]) -> bytes:
-    stream = zlib.compress(content.encode("latin-1", "replace"))
-    objects = [
-        b"<< /Type /Catalog /Pages 2 0 R >>",
-        b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {_pt(page[0])} {_pt(page[1])}] /Contents 4 0 R"
-        " /Resources << /Font << /F1 5 0 R >> >> >>".encode(),
-        b"<< /Length %d /Filter /FlateDecode >>\nstream\n%s\nendstream" % (len(stream), stream),
-        b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
-    ]
-    out = bytearray(b"%PDF-1.4\n")
-    places: list[int] = []
-    for number, body in enumerate(objects, start=1):
-        places.append(len(out))
-        out += b"%d 0 obj\n%s\nendobj\n" % (number, body)
-    table = len(out)
-    out += b"xref\n0 %d\n0000000000 65535 f \n" % (len(objects) + 1)
-    for place in places:
-        out += b"%010d 00000 n \n" % place
-    out += b"trailer\n<< /Size %d /Root 1 0 R >>\nstartxref\n%d\n%%%%EOF\n" % (len(objects) + 1, table)
-    return bytes(out)
 
 
 def mesh(board: Board) -> tuple[list[float], list[float], list[int]]:
