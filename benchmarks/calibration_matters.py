@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.campaign_mounts import with_mounts
-from openarm_bringup.campaign_robot import SimulatedSenses
-from openarm_bringup.campaign_tasks import Task
-from openarm_bringup.campaign_trial import Trials
-from openarm_bringup.demo import parse_seeds
+from openarm_bringup.campaign.mounts import with_mounts
+from openarm_bringup.campaign.robot import SimulatedSenses
+from openarm_bringup.campaign.tasks import Task
+from openarm_bringup.campaign.trial import Trials
+from openarm_bringup.demo.demo import parse_seeds
 from openarm_calibration.refine import mount_error
 from openarm_calibration.store import CalibrationStore
 from openarm_common.cameras import load_cameras, true_mount

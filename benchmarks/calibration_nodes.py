@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.calibration_run import CalibrationOptions, as_row, run_calibration
-from openarm_bringup.demo import parse_seeds
+from openarm_bringup.calibration.run import CalibrationOptions, as_row, run_calibration
+from openarm_bringup.demo.demo import parse_seeds
 from openarm_calibration.offline import calibrate
 from openarm_calibration.refine import mount_error
 from openarm_calibration.session_file import load_session

@@ -24,7 +24,7 @@ os.environ.setdefault("LP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.campaign_mounts import Bench
+from openarm_bringup.campaign.mounts import Bench
 from openarm_calibration.offline import calibrate
 from openarm_calibration.problem import difference
 from openarm_calibration.refine import mount_error

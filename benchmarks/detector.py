@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.detector_data import DataConfig, make_data
+from openarm_bringup.detector.data import DataConfig, make_data
 from openarm_perception.boxes import Candidates, Letterbox, blob, decode
 from openarm_perception.network import NetworkConfig, NetworkDetector
 from openarm_perception.training.report import LEAST, evaluate

@@ -25,11 +25,11 @@ import yaml
 from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
-from openarm_bringup import environment
-from openarm_bringup.detector_looks import surface
-from openarm_bringup.graph import load_graph
-from openarm_bringup.observer_client import Observer
-from openarm_bringup.session import running_graph
+from openarm_bringup.detector.looks import surface
+from openarm_bringup.judging.observer_client import Observer
+from openarm_bringup.supervision import environment
+from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.session import running_graph
 from openarm_common import se3
 from openarm_common.cameras import load_cameras
 from openarm_common.domain import reserve_domain

@@ -29,9 +29,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.graph import load_graph
-from openarm_bringup.keeper import NodeState
-from openarm_bringup.session import running_graph
+from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.keeper import NodeState
+from openarm_bringup.supervision.session import running_graph
 from openarm_common.domain import release_domain, reserve_domain
 from openarm_common.scene import load_scene
 

@@ -47,8 +47,8 @@ import numpy as np
 import psutil
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.graph import Graph, NodeSpec, Ready, load_graph
-from openarm_bringup.session import running_graph
+from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready, load_graph
+from openarm_bringup.supervision.session import running_graph
 from openarm_common.domain import reserve_domain
 
 CAMERAS = ("overhead", "wrist")

@@ -34,8 +34,8 @@ from sensor_msgs.msg import JointState
 from visualization_msgs.msg import Marker, MarkerArray
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.graph import load_graph
-from openarm_bringup.session import in_thread, running_graph
+from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.session import in_thread, running_graph
 from openarm_common.convert import pose_to_matrix, xyz
 from openarm_common.description import RobotDescription
 from openarm_common.domain import reserve_domain

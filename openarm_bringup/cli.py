@@ -16,8 +16,8 @@ from pathlib import Path
 import cyclopts
 from cyclopts import App, Parameter
 
-from openarm_bringup import runs
 from openarm_bringup.outcome import FOR_PEOPLE, Outcome, failure
+from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 
 HELP = """Eyes and hands for the OpenArm robot.
@@ -29,26 +29,26 @@ Exit code 0: what was asked happened. 1: it did not; a code and a sentence say w
 
 def build_app() -> App:
     """Return the application with all its commands."""
-    from openarm_bringup import (
-        calibrate_cli,
-        campaign_cli,
-        checks_cli,
-        completion_cli,
-        demo_cli,
-        detector_cli,
-        doctor_cli,
-        graph_cli,
-        grasp_cli,
-        inspect_cli,
-        model_cli,
-        order_cli,
-        param_cli,
-        pick_cli,
-        record_cli,
-        ros_cli,
-        tf_cli,
-        up_cli,
-        view_cli,
+    from openarm_bringup.commands import (
+        calibrate,
+        campaign,
+        checks,
+        completion,
+        demo,
+        detector,
+        doctor,
+        graph,
+        grasp,
+        model,
+        order,
+        param,
+        pick,
+        processes,
+        record,
+        ros2,
+        tf,
+        up,
+        view,
     )
 
     app = App(
@@ -59,28 +59,28 @@ def build_app() -> App:
         version=_version,
         default_parameter=Parameter(negative_iterable=()),
     )
-    app.command(up_cli.up)
-    app.command(view_cli.view)
-    app.command(pick_cli.pick)
-    app.command(order_cli.order)
-    app.command(demo_cli.demo)
-    app.command(record_cli.record)
-    app.command(record_cli.replay)
-    app.command(record_cli.check)
-    app.command(campaign_cli.campaign)
-    app.command(checks_cli.test)
-    app.command(checks_cli.lint)
-    app.command(doctor_cli.doctor)
-    app.command(inspect_cli.ps)
-    app.command(inspect_cli.logs)
-    app.command(model_cli.model)
-    app.command(graph_cli.app)
-    for group in (ros_cli.topic, ros_cli.service, ros_cli.action, ros_cli.node, param_cli.app, tf_cli.app):
+    app.command(up.up)
+    app.command(view.view)
+    app.command(pick.pick)
+    app.command(order.order)
+    app.command(demo.demo)
+    app.command(record.record)
+    app.command(record.replay)
+    app.command(record.check)
+    app.command(campaign.campaign)
+    app.command(checks.test)
+    app.command(checks.lint)
+    app.command(doctor.doctor)
+    app.command(processes.ps)
+    app.command(processes.logs)
+    app.command(model.model)
+    app.command(graph.app)
+    for group in (ros2.topic, ros2.service, ros2.action, ros2.node, param.app, tf.app):
         app.command(group)
-    app.command(grasp_cli.app)
-    app.command(calibrate_cli.app)
-    app.command(completion_cli.completion_of(app))
-    app.command(detector_cli.app)
+    app.command(grasp.app)
+    app.command(calibrate.app)
+    app.command(completion.completion_of(app))
+    app.command(detector.app)
     return app
 
 

@@ -20,8 +20,8 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from tf2_msgs.msg import TFMessage
 
-from openarm_bringup import runs
 from openarm_bringup.message_client import to_data, unknown
+from openarm_bringup.supervision import runs
 from openarm_common.convert import transform_to_matrix
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_STATIC_TF, QOS_TF, offered_qos

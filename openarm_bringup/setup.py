@@ -3,13 +3,25 @@
 from setuptools import setup
 
 NAME = "openarm_bringup"
+PARTS = (
+    "bags",
+    "calibration",
+    "campaign",
+    "commands",
+    "demo",
+    "detector",
+    "doctor",
+    "judging",
+    "supervision",
+    "view",
+)
 
 setup(
     name=NAME,
     version="0.1.0",
-    packages=[NAME],
+    packages=[NAME, *(f"{NAME}.{part}" for part in PARTS)],
     package_dir={NAME: "."},
-    package_data={NAME: ["py.typed", "view_page/*"]},
+    package_data={NAME: ["py.typed", "view/page/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -32,7 +32,7 @@ def test_the_wheel_holds_packages_models_and_parameters_and_nothing_of_colcon(tm
         missing = [str(path) for path in files if f"{shared}/{path.relative_to(_ROOT)}" not in names]
         assert not missing
     assert {f"{package}/__init__.py" for package in _PACKAGES} <= names
-    page = {str(path.relative_to(_ROOT)) for path in (_ROOT / "openarm_bringup" / "view_page").iterdir()}
+    page = {str(path.relative_to(_ROOT)) for path in (_ROOT / "openarm_bringup" / "view" / "page").iterdir()}
     assert page
     assert page <= names
     colcon = re.compile(r"(^|/)(setup\.py|setup\.cfg|package\.xml|resource/.*)$")

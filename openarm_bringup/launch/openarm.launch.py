@@ -14,9 +14,9 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 
-from openarm_bringup.environment import PROFILE, node_arguments, node_environment
-from openarm_bringup.graph import graph_names, load_graph
-from openarm_bringup.runs import new_run_dir
+from openarm_bringup.supervision.environment import PROFILE, node_arguments, node_environment
+from openarm_bringup.supervision.graph import graph_names, load_graph
+from openarm_bringup.supervision.runs import new_run_dir
 from openarm_common.resources import config_dir
 
 #: Name, default and meaning; an empty value leaves what the graph says.

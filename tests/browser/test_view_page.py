@@ -147,7 +147,7 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> Iterator[StandIns]:
 
 def with_page(open_tab: Any, test: Callable[[Any], Awaitable[None]]) -> None:
     """Serve the page as the command does, open it in the browser, and run a test on it."""
-    from openarm_bringup.view_cli import make_server
+    from openarm_bringup.commands.view import make_server
 
     async def main() -> None:
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()

@@ -21,8 +21,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from vision_msgs.msg import Detection3DArray
 
-from openarm_bringup.graph import load_graph
-from openarm_bringup.session import running_graph
+from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.session import running_graph
 from openarm_common.domain import reserve_domain
 
 STREAMS = ("/overhead/color", "/overhead/depth", "/wrist/color", "/wrist/depth")

@@ -22,7 +22,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState, PointCloud2
 from vision_msgs.msg import Detection3DArray
 
-from openarm_bringup.bag import open_bag
+from openarm_bringup.bags.bag import open_bag
 from openarm_common.convert import points_from_cloud
 from openarm_common.description import RobotDescription
 from openarm_common.scene import load_scene

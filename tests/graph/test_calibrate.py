@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from openarm_interfaces.srv import InjectFault
 
-from openarm_bringup.calibration_run import CalibrationListeners, CalibrationOptions, run_calibration
+from openarm_bringup.calibration.run import CalibrationListeners, CalibrationOptions, run_calibration
 from openarm_calibration.refine import mount_error
 from openarm_calibration.store import CalibrationStore
 from openarm_common.cameras import load_cameras, true_mount

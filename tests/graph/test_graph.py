@@ -18,11 +18,11 @@ from openarm_interfaces.srv import Grasp
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
-from openarm_bringup.graph import load_graph
-from openarm_bringup.judge import JudgeConfig, judge
-from openarm_bringup.observer_client import Observer
-from openarm_bringup.shm import ports_of, unused
-from openarm_bringup.trial import wait_scene
+from openarm_bringup.judging.judge import JudgeConfig, judge
+from openarm_bringup.judging.observer_client import Observer
+from openarm_bringup.judging.trial import wait_scene
+from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.shm import ports_of, unused
 from openarm_common.errors import Code
 from openarm_common.scene import load_scene
 from openarm_grasp.client import GraspClient, GraspResult

@@ -15,7 +15,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from vision_msgs.msg import Detection3DArray
 
-from openarm_bringup import golden
+from openarm_bringup.bags import golden
 
 BAG = Path(__file__).parents[1] / "data" / "demo_pick"
 pytestmark = [pytest.mark.graph, pytest.mark.slow]

@@ -13,7 +13,7 @@ import pytest
 from rclpy.action import ActionServer
 from type_description_interfaces.srv import GetTypeDescription
 
-from openarm_bringup.bag import Types
+from openarm_bringup.bags.bag import Types
 
 _MESSAGES = {
     "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",

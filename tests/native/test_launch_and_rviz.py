@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 import yaml
 
-from openarm_bringup.environment import node_arguments
-from openarm_bringup.graph import load_graph
+from openarm_bringup.supervision.environment import node_arguments
+from openarm_bringup.supervision.graph import load_graph
 from openarm_common.description import RobotDescription
 from openarm_common.resources import config_dir
 

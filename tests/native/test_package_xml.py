@@ -61,7 +61,7 @@ def test_package_xml_declares_what_is_imported(package: Path) -> None:
 
 def test_every_node_of_the_graphs_is_an_executable_of_its_package() -> None:
     """What `ros2 run` and a launch file start is what the graph starts."""
-    from openarm_bringup.graph import graph_names, load_graph
+    from openarm_bringup.supervision.graph import graph_names, load_graph
 
     modules = {spec.module for name in graph_names() for spec in load_graph(name).nodes.values() if spec.module}
     for module in modules - {"openarm_bringup.script_node"}:

@@ -17,9 +17,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from openarm_bringup.graph import Ready
-from openarm_bringup.observer_client import Observer, Step
-from openarm_bringup.readiness_client import ReadinessClient
+from openarm_bringup.judging.observer_client import Observer, Step
+from openarm_bringup.supervision.graph import Ready
+from openarm_bringup.supervision.readiness_client import ReadinessClient
 from openarm_common.errors import Code, OpenArmError
 
 LATCHED = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)

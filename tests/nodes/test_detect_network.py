@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 
-from openarm_bringup.detector_client import DetectionListener
+from openarm_bringup.detector.things_client import DetectionListener
 from openarm_common.convert import pose_to_matrix, stamp_to_ns
 from openarm_perception.attributes import parse, resolve
 from tests.nodes.detect_bench import TABLE, Bench, FakeCamera

@@ -24,7 +24,7 @@ class Foxglove:
     def __init__(self, ros) -> None:
         from rclpy.parameter import Parameter
 
-        from openarm_bringup.foxglove_node import FoxgloveNode
+        from openarm_bringup.view.foxglove_node import FoxgloveNode
 
         self.ros = ros
         self.node = ros.add(FoxgloveNode(parameter_overrides=[Parameter("port", value=0)]))

@@ -14,10 +14,10 @@ from rclpy.qos import DurabilityPolicy
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from openarm_bringup import record_cli
-from openarm_bringup.bag import open_bag
-from openarm_bringup.player_client import Player
-from openarm_bringup.recorder_client import Recorder, Thinner
+from openarm_bringup.bags.bag import open_bag
+from openarm_bringup.bags.player_client import Player
+from openarm_bringup.bags.recorder_client import Recorder, Thinner
+from openarm_bringup.commands.record import replay
 from openarm_common.convert import array_to_image
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
@@ -97,8 +97,8 @@ def test_a_full_disk_ends_the_recording_and_leaves_a_bag(ros, tmp_path: Path, mo
     class Usage:
         free = 10**12
 
-    monkeypatch.setattr("openarm_bringup.recorder_client.shutil.disk_usage", lambda _: Usage)
-    monkeypatch.setattr("openarm_bringup.recorder_client._SPARE_BYTES", 2**20)
+    monkeypatch.setattr("openarm_bringup.bags.recorder_client.shutil.disk_usage", lambda _: Usage)
+    monkeypatch.setattr("openarm_bringup.bags.recorder_client._SPARE_BYTES", 2**20)
     images = ros.node.create_publisher(Image, "/overhead/color/image_raw", QOS_COMMAND)
     picture = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     with Recorder(int(os.environ["ROS_DOMAIN_ID"]), tmp_path / "bag", ("/overhead/.*",), {}) as recorder:
@@ -165,5 +165,5 @@ def test_replay_refuses_what_makes_no_sense(ros, tmp_path: Path) -> None:
         ({"remap": ("/a=/b",)}, "expected /from:=/to"),
     ):
         with pytest.raises(OpenArmError, match=said):
-            record_cli.replay(tmp_path / "bag", **keywords)
+            replay(tmp_path / "bag", **keywords)
     assert time.monotonic() - began < 5.0

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Image
 
-from openarm_bringup.bag import open_bag
+from openarm_bringup.bags.bag import open_bag
 from openarm_common.convert import array_to_image
 from openarm_common.node import QOS_COMMAND
 

@@ -18,7 +18,8 @@ from rclpy.action import ActionServer
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from openarm_bringup import cli, param_cli, ros_cli, tf_cli
+from openarm_bringup import cli
+from openarm_bringup.commands import param, ros2, tf
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF
 
@@ -69,47 +70,47 @@ def heard(ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list
 
 
 def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    listed = ros_cli.topic_list()
+    listed = ros2.topic_list()
     assert listed.data["topics"]["/ticks"] == "std_msgs/msg/String"
-    echoed = ros_cli.echo("status", count=1)  # latched: it was published long before
+    echoed = ros2.echo("status", count=1)  # latched: it was published long before
     assert echoed.data["messages"] == [{"data": "ready"}]
     assert "data: ready" in capsys.readouterr().out
     assert cli.run(["topic", "echo", "status", "-n", "1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["messages"] == [{"data": "ready"}], "JSON, and nothing else"
-    measured = ros_cli.hz("/ticks", seconds=1.0).data
+    measured = ros2.hz("/ticks", seconds=1.0).data
     assert 20.0 < measured["rate_hz"] < 80.0
     assert measured["lost"] == 0
     assert 0.0 <= measured["delay_median_ms"] <= measured["delay_max_ms"] < 5000.0
-    assert ros_cli.pub("/talk", "{data: hello}", count=2, rate=20.0).success
+    assert ros2.pub("/talk", "{data: hello}", count=2, rate=20.0).success
     deadline = time.monotonic() + 5.0
     while len(heard) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)  # the node takes them in a thread of its own
     assert heard == ["hello", "hello"]
-    alone = ros_cli.pub("/nobody", type_="std_msgs/msg/String")
+    alone = ros2.pub("/nobody", type_="std_msgs/msg/String")
     assert (alone.success, alone.code) == (False, Code.NOT_READY)
 
 
 def test_services_and_actions_are_called_and_the_exit_code_follows_the_answer(heard: list[str]) -> None:
-    listed = ros_cli.service_list().data["services"]
+    listed = ros2.service_list().data["services"]
     assert (listed["/pause"], "/probe/set_parameters" in listed) == ("openarm_interfaces/srv/SetPause", False)
-    assert "/probe/set_parameters" in ros_cli.service_list(all_=True).data["services"]
-    assert ros_cli.call("/pause", "{paused: true}").exit_code == 0
-    refused = ros_cli.call("pause", "{paused: false}")
+    assert "/probe/set_parameters" in ros2.service_list(all_=True).data["services"]
+    assert ros2.call("/pause", "{paused: true}").exit_code == 0
+    refused = ros2.call("pause", "{paused: false}")
     assert (refused.exit_code, refused.message) == (1, "only true is taken")
-    assert ros_cli.action_list().data["actions"]["/pick"] == "openarm_interfaces/action/Pick"
-    assert ros_cli.send("/pick", "{label: red}").data["answer"]["label"] == "red"
+    assert ros2.action_list().data["actions"]["/pick"] == "openarm_interfaces/action/Pick"
+    assert ros2.send("/pick", "{label: red}").data["answer"]["label"] == "red"
 
 
 def test_mistakes_are_met_with_what_was_perhaps_meant(heard: list[str]) -> None:
     for command, said in (
-        (lambda: ros_cli.echo("/statsu"), "did you mean /status"),
-        (lambda: ros_cli.call("/paus"), "did you mean /pause"),
-        (lambda: ros_cli.call("/pause", "{pause: true}"), "did you mean paused"),
-        (lambda: ros_cli.call("/pause", "{"), "is not YAML"),
-        (lambda: ros_cli.send("/pikc"), "did you mean /pick"),
-        (lambda: param_cli.get("prob", "height"), "did you mean /probe"),
-        (lambda: param_cli.get("probe", "heigth"), "did you mean height"),
-        (lambda: tf_cli.echo("world", "camra"), "did you mean camera"),
+        (lambda: ros2.echo("/statsu"), "did you mean /status"),
+        (lambda: ros2.call("/paus"), "did you mean /pause"),
+        (lambda: ros2.call("/pause", "{pause: true}"), "did you mean paused"),
+        (lambda: ros2.call("/pause", "{"), "is not YAML"),
+        (lambda: ros2.send("/pikc"), "did you mean /pick"),
+        (lambda: param.get("prob", "height"), "did you mean /probe"),
+        (lambda: param.get("probe", "heigth"), "did you mean height"),
+        (lambda: tf.echo("world", "camra"), "did you mean camera"),
     ):
         with pytest.raises(OpenArmError) as refused:
             command()
@@ -118,24 +119,24 @@ def test_mistakes_are_met_with_what_was_perhaps_meant(heard: list[str]) -> None:
 
 
 def test_nodes_and_parameters(heard: list[str]) -> None:
-    assert "/probe" in ros_cli.node_list().data["nodes"]
-    info = ros_cli.info("probe")
+    assert "/probe" in ros2.node_list().data["nodes"]
+    info = ros2.info("probe")
     assert info.data["publishes"]["/ticks"] == "std_msgs/msg/String"
     assert info.data["offers"]["/pause"] == "openarm_interfaces/srv/SetPause"
-    assert "height" in param_cli.list_("probe").data["parameters"]
-    assert param_cli.set_("probe", "height", "0.7").success
-    assert param_cli.get("probe", "height").text == "0.7"
-    assert "ros__parameters:" in param_cli.dump("probe").text
-    wrong = param_cli.set_("probe", "height", "tall")
+    assert "height" in param.list_("probe").data["parameters"]
+    assert param.set_("probe", "height", "0.7").success
+    assert param.get("probe", "height").text == "0.7"
+    assert "ros__parameters:" in param.dump("probe").text
+    wrong = param.set_("probe", "height", "tall")
     assert not wrong.success
     assert "--set probe.height=tall" in wrong.message
 
 
 def test_b35_the_tree_of_frames_is_shown_and_drawn(heard: list[str], tmp_path: Path) -> None:
     out = tmp_path / "tree.png"
-    tree = tf_cli.tree(out=out)
+    tree = tf.tree(out=out)
     assert tree.text.splitlines() == ["world", "  base", "    camera"]
     assert cv2.imread(str(out)).shape[0] > 60
-    assert tf_cli.echo("world", "camera").data["position"] == [1.5, 0.0, 0.0]
+    assert tf.echo("world", "camera").data["position"] == [1.5, 0.0, 0.0]
     with pytest.raises(OpenArmError, match=r"ends in \.png"):
-        tf_cli.tree(out=tmp_path / "tree.pdf")
+        tf.tree(out=tmp_path / "tree.pdf")

@@ -17,7 +17,7 @@ class Looking:
     """A view of the graph of a test, and the newest that it has seen of each key."""
 
     def __init__(self, ros) -> None:
-        from openarm_bringup.view_client import GraphView
+        from openarm_bringup.view.page_client import GraphView
 
         self.ros = ros
         self.seen: dict[str, Any] = {}
@@ -133,7 +133,7 @@ def test_a_message_that_can_t_be_shown_is_said_and_the_rest_goes_on(ros, looking
 
 
 def test_without_a_graph_every_question_has_an_answer(looking: Looking) -> None:
-    from openarm_bringup.view_server import Order, Reset
+    from openarm_bringup.view.server import Order, Reset
 
     view = looking.view
     for ask in (lambda: view.pick(Order(label="red")), view.cancel, lambda: view.reset(Reset())):

@@ -9,9 +9,9 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import String
 
-from openarm_bringup.bag import BagWriter, definition, message_class, open_bag
-from openarm_bringup.player_client import to_profile
-from openarm_bringup.recorder_client import from_profile
+from openarm_bringup.bags.bag import BagWriter, definition, message_class, open_bag
+from openarm_bringup.bags.player_client import to_profile
+from openarm_bringup.bags.recorder_client import from_profile
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 

@@ -16,8 +16,8 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from openarm_bringup import cli
-from openarm_bringup.bag import BagWriter
-from openarm_bringup.recorder_client import from_profile
+from openarm_bringup.bags.bag import BagWriter
+from openarm_bringup.bags.recorder_client import from_profile
 from openarm_calibration.refine import mount_error
 from openarm_calibration.session_file import load_session
 from openarm_calibration.store import CalibrationStore

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup import calibration_run, cli
+from openarm_bringup import cli
+from openarm_bringup.calibration import run as calibration
 from openarm_calibration.client import AutoResult
 from openarm_calibration.synthetic_session import make_session
 from openarm_common import se3
@@ -205,14 +206,14 @@ def test_b15_auto_takes_the_fixed_camera_first_and_tells_what_came_out(
     capsys, tmp_path: Path, monkeypatch, results, error, code: int, words: str
 ) -> None:
     """Exit code and sentence follow the worst camera; pages are written of the sessions that there are."""
-    asked: list[calibration_run.CalibrationOptions] = []
+    asked: list[calibration.CalibrationOptions] = []
 
     def run_it(options, listeners):
         asked.append(options)
         make_session("in_hand", 12).samples.save(tmp_path / "wrist.npz")
-        return calibration_run.CalibrationRun(tmp_path, results, 1.0, error)
+        return calibration.CalibrationRun(tmp_path, results, 1.0, error)
 
-    monkeypatch.setattr(calibration_run, "run_calibration", run_it)
+    monkeypatch.setattr(calibration, "run_calibration", run_it)
     got, out, _ = run(capsys, "auto", "--mount-seed", "3", "--poses", "12", "--save", "--json")
     assert got == code
     data = json.loads(out)

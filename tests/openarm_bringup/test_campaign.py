@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup import campaign, campaign_link, campaign_report, campaign_trial
-from openarm_bringup.campaign import CampaignOptions, run_campaign
-from openarm_bringup.campaign_faults import KINDS
-from openarm_bringup.campaign_progress import Pace
-from openarm_bringup.campaign_robot import SimulatedSenses
-from openarm_bringup.campaign_tasks import FaultPlan, make_task, sets
+from openarm_bringup.campaign import campaign, link, report, trial
+from openarm_bringup.campaign.campaign import CampaignOptions, run_campaign
+from openarm_bringup.campaign.faults import KINDS
+from openarm_bringup.campaign.progress import Pace
+from openarm_bringup.campaign.robot import SimulatedSenses
+from openarm_bringup.campaign.tasks import FaultPlan, make_task, sets
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octomap_codec import read_file
 from openarm_grasp import performer
@@ -39,7 +39,7 @@ def row(seed: int, *, placed: bool = True, attempts: int = 1, false: bool = Fals
 
 def test_n01_n04_n19_rates_carry_wilson_intervals_and_attempts() -> None:
     rows = [row(0), row(1, attempts=2), row(2, placed=False, code="GRASP_LOST"), row(3, false=True, placed=False)]
-    s = campaign_report.summarise(rows)
+    s = report.summarise(rows)
     assert (s["success"], s["possible"], s["first_attempt"], s["false_success"]) == (2, 4, 1, 1)
     # Wilson's interval of 2 of 4 at 95 %: 0.150 to 0.850
     assert s["success_rate"]["low"] == pytest.approx(0.150, abs=1e-3)
@@ -52,7 +52,7 @@ def test_n01_n04_n19_rates_carry_wilson_intervals_and_attempts() -> None:
 def test_impossible_rows_count_apart() -> None:
     rows = [row(0), row(1, placed=False, expected=("TOO_WIDE",), code="TOO_WIDE"),
             row(2, placed=False, expected=("TOO_WIDE",), code="NO_PLAN")]  # fmt: skip
-    s = campaign_report.summarise(rows)
+    s = report.summarise(rows)
     assert s["possible"] == 1
     assert (s["refused_right"]["count"], s["refused_right"]["n"]) == (1, 2)
 
@@ -122,8 +122,8 @@ def test_n03_every_kind_of_fault_can_be_made_and_says_how_it_may_end() -> None:
         assert task.codes
 
 
-def trials(task, tmp_path, **kwargs) -> campaign_trial.Trials:
-    return campaign_trial.Trials(task, SimulatedSenses(depth_noise=False), GraspConfig(), folder=tmp_path, **kwargs)
+def trials(task, tmp_path, **kwargs) -> trial.Trials:
+    return trial.Trials(task, SimulatedSenses(depth_noise=False), GraspConfig(), folder=tmp_path, **kwargs)
 
 
 def test_b01_b70_two_objects_are_placed_one_after_the_other_without_a_reset(tmp_path) -> None:
@@ -181,7 +181,7 @@ def test_n02_n24_what_cannot_be_held_is_refused_and_everything_of_it_kept(tmp_pa
 
 def test_p16_nothing_that_decides_reads_ground_truth() -> None:
 
-    for module in (performer, campaign_link):
+    for module in (performer, link):
         text = Path(module.__file__ or "").read_text()
         for word in ("tracks", ".objects()", "body_pose", "qpos"):
             assert word not in text, f"{module.__name__} reads {word}"

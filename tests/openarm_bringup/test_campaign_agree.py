@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from openarm_bringup.campaign_agree import compare, rows_of, text_of
+from openarm_bringup.campaign.agree import compare, rows_of, text_of
 from openarm_common.errors import OpenArmError
 
 

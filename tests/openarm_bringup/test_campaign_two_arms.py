@@ -7,12 +7,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from openarm_bringup.campaign_gap import LEAST_GAP, ArmGap
-from openarm_bringup.campaign_planner import arms_behind
-from openarm_bringup.campaign_robot import SimRobot, SimulatedSenses
-from openarm_bringup.campaign_tasks import make_task
-from openarm_bringup.campaign_traffic import Traffic
-from openarm_bringup.campaign_trial import Trials
+from openarm_bringup.campaign.gap import LEAST_GAP, ArmGap
+from openarm_bringup.campaign.planner import arms_behind
+from openarm_bringup.campaign.robot import SimRobot, SimulatedSenses
+from openarm_bringup.campaign.tasks import make_task
+from openarm_bringup.campaign.traffic import Traffic
+from openarm_bringup.campaign.trial import Trials
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Table, random_scene
 from openarm_grasp.config import GraspConfig

@@ -13,10 +13,12 @@ from pathlib import Path
 import psutil
 import pytest
 
-from openarm_bringup import cli, graph_cli, runs
-from openarm_bringup.checks_cli import _in_order
-from openarm_bringup.demo import parse_seeds
+from openarm_bringup import cli
+from openarm_bringup.commands import graph
+from openarm_bringup.commands.checks import _in_order
+from openarm_bringup.demo.demo import parse_seeds
 from openarm_bringup.outcome import Outcome
+from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 
 ROOT = Path(__file__).parents[2]
@@ -95,10 +97,10 @@ def test_missing_module_is_named_by_graph_check(tmp_path: Path, capsys: pytest.C
 
 def test_every_graph_of_the_suite_is_sound() -> None:
     """B-66: each step of the bring-up is a graph of its own."""
-    listed = graph_cli.list_().data["graphs"]
+    listed = graph.list_().data["graphs"]
     assert set(listed) >= {"sim", "sim_only", "perception", "motion"}
     for name in listed:
-        assert graph_cli.check(name).success, name
+        assert graph.check(name).success, name
 
 
 def test_draw_writes_json_to_a_file_and_text_to_stdout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup import runs
-from openarm_bringup.graph import NodeSpec, Ready, Restart
-from openarm_bringup.keeper import NodeState
+from openarm_bringup.supervision import runs
+from openarm_bringup.supervision.graph import NodeSpec, Ready, Restart
+from openarm_bringup.supervision.keeper import NodeState
 from openarm_common.errors import OpenArmError
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from openarm_bringup.detector_data import DataConfig, make_data, write_sheet
-from openarm_bringup.detector_scene import RandomViews
+from openarm_bringup.detector.data import DataConfig, make_data, write_sheet
+from openarm_bringup.detector.scene import RandomViews
 from openarm_common.errors import OpenArmError
 from openarm_common.scene import SHAPES
 from openarm_perception.yolo_text import read_classes, read_labels

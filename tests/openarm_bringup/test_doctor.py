@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup import cli, doctor
-from openarm_bringup.graph import load_graph
-from openarm_bringup.shm import check_shm, shm_need_mib
+from openarm_bringup import cli
+from openarm_bringup.doctor import checks
+from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.shm import check_shm, shm_need_mib
 from openarm_common.errors import Code, OpenArmError
 
 GOOD = {
@@ -30,7 +31,7 @@ NATIVE = "/opt/ros/jazzy/lib/python3.12/site-packages/rclpy/__init__.py"
 
 
 def test_a08_the_simulators_version_is_the_first_check() -> None:
-    first = doctor.check_versions(GOOD)[0]
+    first = checks.check_versions(GOOD)[0]
     assert (first.name, first.level) == ("mujoco", "ok")
     assert "4.0.0" in first.seen
 
@@ -39,14 +40,14 @@ def test_a08_the_simulators_version_is_the_first_check() -> None:
     ("name", "version"), [("mujoco", "3.9.1"), ("opencv-python-headless", "5.0.1"), ("ompl", "1.7.0")]
 )
 def test_b08_wrong_versions_are_errors_with_the_wanted_range(name: str, version: str) -> None:
-    findings = {f.name: f for f in doctor.check_versions({**GOOD, name: version})}
+    findings = {f.name: f for f in checks.check_versions({**GOOD, name: version})}
     assert findings[name].level == "error"
     assert "needs >=" in findings[name].advice
     assert all(f.level == "ok" for key, f in findings.items() if key != name)
 
 
 def test_missing_package_is_an_error() -> None:
-    findings = doctor.check_versions({k: v for k, v in GOOD.items() if k != "pin"})
+    findings = checks.check_versions({k: v for k, v in GOOD.items() if k != "pin"})
     assert [f.name for f in findings if f.level == "error"] == ["pin"]
 
 
@@ -63,44 +64,44 @@ def test_missing_package_is_an_error() -> None:
     ],
 )
 def test_b09_more_than_one_ros_is_an_error(environ: dict[str, str], file: str, words: str) -> None:
-    (finding,) = doctor.check_ros(environ, file, "7.1.6", PREFIX)
+    (finding,) = checks.check_ros(environ, file, "7.1.6", PREFIX)
     assert finding.level == "error"
     assert words in finding.seen
     assert finding.advice
 
 
 def test_wheels_alone_and_native_jazzy_alone_are_both_fine() -> None:
-    assert doctor.check_ros({}, WHEEL, "7.1.6", PREFIX)[0].level == "ok"
+    assert checks.check_ros({}, WHEEL, "7.1.6", PREFIX)[0].level == "ok"
     native = {"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": "/opt/ros/jazzy"}
-    assert doctor.check_ros(native, NATIVE, "7.1.2", "/usr")[0].level == "ok"
+    assert checks.check_ros(native, NATIVE, "7.1.2", "/usr")[0].level == "ok"
 
 
 def test_rclpy_of_another_distribution_and_none_at_all_are_errors() -> None:
-    assert doctor.check_ros({}, WHEEL, "3.3.13", PREFIX)[0].level == "error"
-    assert "cannot be imported" in doctor.check_ros({}, None, "", PREFIX)[0].seen
+    assert checks.check_ros({}, WHEEL, "3.3.13", PREFIX)[0].level == "error"
+    assert "cannot be imported" in checks.check_ros({}, None, "", PREFIX)[0].seen
 
 
 def test_b11_opencv_with_a_window_system_is_an_error() -> None:
-    both = doctor.check_opencv({**GOOD, "opencv-python": "4.14.0"}, links_gl=False)
+    both = checks.check_opencv({**GOOD, "opencv-python": "4.14.0"}, links_gl=False)
     assert both.level == "error"
     assert "uninstall opencv-python," in both.advice
-    assert doctor.check_opencv(GOOD, links_gl=True).level == "error"
-    assert doctor.check_opencv(GOOD, links_gl=False).level == "ok"
+    assert checks.check_opencv(GOOD, links_gl=True).level == "error"
+    assert checks.check_opencv(GOOD, links_gl=False).level == "ok"
 
 
 def test_64_mb_of_shared_memory_are_enough_for_the_whole_graph() -> None:
     """A container's default; the figure comes from the graph, not from a constant."""
     need = shm_need_mib(load_graph("sim"), extra_participants=4)
     assert 30 < need < 62
-    assert doctor.check_shm(64.0, 63.0, need, "sim").level == "ok"
+    assert checks.check_shm(64.0, 63.0, need, "sim").level == "ok"
 
 
 def test_too_little_shared_memory_is_an_error_with_what_to_do() -> None:
     need = shm_need_mib(load_graph("sim"), extra_participants=4)
-    full = doctor.check_shm(64.0, 20.0, need, "sim")
+    full = checks.check_shm(64.0, 20.0, need, "sim")
     assert full.level == "error"
     assert "fastdds shm clean" in full.advice
-    small = doctor.check_shm(16.0, 16.0, need, "sim")
+    small = checks.check_shm(16.0, 16.0, need, "sim")
     assert "--shm-size" in small.advice
     with pytest.raises(OpenArmError) as caught:
         check_shm(load_graph("sim"), free_mib=20.0)
@@ -109,18 +110,18 @@ def test_too_little_shared_memory_is_an_error_with_what_to_do() -> None:
 
 
 def test_a10_no_display_is_fine_and_a_failing_renderer_names_one_that_works() -> None:
-    assert doctor.check_machine(2, 8.0, 0.3, display=False, wsl=True).level == "ok"
-    assert doctor.check_gl({"egl": 12.0, "osmesa": "failed"}, "egl").level == "ok"
-    other = doctor.check_gl({"egl": "failed", "osmesa": 30.0}, "egl")
+    assert checks.check_machine(2, 8.0, 0.3, display=False, wsl=True).level == "ok"
+    assert checks.check_gl({"egl": 12.0, "osmesa": "failed"}, "egl").level == "ok"
+    other = checks.check_gl({"egl": "failed", "osmesa": 30.0}, "egl")
     assert (other.level, other.advice) == ("error", "set MUJOCO_GL=osmesa")
-    assert "apt-get install libegl1" in doctor.check_gl({"egl": "failed", "osmesa": "failed"}, "egl").advice
+    assert "apt-get install libegl1" in checks.check_gl({"egl": "failed", "osmesa": "failed"}, "egl").advice
 
 
 @pytest.mark.parametrize(
     ("text", "level"), [("0", "ok"), ("101", "ok"), ("102", "note"), ("250", "error"), ("x", "error")]
 )
 def test_domain(text: str, level: str) -> None:
-    assert doctor.check_domain(text, 32768).level == level
+    assert checks.check_domain(text, 32768).level == level
 
 
 @pytest.mark.parametrize(
@@ -134,13 +135,13 @@ def test_domain(text: str, level: str) -> None:
     ],
 )
 def test_n17_python_and_machine(version: tuple[int, int], system: str, machine: str, level: str) -> None:
-    assert doctor.check_python(version, system, machine).level == level
+    assert checks.check_python(version, system, machine).level == level
 
 
 def test_environment_that_changes_discovery_is_noted() -> None:
-    notes = doctor.check_rmw({"ROS_LOCALHOST_ONLY": "1", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"})
+    notes = checks.check_rmw({"ROS_LOCALHOST_ONLY": "1", "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"})
     assert [finding.level for finding in notes] == ["note", "note"]
-    assert [finding.level for finding in doctor.check_rmw({})] == ["ok", "ok"]
+    assert [finding.level for finding in checks.check_rmw({})] == ["ok", "ok"]
 
 
 @pytest.mark.slow

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import pytest
 
-from openarm_bringup.doctor_graph import Heard, check_heard, check_nodes
-from openarm_bringup.runs import NodeRecord, RunRecord
+from openarm_bringup.doctor.graph import Heard, check_heard, check_nodes
+from openarm_bringup.supervision.runs import NodeRecord, RunRecord
 
 NODES = {name: NodeRecord(state="ready") for name in ("mujoco_bridge", "detector", "grasp")}
 WELL = {name: (True, "fine") for name in NODES}

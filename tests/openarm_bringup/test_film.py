@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from openarm_bringup.film import Film, save_picture
+from openarm_bringup.judging.film import Film, save_picture
 from openarm_common.errors import OpenArmError
 
 

@@ -13,9 +13,10 @@ from openarm_interfaces.msg import GraspStatus
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from openarm_bringup import golden, record_cli
-from openarm_bringup.bag import BagWriter, open_bag
-from openarm_bringup.bag_client import numbers_of
+from openarm_bringup.bags import golden
+from openarm_bringup.bags.bag import BagWriter, open_bag
+from openarm_bringup.bags.bag_client import numbers_of
+from openarm_bringup.commands import record
 from openarm_common.errors import Code, OpenArmError
 
 BAG = Path(__file__).parents[1] / "data" / "demo_pick"
@@ -61,7 +62,7 @@ def test_a_changed_golden_number_fails_and_is_named(tmp_path: Path) -> None:
     data["numbers"]["detection/overhead/blue/x_mm"]["value"] += 1.0
     data["numbers"]["detection/overhead/pink/frames"] = {"value": 3, "tolerance": 0}
     path.write_text(json.dumps(data))
-    outcome = record_cli.check(BAG, golden=path)
+    outcome = record.check(BAG, golden=path)
     assert not outcome.success
     assert "2 of" in outcome.message
     assert "detection/overhead/blue/x_mm" in outcome.text

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup.draw import mermaid, text
-from openarm_bringup.graph import load_graph
+from openarm_bringup.supervision.draw import mermaid, text
+from openarm_bringup.supervision.graph import load_graph
 from openarm_common.errors import Code, OpenArmError
 
 BASE = """

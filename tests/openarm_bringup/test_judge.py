@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from openarm_bringup.judge import JudgeConfig, Sample, at_rest, judge
+from openarm_bringup.judging.judge import JudgeConfig, Sample, at_rest, judge
 
 TARGET = (0.3, -0.2)
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from openarm_bringup.losses import Arrivals
+from openarm_bringup.bags.losses import Arrivals
 
 
 def missing(numbers: Sequence[int], publishers: int) -> int:

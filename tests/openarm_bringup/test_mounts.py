@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup import mounts
-from openarm_bringup.calibration_run import CalibrationOptions, CalibrationRun
+from openarm_bringup.calibration.run import CalibrationOptions, CalibrationRun
+from openarm_bringup.demo import mounts
 from openarm_calibration.client import AutoResult
 from openarm_calibration.store import CalibrationStore, StoredCalibration
 from openarm_common.cameras import load_cameras, true_mount

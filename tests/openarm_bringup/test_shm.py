@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup.environment import node_arguments, node_environment
-from openarm_bringup.graph import Graph, NodeSpec
-from openarm_bringup.shm import fields_of, mapped_by, names_of, ports_of, shm_need_mib, sweep
+from openarm_bringup.supervision.environment import node_arguments, node_environment
+from openarm_bringup.supervision.graph import Graph, NodeSpec
+from openarm_bringup.supervision.shm import fields_of, mapped_by, names_of, ports_of, shm_need_mib, sweep
 
 
 def make(folder: Path, name: str, *, lock: bool) -> Path:

@@ -17,11 +17,11 @@ from pathlib import Path
 import psutil
 import pytest
 
-from openarm_bringup import runs
-from openarm_bringup.graph import Graph, NodeSpec, Ready, Restart
-from openarm_bringup.keeper import NodeState
-from openarm_bringup.process import Ladder
-from openarm_bringup.supervisor import Event, Supervisor
+from openarm_bringup.supervision import runs
+from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready, Restart
+from openarm_bringup.supervision.keeper import NodeState
+from openarm_bringup.supervision.process import Ladder
+from openarm_bringup.supervision.supervisor import Event, Supervisor
 from openarm_common.errors import Code, OpenArmError
 
 #: Touches the file named by the first argument, as a server that has come up.

@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from openarm_bringup.judge import JudgeConfig, Sample, judge
-from openarm_bringup.report import machine, scene_hash, summarise, versions, wilson_low
-from openarm_bringup.trial import Trial, choose_target, shows
+from openarm_bringup.judging.judge import JudgeConfig, Sample, judge
+from openarm_bringup.judging.provenance import machine, scene_hash, summarise, versions, wilson_low
+from openarm_bringup.judging.trial import Trial, choose_target, shows
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Scene, load_scene
 

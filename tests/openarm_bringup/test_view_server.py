@@ -16,8 +16,8 @@ import aiohttp
 import pytest
 from aiohttp import web
 
-from openarm_bringup.view_guard import Guard
-from openarm_bringup.view_server import PAGE, Item, Order, Reset, ViewServer
+from openarm_bringup.view.guard import Guard
+from openarm_bringup.view.server import PAGE, Item, Order, Reset, ViewServer
 from openarm_common.errors import Code, OpenArmError
 
 
@@ -307,7 +307,7 @@ def test_what_the_graph_refuses_is_said() -> None:
 
 def test_files_outside_of_the_page_are_not_there() -> None:
     async def test(bench: Bench) -> None:
-        for path in ("/../view_server.py", "/%2e%2e/view_server.py", "/view_page/../cli.py", "/index.html", "/nothing"):
+        for path in ("/../server.py", "/%2e%2e/server.py", "/page/../server.py", "/index.html", "/nothing"):
             assert (await bench.get(path))[0] == 404, path
         assert (await bench.get("/view.js"))[0] == 200
 

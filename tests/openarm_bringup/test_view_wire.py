@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from openarm_bringup import view_wire
+from openarm_bringup.view import wire
 from openarm_common import se3
 from openarm_common.cameras import Intrinsics
 from openarm_common.description import SIDES, RobotDescription
@@ -21,7 +21,7 @@ from openarm_perception.depth import Deprojector, DepthLimits
 
 @pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd", "µ"])
 def test_a_frame_is_head_and_arrays_that_begin_at_a_multiple_of_four(name: str) -> None:
-    data = view_wire.frame({"kind": name}, np.array([[1.5, 2.5]], np.float32), np.array([7, 8], np.uint8), b"\x09")
+    data = wire.frame({"kind": name}, np.array([[1.5, 2.5]], np.float32), np.array([7, 8], np.uint8), b"\x09")
     length = int.from_bytes(data[:4], "little")
     assert length % 4 == 0
     assert json.loads(data[4 : 4 + length]) == {"kind": name}
@@ -33,8 +33,8 @@ def test_a_frame_is_head_and_arrays_that_begin_at_a_multiple_of_four(name: str) 
 def test_shapes_and_poses_put_every_shape_where_the_description_does() -> None:
     description = RobotDescription.load()
     q = {description.finger_joint(side): 0.01 for side in SIDES} | {"openarm_right_joint4": 1.0}
-    shapes = json.loads(json.dumps(view_wire.robot_shapes(description)))
-    poses = view_wire.link_poses(description, q)
+    shapes = json.loads(json.dumps(wire.robot_shapes(description)))
+    poses = wire.link_poses(description, q)
     assert poses.shape == (len(description.links), 16)
     full = {name: 0.0 for name, joint in description.joints.items() if joint.type != "fixed"} | q
     visuals = [(link, shape) for link in description.links.values() for shape in link.visual]
@@ -52,7 +52,7 @@ def test_occupied_cells_cover_what_is_occupied_and_nothing_else() -> None:
     states = rng.choice(np.array([0, 1, 2], np.uint8), lattice.shape, p=(0.5, 0.3, 0.2))
     states[:4, :4, :4] = 2  # pruned to one leaf
     payload = encode_states(lattice, states)
-    cells = view_wire.occupied_cells(decode(payload.data, lattice.resolution, binary=True))
+    cells = wire.occupied_cells(decode(payload.data, lattice.resolution, binary=True))
     assert {round(float(edge), 3) for edge in cells[:, 3]} >= {0.05, 0.2}
     assert np.sum(np.round(cells[:, 3] / 0.05) ** 3) == np.count_nonzero(states == 2)
     for x, y, z, edge in cells:
@@ -70,7 +70,7 @@ def test_a_cloud_is_thin_coloured_and_in_the_base_frame() -> None:
     rgb[60:, :, 1] = 250  # the lower half is green
     intrinsics = Intrinsics.from_fovy(160, 120, 60.0)
     T_base_optical = se3.make(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), (1.0, 0.0, 0.5))
-    maker = view_wire.CloudMaker(Deprojector(DepthLimits()), edge=0.02, stride=2)
+    maker = wire.CloudMaker(Deprojector(DepthLimits()), edge=0.02, stride=2)
     points, colors = maker.make(depth, rgb, intrinsics, T_base_optical)
     np.testing.assert_allclose(points[:, 0], 1.8, atol=1e-4)
     assert 500 < len(points) == len(colors) < 50 * 60
@@ -85,7 +85,7 @@ def test_a_cloud_is_thin_coloured_and_in_the_base_frame() -> None:
 
 
 def test_a_colour_image_of_another_size_is_refused() -> None:
-    maker = view_wire.CloudMaker(Deprojector(DepthLimits()))
+    maker = wire.CloudMaker(Deprojector(DepthLimits()))
     with pytest.raises(OpenArmError, match=r"\(4, 4\), depth \(8, 8\)"):
         maker.make(np.ones((8, 8), np.float32), np.zeros((4, 4, 3), np.uint8), Intrinsics(8, 8, 4, 4, 4, 4), np.eye(4))
 
@@ -93,6 +93,6 @@ def test_a_colour_image_of_another_size_is_refused() -> None:
 def test_a_picture_keeps_its_colours() -> None:
     rgb = np.zeros((32, 32, 3), np.uint8)
     rgb[..., 0] = 200
-    back = cv2.imdecode(np.frombuffer(view_wire.jpeg(rgb), np.uint8), cv2.IMREAD_COLOR)
+    back = cv2.imdecode(np.frombuffer(wire.jpeg(rgb), np.uint8), cv2.IMREAD_COLOR)
     assert back[16, 16, 2] > 180
     assert back[16, 16, :2].max() < 20

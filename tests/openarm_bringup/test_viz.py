@@ -13,12 +13,12 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
-from openarm_bringup import up_cli
-from openarm_bringup.definitions import full_definition
-from openarm_bringup.graph import Graph, load_graph
+from openarm_bringup.bags.definitions import full_definition
+from openarm_bringup.commands import up
 from openarm_bringup.outcome import Outcome
-from openarm_bringup.viz import NODE, TOKEN_VARIABLE, app_link, with_viz
-from openarm_bringup.viz_proxy import hidden_address
+from openarm_bringup.supervision.graph import Graph, load_graph
+from openarm_bringup.view.proxy import hidden_address
+from openarm_bringup.view.viz import NODE, TOKEN_VARIABLE, app_link, with_viz
 from openarm_common.errors import Code, OpenArmError
 
 ROOT = Path(__file__).parents[2]
@@ -59,13 +59,13 @@ def test_up_sets_parameters_of_the_added_node_too(monkeypatch: pytest.MonkeyPatc
         started.append(graph)
         return Outcome(True)
 
-    monkeypatch.setattr(up_cli, "_up", note)
+    monkeypatch.setattr(up, "_up", note)
     sets = ("foxglove.origins=[http://localhost:8080]", "mujoco_bridge.images=false")
-    assert up_cli.up("sim_only", set_=sets, viz=True, viz_port=free_port()).success
+    assert up.up("sim_only", set_=sets, viz=True, viz_port=free_port()).success
     assert started[0].nodes[NODE].params["origins"] == ["http://localhost:8080"]
     assert started[0].nodes["mujoco_bridge"].params["images"] is False
     with pytest.raises(OpenArmError, match="no node 'foxglove'"):
-        up_cli.up("sim_only", set_=sets)
+        up.up("sim_only", set_=sets)
 
 
 def test_a_missing_sdk_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:

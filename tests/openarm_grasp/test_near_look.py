@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from openarm_bringup.campaign_robot import SimulatedSenses
-from openarm_bringup.campaign_tasks import Task
-from openarm_bringup.campaign_trial import Trials
+from openarm_bringup.campaign.robot import SimulatedSenses
+from openarm_bringup.campaign.tasks import Task
+from openarm_bringup.campaign.trial import Trials
 from openarm_common import se3
 from openarm_common.cameras import load_cameras
 from openarm_common.errors import Code

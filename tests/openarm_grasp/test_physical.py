@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from openarm_bringup.campaign_robot import SimulatedSenses
-from openarm_bringup.campaign_tasks import Task, endurance
-from openarm_bringup.campaign_trial import Trials
+from openarm_bringup.campaign.robot import SimulatedSenses
+from openarm_bringup.campaign.tasks import Task, endurance
+from openarm_bringup.campaign.trial import Trials
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Scene, SceneObject
 from openarm_grasp import effects as fx

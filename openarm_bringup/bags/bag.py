@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags: standard rosbag2 folders with MCAP files, written and read by rosbags without deserialising messages.
+
+Stamps of a bag are when a message was received, ns of the system clock. The text of a message definition is made from
+the installed Python class, so that every installed type can be recorded, also a user's own.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import Connection, Qos
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from openarm_bringup.bags.mcap import mend
+from openarm_common.errors import Code, OpenArmError
+
+_PRIMITIVES = {"float": "float32", "double": "float64", "boolean": "bool", "octet": "byte"}
+_ARRAY = re.compile(r"^sequence<(?P<seq>.+?)(?:, (?P<bound>\d+))?>$|^(?P<arr>.+)\[(?P<size>\d+)\]$")
+
+
+@dataclass(frozen=True)
+class Record:
+    """A message as it is in a bag: `data` is CDR."""
+
+    topic: str
+    type: str
+    t_ns: int
+    data: bytes
+
+
+def definition(message: type[Any]) -> str:
+    """Return the text of a message's definition, from its Python class.
+
+    Args:
+        message: A class that rosidl generated.
+    """
+    lines = [f"{_ros_type(kind)} {name}" for name, kind in message.get_fields_and_field_types().items()]
+    return "\n".join([*_constants(message), *lines]) + "\n"
+
+
+def _ros_type(kind: str) -> str:
+    match = _ARRAY.match(kind)
+    if match is None:
+        return _PRIMITIVES.get(kind, kind)
+    if match["arr"]:
+        return f"{_ros_type(match['arr'])}[{match['size']}]"
+    return f"{_ros_type(match['seq'])}[{'<=' + match['bound'] if match['bound'] else ''}]"
+
+
+def _constants(message: type[Any]) -> list[str]:
+    # rosidl keeps them on the metaclass, without their type; the hash of a type does not hold constants.
+    values: Mapping[str, Any] = getattr(type(message), f"_{type(message).__name__}__constants", {})
+    kinds = {bool: "bool", int: "int64", float: "float64", str: "string", bytes: "byte"}
+    return [f"{kinds[type(value)]} {name}={value!r}" for name, value in values.items() if type(value) in kinds]
+
+
+def nested_types(message: type[Any]) -> list[str]:
+    """Names, such as `std_msgs/msg/Header`, of the types of a message's fields that are messages themselves."""
+    found: list[str] = []
+    for kind in message.get_fields_and_field_types().values():
+        match = _ARRAY.match(kind)
+        base = (match["seq"] or match["arr"]) if match else kind
+        if "/" in base:
+            package, _, short = base.partition("/")
+            found.append(f"{package}/msg/{short.removeprefix('msg/')}")
+    return found
+
+
+class Types:
+    """Definitions of the messages that are met, by name such as `sensor_msgs/msg/Image`."""
+
+    def __init__(self) -> None:
+        self.store: Typestore = get_typestore(Stores.ROS2_JAZZY)
+
+    def add(self, name: str) -> None:
+        """Learn a type and all that it is made of.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when no installed package has it.
+        """
+        if name in self.store.types:
+            return
+        message = message_class(name)
+        for inner in nested_types(message):
+            self.add(inner)
+        self.store.register(get_types_from_msg(definition(message), name))
+
+
+def message_class(name: str) -> type[Any]:
+    """Return the installed class of a message type.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when there is none.
+    """
+    package, _, short = name.replace("/msg/", "/").partition("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), short)
+    except (AttributeError, ModuleNotFoundError, ValueError) as error:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, f"no installed package has the message type {name!r} ({error})"
+        ) from error
+
+
+class BagWriter:
+    """Writes a bag; a context manager.
+
+    Args:
+        path: Folder of the bag, which must not exist.
+        custom: Kept in the metadata: versions, graph, parameters.
+        compress: Whether chunks are compressed (zstd).
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when the folder exists or can't be made.
+    """
+
+    def __init__(self, path: Path, custom: Mapping[str, str], *, compress: bool = True) -> None:
+        self._types = Types()
+        self._writer = (
+            Writer(path, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+            if not (path.exists())
+            else _refuse(path)
+        )
+        if compress:
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        for key, value in custom.items():
+            self.remember(key, value)
+        self._connections: dict[str, Connection] = {}
+
+    def __enter__(self) -> BagWriter:
+        try:
+            self._writer.open()
+        except OSError as error:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"can't make the bag {self._writer.path}: {error}") from error
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, OSError):
+            self._writer.abort()  # a full disk takes no index either; `open_bag` mends the file
+        else:
+            self._writer.close()
+
+    def remember(self, key: str, value: str) -> None:
+        """Keep something in the metadata, which are written at the end."""
+        self._writer.set_custom_data(key, value)
+
+    def add_topic(self, topic: str, kind: str, qos: Qos) -> None:
+        """Say what a topic is, before its first message."""
+        self._types.add(kind)
+        self._connections[topic] = self._writer.add_connection(
+            topic, kind, typestore=self._types.store, offered_qos_profiles=[qos]
+        )
+
+    def write(self, topic: str, t_ns: int, data: bytes) -> None:
+        """Append a message.
+
+        Raises:
+            OSError: When the disk is full.
+        """
+        self._writer.write(self._connections[topic], t_ns, data)
+
+
+def _refuse(path: Path) -> Any:
+    raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} exists; give the bag another name, a bag is never overwritten")
+
+
+class Bag:
+    """A bag that is open for reading; made by `open_bag`.
+
+    Attributes:
+        path: As it was given.
+        topics: Type and offered quality of service of each topic.
+        counts: Messages by topic.
+        custom: What was kept with it.
+        start_ns: Of the first message.
+        duration_s: To the last message.
+        mended: How many bytes of an unfinished file were given up; None for a bag that was closed in order.
+    """
+
+    def __init__(self, path: Path, reader: Reader, mended: int | None) -> None:
+        self.path = path
+        self.mended = mended
+        self._reader = reader
+        self.topics: dict[str, tuple[str, Qos | None]] = {}
+        self.counts: dict[str, int] = {}
+        for connection in reader.connections:
+            profiles: Sequence[Qos] = getattr(connection.ext, "offered_qos_profiles", [])
+            self.topics[connection.topic] = (connection.msgtype, profiles[0] if profiles else None)
+            self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
+        self.custom: Mapping[str, str] = reader.storage.metadata.custom or {}
+        self.start_ns = reader.start_time
+        self.duration_s = max(0, reader.duration - 1) * 1e-9
+
+    def records(self, topics: Sequence[str] | None = None, start_s: float = 0.0) -> Iterator[Record]:
+        """Messages in the order in which they were received.
+
+        Args:
+            topics: Only these; None takes all.
+            start_s: Only from this long after the first on.
+        """
+        chosen = [c for c in self._reader.connections if topics is None or c.topic in topics]
+        if not chosen:
+            return
+        start = self.start_ns + round(start_s * 1e9) if start_s else None
+        try:
+            for connection, t_ns, data in self._reader.messages(chosen, start=start):
+                yield Record(connection.topic, connection.msgtype, t_ns, bytes(data))
+        except (ReaderError, EOFError, ValueError) as error:
+            raise _damaged(self.path, error) from error
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Bag]:
+    """Open a rosbag2 folder or an MCAP file for reading.
+
+    A recording that was cut short (SIGKILL, full disk) lacks its end: everything whole in it is kept, the end is
+    written anew and the metadata made from the file.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when it is missing, empty, truncated beyond use, or something else.
+    """
+    if not path.exists():
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"there is no bag at {path}")
+    source, mended = path, None
+    if path.is_dir():
+        files = sorted(path.glob("*.mcap"))
+        if not (path / "metadata.yaml").exists():
+            if len(files) != 1:
+                raise OpenArmError(
+                    Code.INVALID_ARGUMENT,
+                    f"{path} is not a bag: expected metadata.yaml or one .mcap file, found "
+                    f"{', '.join(p.name for p in sorted(path.iterdir())[:5]) or 'nothing'}",
+                )
+            source = files[0]
+    if source.is_file() and source.suffix == ".mcap":
+        mended = mend(source)
+    elif source.is_file():
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} is not a bag: expected a folder of rosbag2 or an .mcap file")
+    reader = Reader(source)
+    try:
+        reader.open()
+    except (ReaderError, OSError, EOFError, ValueError, TypeError) as error:
+        raise _damaged(path, error) from error
+    try:
+        yield Bag(path, reader, mended)
+    finally:
+        reader.close()
+
+
+def _damaged(path: Path, error: Exception) -> OpenArmError:
+    return OpenArmError(Code.INVALID_ARGUMENT, f"{path} can't be read as a bag: {error}")

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrates cameras of the simulated robot: a graph of its own, one scene a camera, the action of the node."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from openarm_bringup.supervision import environment, runs
+from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.session import in_thread, running_graph
+from openarm_common.cameras import load_cameras
+from openarm_common.domain import reserve_domain
+from openarm_common.errors import Code, OpenArmError
+
+if TYPE_CHECKING:
+    from openarm_bringup.supervision.supervisor import Event
+    from openarm_calibration.client import AutoResult, OnFeedback
+
+GRAPH = "calibrate"
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """What to calibrate.
+
+    Args:
+        cameras: Names; each needs a scene `calibration_<camera>`.
+        mount_seed: Of the true mounts, or "none"; None is the graph's.
+        poses: Samples a camera at most; 0 is the node's parameter.
+        enough: Predicted errors that end it, m and rad; 0 is the node's parameter.
+        save: Store results that do not fail.
+        store: Folder of stored calibrations; None is the default one.
+        delay: Also measure the age of the images.
+        domain: ROS_DOMAIN_ID; None is a free one.
+        sets: Parameters, as node.param=value.
+    """
+
+    cameras: tuple[str, ...] = ("overhead", "wrist")
+    mount_seed: int | Literal["none"] | None = None
+    poses: int = 0
+    enough: tuple[float, float] = (0.0, 0.0)
+    save: bool = False
+    store: Path | None = None
+    delay: bool = False
+    domain: int | None = None
+    sets: tuple[str, ...] = ()
+
+
+@dataclass
+class CalibrationListeners:
+    """Who is told what while it happens; each is called in some thread."""
+
+    on_event: Callable[[Event], None] = lambda event: None
+    on_ready: Callable[[float], None] = lambda seconds: None
+    on_camera: Callable[[str], None] = lambda camera: None
+    on_feedback: OnFeedback = lambda feedback: None
+
+
+@dataclass
+class CalibrationRun:
+    """What came out, by camera in the order of the work; session files lie in the run folder."""
+
+    run_dir: Path
+    results: dict[str, AutoResult] = field(default_factory=dict[str, "AutoResult"])
+    ready_s: float = 0.0
+    error: OpenArmError | None = None
+
+
+def scene_of(camera: str) -> str:
+    """Name of the scene in which a camera is calibrated."""
+    return f"calibration_{camera}"
+
+
+def chosen_cameras(names: Sequence[str]) -> tuple[str, ...]:
+    """Check names of cameras.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, listing those that can be calibrated.
+    """
+    can = [camera.name for camera in load_cameras().values() if camera.mount_error]
+    for name in names:
+        if name not in can:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no camera {name!r} to calibrate; cameras: {', '.join(can)}")
+    return tuple(names)
+
+
+def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners | None = None) -> CalibrationRun:
+    """Calibrate; the graph is stopped whatever happens.
+
+    Raises:
+        OpenArmError: What is wrong with the options; what happens later is in the result.
+    """
+    cameras = chosen_cameras(options.cameras)
+    domain = reserve_domain() if options.domain is None else options.domain
+    sets = [*options.sets, f"calibration.camera={cameras[0]}"]
+    if options.store is not None:
+        folder = options.store.expanduser().absolute()
+        sets += [f"calibration.store={folder}", f"calibration_publisher.store={folder}"]
+    overrides = {"domain": domain, "scene": scene_of(cameras[0]), "mount_seed": options.mount_seed}
+    graph = load_graph(GRAPH, overrides=overrides, sets=sets)
+    run = CalibrationRun(runs.new_run_dir())
+    told = listeners or CalibrationListeners()
+    stop = threading.Event()
+
+    async def work() -> None:
+        began = time.monotonic()
+        # Clients made in this process find the graph through the environment.
+        os.environ.update(environment.ros_environment(graph))
+        async with running_graph(graph, run.run_dir, told.on_event) as supervisor:
+            await supervisor.wait_ready()
+            run.ready_s = time.monotonic() - began
+            told.on_ready(run.ready_s)
+            job = in_thread(lambda: _all(options, cameras, run, told, stop), "calibration")
+            asked = asyncio.create_task(supervisor.wait_stop_asked())
+            await asyncio.wait([job, asked], return_when=asyncio.FIRST_COMPLETED)
+            try:
+                if not job.done():
+                    stop.set()
+                    await asyncio.wait([job], timeout=10.0)
+                    asked.result()
+                    raise OpenArmError(Code.CANCELLED, "stopped by Ctrl-C")
+                job.result()
+            finally:
+                asked.cancel()
+
+    try:
+        asyncio.run(work())
+    except OpenArmError as error:
+        run.error = error
+    return run
+
+
+def _all(
+    options: CalibrationOptions,
+    cameras: Sequence[str],
+    run: CalibrationRun,
+    told: CalibrationListeners,
+    stop: threading.Event,
+) -> None:
+    from openarm_bringup.calibration.scene_client import SceneClient
+    from openarm_calibration.client import CalibrationClient
+
+    with SceneClient() as scenes, CalibrationClient() as client:
+        for k, camera in enumerate(cameras):
+            told.on_camera(camera)
+            if k:
+                scenes.reset_world(scene_of(camera))
+            run.results[camera] = client.auto(
+                camera,
+                poses=options.poses,
+                sigma=options.enough,
+                measure_delay=options.delay,
+                save=options.save,
+                session=str((run.run_dir / f"{camera}.npz").absolute()),
+                on_feedback=told.on_feedback,
+                stop=stop,
+            )
+            if stop.is_set():
+                return
+
+
+def as_row(result: AutoResult) -> dict[str, Any]:
+    """What `--json` and reports write of one camera."""
+    T = result.T_parent_link
+    return {
+        "success": result.success,
+        "code": str(result.code),
+        "message": result.message,
+        "grade": result.grade,
+        "T_parent_link": None if T is None else T.tolist(),
+        "sigma_translation": result.sigma_translation,
+        "sigma_rotation": result.sigma_rotation,
+        "samples": result.samples,
+        "missed": list(result.missed),
+        "delay": None if result.delay is None else {"seconds": result.delay[0], "sigma": result.delay[1]},
+        "path": result.path,
+        "duration": result.duration,
+    }

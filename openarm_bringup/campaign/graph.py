@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The same campaign through the node graph: every request over DDS, in real time, judged by the same rules."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from openarm_bringup.campaign.campaign import Campaign, CampaignOptions, Row, keep_row, read_rows, write_reports
+from openarm_bringup.campaign.tasks import Task, make_task
+from openarm_bringup.campaign.trial import crashed_row, row_of
+from openarm_bringup.judging.trial import Ask, run_trial
+from openarm_bringup.supervision import environment
+from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.session import in_thread, running_graph
+from openarm_common.domain import reserve_domain
+from openarm_common.errors import Code, OpenArmError
+
+if TYPE_CHECKING:
+    from openarm_bringup.judging.observer_client import Observer
+    from openarm_grasp.client import GraspClient
+
+#: Sets whose scenes are random scenes, which the bridge draws from the seed by itself.
+GRAPH_SETS = ("nominal",)
+#: Looks in a row that make a free cell of the map occupied, where depth is noisy.
+_NOISY_MARK = 3
+
+
+def run_graph_campaign(
+    options: CampaignOptions,
+    folder: Path,
+    on_row: Callable[[Row], None] = lambda row: None,
+    on_begin: Callable[[int], None] = lambda done: None,
+) -> Campaign:
+    """Run all seeds that the folder has no row of through a graph of its own, and write the reports.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for what only the campaign in one process can do; whatever ends the graph.
+    """
+    if options.set_name not in GRAPH_SETS or len(options.mount_seeds) > 1 or options.workers != 1:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"a campaign through the graph runs the sets {', '.join(GRAPH_SETS)} with one worker and at most one mount"
+            f" seed; asked for {options.set_name!r}, {options.workers} workers, mount seeds {options.mount_seeds}",
+        )
+    campaign = Campaign(folder, options, read_rows(folder, options))
+    campaign.resumed = len(campaign.rows)
+    on_begin(campaign.resumed)
+    done = {row["seed"] for row in campaign.rows}
+    tasks = [make_task(options.set_name, seed) for seed in options.seeds if seed not in done]
+    began = time.monotonic()
+    try:
+        if tasks:
+            asyncio.run(_run(campaign, tasks, on_row))
+    finally:
+        campaign.wall_s = time.monotonic() - began
+        write_reports(campaign)
+    return campaign
+
+
+async def _run(campaign: Campaign, tasks: list[Task], on_row: Callable[[Row], None]) -> None:
+    options = campaign.options
+    overrides: dict[str, Any] = {"domain": reserve_domain(), "scene": "random", "seed": tasks[0].seed}
+    if options.mount_seeds:
+        overrides["mount_seed"] = options.mount_seeds[0]
+    sets = [f"mujoco_bridge.depth_noise.enabled={str(options.noise).lower()}"]
+    if options.noise:
+        # at edges a noisy camera sees points in the air: the map believes what it sees again and again
+        sets.append(f"octomap.grid.frames_to_mark={_NOISY_MARK}")
+    sets.append(f"grasp.held.use_effort={str(options.use_effort).lower()}")
+    sets += [f"{node}.detector={options.detector}" for node in ("detector", "wrist_detector")]
+    graph = load_graph("sim", overrides=overrides, sets=tuple(sets))
+    for name in ("logs", "params"):
+        (campaign.folder / name).mkdir(parents=True, exist_ok=True)
+    # Clients made in this process find the graph through the environment.
+    os.environ.update(environment.ros_environment(graph))
+    async with running_graph(graph, campaign.folder) as supervisor:
+        await supervisor.wait_ready()
+        from openarm_bringup.judging.observer_client import Observer
+        from openarm_grasp.client import GraspClient
+
+        with Observer(environment.domain_id(graph)) as observer, GraspClient() as client:
+
+            def work() -> None:
+                for task in tasks:
+                    row = {**_row(observer, client, task), "again": f"{options.command(task.seed)} --graph"}
+                    keep_row(campaign, row)
+                    on_row(row)
+
+            trials = in_thread(work, "trials")
+            stop = asyncio.create_task(supervisor.wait_stop_asked())
+            await asyncio.wait([trials, stop], return_when=asyncio.FIRST_COMPLETED)
+            try:
+                if not trials.done():
+                    client.cancel()
+                    await asyncio.wait([trials], timeout=5.0)
+                    stop.result()
+                    raise OpenArmError(Code.CANCELLED, "stopped by Ctrl-C")
+                trials.result()
+            finally:
+                stop.cancel()
+
+
+def _row(observer: Observer, client: GraspClient, task: Task) -> Row:
+    began = time.monotonic()
+    try:
+        after_ns = observer.reset_world("random", task.seed)
+        trials = [
+            run_trial(
+                observer, client, task.scene, Ask(label, task.arm), seed=task.seed, after_ns=after_ns, moved=k > 0
+            )
+            for k, label in enumerate(task.labels)
+        ]
+    except OpenArmError as error:
+        return crashed_row(task, error)
+    return row_of(task, trials, time.monotonic() - began)

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm calibrate`: boards, and what is done with a session file; only `auto` and `sample` need a robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import App, Parameter
+
+from openarm_bringup.calibration.source import NOT_GIVEN, Recording, Solved, now, store_in, stored_of, with_solved
+from openarm_bringup.commands import calibrate_live
+from openarm_bringup.outcome import Outcome
+from openarm_common.errors import Code, OpenArmError
+
+if TYPE_CHECKING:
+    from openarm_calibration.store import CalibrationStore, StoredCalibration
+
+app = App(name="calibrate", help="Where are the cameras? Boards, solving, checking and storing hand-eye calibrations.")
+
+app.command(calibrate_live.auto)
+app.command(calibrate_live.sample)
+
+
+@app.command
+def board(
+    out: Path,
+    *,
+    kind: Literal["circles", "charuco"] = "circles",
+    columns: int | None = None,
+    rows: int | None = None,
+    spacing: float | None = None,
+    diameter: float | None = None,
+    border: float | None = None,
+    dpi: int = 300,
+) -> Outcome:
+    """Write a calibration board: .png or .pdf true to scale for a printer, .xml (MJCF) for a simulated scene.
+
+    Args:
+        out: File to write; its ending chooses the form.
+        kind: An asymmetric circle grid, or ChArUco.
+        columns: Circles in a row (4), or squares in a row (7).
+        rows: Rows of circles (11, odd), or of squares (5).
+        spacing: Between rows of circles (0.02), or edge of a square (0.034), m.
+        diameter: Of a circle (0.015), or edge of a marker (0.026), m.
+        border: White around the marks, m.
+        dpi: Of a PNG.
+    """
+    from openarm_calibration.board import parse_board
+    from openarm_calibration.board_files import write_board
+
+    given = {"columns": columns, "rows": rows, "spacing": spacing, "diameter": diameter, "border": border}
+    chosen = {key: value for key, value in given.items() if value is not None}
+    try:
+        made = parse_board({"kind": kind, **chosen}, "board")
+    except OpenArmError as error:
+        raise OpenArmError(Code.INVALID_ARGUMENT, error.message) from error
+    message = write_board(made, out, dpi)
+    return Outcome(True, message, data={"written": str(out), "board": made.model_dump(), "size": list(made.size)})
+
+
+@app.command
+def solve(
+    samples: Path,
+    *,
+    algorithm: str = "REFINED",
+    exclude: tuple[str, ...] = (),
+    free_intrinsics: Annotated[bool, Parameter(negative=())] = False,
+    save: Annotated[bool, Parameter(negative=())] = False,
+    store: Path | None = None,
+    recording: Recording = NOT_GIVEN,
+) -> Outcome:
+    """Solve a session file or a bag and say how good the result is.
+
+    Args:
+        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
+        algorithm: REFINED, or a closed form: TSAI PARK HORAUD ANDREFF DANIILIDIS SHAH LI.
+        exclude: Names of samples to leave out.
+        free_intrinsics: Find focal lengths and principal point as well, where those of camera_info are in doubt.
+        save: Store the result, unless it fails.
+        store: Folder of stored calibrations.
+        recording: What a bag does not say.
+    """
+    place = store_in(store) if save else None
+    return with_solved(
+        samples,
+        recording,
+        exclude,
+        store,
+        lambda done: _outcome(done, place),
+        algorithm=algorithm,
+        free_intrinsics=free_intrinsics,
+    )
+
+
+@app.command
+def check(
+    samples: Path, *, exclude: tuple[str, ...] = (), store: Path | None = None, recording: Recording = NOT_GIVEN
+) -> Outcome:
+    """Judge a session file or a bag and its distance from what is stored; exit code 1 when it fails the limits.
+
+    Args:
+        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
+        exclude: Names of samples to leave out.
+        store: Folder of stored calibrations.
+        recording: What a bag does not say.
+    """
+    return with_solved(samples, recording, exclude, store, lambda done: _outcome(done, None))
+
+
+@app.command
+def save(
+    samples: Path,
+    *,
+    algorithm: str = "REFINED",
+    exclude: tuple[str, ...] = (),
+    store: Path | None = None,
+    force: Annotated[bool, Parameter(negative=())] = False,
+    recording: Recording = NOT_GIVEN,
+) -> Outcome:
+    """Solve a session file or a bag and store the result; a running graph takes it over at once.
+
+    Args:
+        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
+        algorithm: As for `solve`.
+        exclude: Names of samples to leave out.
+        store: Folder of stored calibrations.
+        recording: What a bag does not say.
+        force: Store also what fails the limits.
+    """
+    place = store_in(store)
+    return with_solved(
+        samples, recording, exclude, store, lambda done: _outcome(done, place, force=force), algorithm=algorithm
+    )
+
+
+@app.command
+def together(
+    *sessions: Path, save: Annotated[bool, Parameter(negative=())] = False, store: Path | None = None
+) -> Outcome:
+    """Solve sessions of several cameras at once: they share the robot's errors, and the board where it is the same.
+
+    Args:
+        sessions: Files of samples (.npz), one for each camera.
+        save: Store the results, unless one fails.
+        store: Folder of stored calibrations.
+    """
+    from openarm_calibration.report import summary
+    from openarm_calibration.session_file import load_session
+    from openarm_calibration.together import calibrate_together
+    from openarm_common.description import RobotDescription
+
+    if len(sessions) < 2:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{len(sessions)} sessions given, expected two or more; one: `solve`")
+    opened = [load_session(session, RobotDescription.load()) for session in sessions]
+    results = calibrate_together(
+        [samples for samples, _ in opened],
+        hashes=[digest for _, digest in opened],
+        created=now(),
+        stored=[stored_of(samples, store) for samples, _ in opened],
+    )
+    names = [samples.head.camera for samples, _ in opened]
+    data: dict[str, Any] = {"cameras": {n: result.as_json() for n, result in zip(names, results, strict=True)}}
+    text = "\n\n".join(summary(result) for result in results)
+    grades = ", ".join(f"{n} {result.verdict.grade}" for n, result in zip(names, results, strict=True))
+    if any(result.verdict.grade == "fail" for result in results):
+        return Outcome(False, f"{grades}; nothing was stored", Code.DEGENERATE, data, text)
+    if save:
+        paths = [str(store_in(store).save(result.calibration)) for result in results]
+        return Outcome(True, f"{grades}. Stored in {', '.join(paths)}", data=data, text=text)
+    return Outcome(True, grades, data=data, text=text)
+
+
+@app.command
+def report(
+    samples: Path,
+    out: Path,
+    *,
+    exclude: tuple[str, ...] = (),
+    store: Path | None = None,
+    recording: Recording = NOT_GIVEN,
+) -> Outcome:
+    """Write a page with pictures on a session file or a bag: coverage, residuals, poses, samples, methods.
+
+    Args:
+        samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
+        out: HTML file to write.
+        exclude: Names of samples to leave out.
+        store: Folder of stored calibrations.
+        recording: What a bag does not say.
+    """
+    from openarm_calibration.report import page
+
+    if out.suffix not in (".html", ".htm"):
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{out}: a report is written as .html")
+
+    def write(done: Solved) -> Outcome:
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            out.write_text(page(done.samples, done.result), encoding="utf-8")
+        except OSError as error:
+            raise OpenArmError(Code.ENVIRONMENT, f"can't write {out}: {error.strerror}") from error
+        said = f"{done.result.verdict.grade}; wrote {out}"
+        return Outcome(True, said, data={"written": str(out), **_json(done)}, text=done.text)
+
+    return with_solved(samples, recording, exclude, store, write)
+
+
+@app.command(name="list")
+def list_(*, store: Path | None = None) -> Outcome:
+    """Name the stored calibrations, with their history.
+
+    Args:
+        store: Folder of stored calibrations.
+    """
+    opened = store_in(store)
+    data: dict[str, Any] = {"store": str(opened.folder), "cameras": {}}
+    lines: list[str] = []
+    faults: list[str] = []
+    for camera in opened.cameras():
+        history = [item.model_dump(mode="json") for item in opened.history(camera)]
+        data["cameras"][camera] = {"history": history}
+        try:
+            lines.append(_line(opened.load(camera)) + f"  ({len(history)} in its history)")
+        except OpenArmError as error:
+            faults.append(error.message)
+            lines.append(f"{camera}: {error.message}")
+    if faults:
+        return Outcome(False, "; ".join(faults), Code.CONFIG_INVALID, data, "\n".join(lines))
+    return Outcome(True, f"{len(lines)} stored in {opened.folder}", data=data, text="\n".join(lines))
+
+
+@app.command
+def rollback(camera: str, *, store: Path | None = None) -> Outcome:
+    """Go back to the calibration of a camera before the present one.
+
+    Args:
+        camera: Its name.
+        store: Folder of stored calibrations.
+    """
+    now = store_in(store).rollback(camera)
+    return Outcome(True, f"now in use: {_line(now)}", data=now.model_dump(mode="json"))
+
+
+def _json(done: Solved) -> dict[str, Any]:
+    return done.result.as_json() | ({"stills": done.stills} if done.stills else {})
+
+
+def _outcome(done: Solved, store: CalibrationStore | None, *, force: bool = False) -> Outcome:
+    from openarm_calibration.report import summary
+
+    result, data = done.result, _json(done)
+    text = "\n\n".join(part for part in (done.text, summary(result)) if part)
+    failed = result.verdict.grade == "fail"
+    message = f"{result.verdict.grade}: {'; '.join(result.verdict.reasons) or 'within all limits'}"
+    if store is not None and (force or not failed):
+        path = store.save(result.calibration)
+        data["stored"] = str(path)
+        return Outcome(True, f"{message}. Stored in {path}", data=data, text=text)
+    if store is not None:
+        message += "; not stored (--force of `openarm calibrate save` stores it all the same)"
+    return Outcome(not failed, message, Code.DEGENERATE if failed else Code.OK, data, text)
+
+
+def _line(item: StoredCalibration) -> str:
+    x, y, z = (v * 1e3 for v in item.position)
+    seed = "none" if item.mount_seed is None else str(item.mount_seed)
+    return (
+        f"{item.camera}: {x:.2f}, {y:.2f}, {z:.2f} mm in {item.parent},"
+        f" predicted error {item.sigma_translation * 1e3:.3f} mm, {item.samples} samples,"
+        f" mount seed {seed}, {item.created or 'undated'}"
+    )

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm calibrate auto` and `sample`: with a robot, simulated in a graph of its own or running already."""
+
+from __future__ import annotations
+
+import math
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from openarm_bringup.calibration.source import store_in
+from openarm_bringup.outcome import Outcome
+from openarm_common.errors import Code, OpenArmError
+
+if TYPE_CHECKING:
+    from openarm_interfaces.action import AutoCalibrate
+
+    from openarm_bringup.supervision.supervisor import Event
+    from openarm_calibration.client import AutoResult
+
+#: Of ROS_DOMAIN_ID; there are no ports above.
+LAST_DOMAIN = 232
+#: Of the node's parameter auto.poses.
+MOST_POSES = 100
+Flag = Annotated[bool, Parameter(negative=())]
+
+
+def auto(
+    *,
+    camera: str = "both",
+    mount_seed: str | None = None,
+    poses: int = 0,
+    save: Flag = False,
+    store: Path | None = None,
+    delay: Flag = False,
+    running: Flag = False,
+    domain: int | None = None,
+    set_: Annotated[tuple[str, ...], Parameter(name="--set")] = (),
+) -> Outcome:
+    """Calibrate by itself: the arm moves from one telling pose to the next, takes samples, and solves.
+
+    Starts a simulated robot with a board of its own, and stops it afterwards. Leaves a folder below runs/ with the
+    samples and a page with pictures for each camera. Ctrl-C stops the arm.
+
+    Args:
+        camera: Name of a camera (overhead, wrist), or both, one after the other.
+        mount_seed: Of the simulated mounts, or "none"; that of the graph `calibrate` when not given.
+        poses: Samples a camera at most; 0: the node's parameter auto.poses.
+        save: Store the result, unless it fails the limits.
+        store: Folder of stored calibrations.
+        delay: Also measure how old images are at their stamps.
+        running: Use the graph that runs already, with the board in place, instead of a simulated one.
+        domain: ROS_DOMAIN_ID; a free one, or that of the running graph, when not given.
+        set_: A parameter, as node.param=value.
+    """
+    from openarm_bringup.calibration.run import (
+        CalibrationListeners,
+        CalibrationOptions,
+        chosen_cameras,
+        run_calibration,
+    )
+
+    if poses < 0 or 0 < poses < 4:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--poses {poses}: at least 4 are needed, 10 to 15 are usual")
+    if poses > MOST_POSES:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--poses {poses}: expected 4 to {MOST_POSES}; 10 to 15 are usual")
+    seed: int | Literal["none"] | None = "none" if mount_seed == "none" else None
+    if mount_seed is not None and seed is None:
+        if not mount_seed.isdecimal():
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"--mount-seed {mount_seed}: expected 0 or more, or none")
+        seed = int(mount_seed)
+    if store is not None:
+        store_in(store)
+    show = _Show()
+    if running:
+        return _running(camera, poses, save, delay, domain, show)
+    cameras = ("overhead", "wrist") if camera == "both" else chosen_cameras((camera,))
+    options = CalibrationOptions(
+        cameras=cameras, mount_seed=seed, poses=poses, save=save, store=store, delay=delay, domain=domain,
+        sets=tuple(set_),
+    )  # fmt: skip
+    listeners = CalibrationListeners(show.event, show.ready, show.camera, show.feedback)
+    run = run_calibration(options, listeners)
+    for name in run.results:
+        _page(run.run_dir / f"{name}.npz", run.run_dir / f"{name}.html")
+    return _outcome(run.results, run.error, run.run_dir)
+
+
+def sample(*, remove: str | None = None, session: str = "", advice: Flag = False, domain: int | None = None) -> Outcome:
+    """Take a sample where the arm stands now, in the graph that runs, and say what to do next.
+
+    Args:
+        remove: Instead, remove the sample of that name ("last" is the last one).
+        session: Write all samples to this file (.npz) afterwards.
+        advice: Take none; list what there is and what to do next.
+        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
+    """
+    if remove is not None and advice:
+        raise OpenArmError(Code.INVALID_ARGUMENT, "--remove and --advice exclude each other")
+    if session and not session.endswith(".npz"):
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--session {session}: expected a name that ends in .npz")
+    _meet(domain)
+    from openarm_calibration.client import CalibrationClient
+
+    with CalibrationClient() as client:
+        if remove is not None:
+            done = client.remove("" if remove == "last" else remove)
+        elif advice:
+            done = client.samples()
+        else:
+            done = client.take()
+        if done.success and session:
+            done = client.save_samples(str(Path(session).expanduser().absolute()))
+        now = client.samples()
+    data: dict[str, Any] = {"camera": now.camera, "samples": list(now.samples), "advice": now.advice}
+    return Outcome(done.success, done.message, done.code or Code.OK, data, f"next: {now.advice}")
+
+
+def _running(camera: str, poses: int, save: bool, delay: bool, domain: int | None, show: _Show) -> Outcome:
+    if camera == "both":
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, "--running needs --camera NAME: the board has to be moved between the cameras"
+        )
+    _meet(domain)
+    from openarm_calibration.client import CalibrationClient
+
+    show.camera(camera)
+    stop = threading.Event()
+    with CalibrationClient() as client:
+        try:
+            result = client.auto(
+                camera, poses=poses, measure_delay=delay, save=save, on_feedback=show.feedback, stop=stop
+            )
+        except KeyboardInterrupt:
+            return Outcome(False, "cancelled by Ctrl-C; the arm stands where it is", Code.CANCELLED)
+    return _outcome({camera: result}, None, None)
+
+
+def _meet(domain: int | None) -> None:
+    from openarm_bringup.commands.pick import meet_graph
+
+    if domain is not None and not 0 <= domain <= LAST_DOMAIN:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--domain {domain}: expected 0 to {LAST_DOMAIN}")
+    meet_graph(domain)
+
+
+class _Show:
+    """Prints what happens, on stderr."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+
+        self._console: Console = Console(stderr=True, highlight=False)
+        self._last = ""
+
+    def event(self, event: Event) -> None:
+        if event.state in ("failed", "backoff"):
+            self._console.print(f"{event.node}: {event.state}: {event.detail}", style="red", markup=False)
+
+    def ready(self, seconds: float) -> None:
+        self._console.print(f"[green]the graph is ready[/green] after {seconds:.1f} s")
+
+    def camera(self, camera: str) -> None:
+        self._console.print(f"{camera}", style="bold")
+
+    def feedback(self, feedback: AutoCalibrate.Feedback) -> None:
+        sigma = ""
+        if feedback.sigma_translation:
+            degrees = math.degrees(feedback.sigma_rotation)
+            sigma = f"predicted error {feedback.sigma_translation * 1e3:.3f} mm {degrees:.4f}°"
+        line = f"pose {feedback.pose:>2} of {feedback.poses}  {feedback.stage:<9}{sigma:<42}{feedback.message}"
+        if line != self._last:
+            self._last = line
+            self._console.print(line, markup=False, soft_wrap=True)
+
+
+def _outcome(results: dict[str, AutoResult], error: OpenArmError | None, run_dir: Path | None) -> Outcome:
+    from openarm_bringup.calibration.run import as_row
+
+    lines: list[str] = []
+    for name, result in results.items():
+        if result.T_parent_link is None:
+            lines.append(f"{name}: {result.code}: {result.message}")
+            continue
+        x, y, z = result.T_parent_link[:3, 3] * 1e3
+        lines.append(
+            f"{name}: {x:.2f}, {y:.2f}, {z:.2f} mm, predicted error {result.sigma_translation * 1e3:.3f} mm"
+            f" {math.degrees(result.sigma_rotation):.4f}°, {result.samples} samples in {result.duration:.0f} s;"
+            f" {result.message}"
+        )
+        if result.delay is not None:
+            delay, sigma = (value * 1e3 for value in result.delay)
+            lines.append(f"{name}: images are {delay:.2f} ± {sigma:.2f} ms old at their stamps")
+    data: dict[str, Any] = {"cameras": {name: as_row(result) for name, result in results.items()}}
+    if run_dir is not None:
+        data["run_dir"] = str(run_dir)
+    where = f"; samples, pages and logs are in {run_dir}" if run_dir is not None else ""
+    text = "\n".join(lines)
+    if error is not None:
+        return Outcome(False, f"{error.message}{where}", error.code, data, text)
+    failed = [name for name, result in results.items() if not result.success or result.grade == "fail"]
+    if failed:
+        first = results[failed[0]]
+        code = first.code if first.code != Code.OK else Code.DEGENERATE
+        return Outcome(False, f"{failed[0]}: {first.message}{where}", code, data, text)
+    return Outcome(True, f"calibrated {', '.join(results)}{where}", data=data, text=text)
+
+
+def _page(session: Path, out: Path) -> None:
+    """Write the page of a session, when there is one that can be solved."""
+    from openarm_calibration.offline import calibrate
+    from openarm_calibration.report import page
+    from openarm_calibration.session_file import load_session
+    from openarm_common.description import RobotDescription
+
+    if not session.is_file():
+        return
+    samples, digest = load_session(session, RobotDescription.load())
+    try:
+        result = calibrate(samples, session=digest)
+    except OpenArmError as error:
+        if error.code != Code.DEGENERATE:
+            raise
+        return  # the command has said so
+    out.write_text(page(samples, result), encoding="utf-8")

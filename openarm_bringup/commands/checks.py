@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm test` and `openarm lint`: the developer's loop."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from openarm_bringup.outcome import Outcome
+from openarm_common.errors import Code, OpenArmError
+
+#: Tests that start processes come last: a fault in a core shows in seconds.
+LAST = ("nodes", "replay", "graph")
+
+Rest = Annotated[str, Parameter(allow_leading_hyphen=True)]
+
+
+def test(*args: Rest) -> Outcome:
+    """Run the tests: the cores first, then nodes, then whole graphs.
+
+    Args:
+        args: Passed to pytest; without a path, all tests run.
+    """
+    root = _checkout()
+    given_paths = [arg for arg in args if not arg.startswith("-") and (root / arg.partition("::")[0]).exists()]
+    paths = [] if given_paths else _in_order(root / "tests")
+    began = time.monotonic()
+    command = [sys.executable, "-m", "pytest", "-q", *paths, *args]
+    code = subprocess.run(command, cwd=root, check=False).returncode
+    seconds = time.monotonic() - began
+    data = {"exit_code": code, "seconds": round(seconds, 1)}
+    if code == 0:
+        return Outcome(True, f"tests passed in {seconds:.0f} s", data=data)
+    if code == 4:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"pytest refused the call: {' '.join(args)}")
+    return Outcome(False, f"tests failed (pytest ended with {code}) after {seconds:.0f} s", Code.INTERNAL, data)
+
+
+def lint() -> Outcome:
+    """Check style and types: ruff, and basedpyright on the cores (installed at the first call)."""
+    root = _checkout()
+    python = Path(sys.executable)
+    if importlib.util.find_spec("basedpyright") is None:
+        lock = root / "requirements-dev.lock"
+        uv = python.parent / "uv"
+        install = [str(uv) if uv.exists() else "uv", "pip", "install", "--python", str(python), "--require-hashes"]
+        if subprocess.run([*install, "-r", str(lock)], cwd=root, check=False).returncode != 0:
+            raise OpenArmError(Code.ENVIRONMENT, f"could not install {lock.name}; see the lines above")
+    results: dict[str, int] = {}
+    for name, command in {
+        "ruff check": ["ruff", "check"],
+        "ruff format": ["ruff", "format", "--check"],
+        "basedpyright": ["basedpyright"],
+    }.items():
+        results[name] = subprocess.run([sys.executable, "-m", *command], cwd=root, check=False).returncode
+    failed = [name for name, code in results.items() if code != 0]
+    if failed:
+        return Outcome(
+            False, f"{', '.join(failed)} found faults; see the lines above", Code.INTERNAL, {"checks": results}
+        )
+    return Outcome(True, "style and types are sound", data={"checks": results})
+
+
+def _in_order(tests: Path) -> list[str]:
+    """Return what is in tests/, files and quick folders first."""
+    entries = [path for path in tests.iterdir() if path.is_dir() or path.name.startswith("test_")]
+    entries = [path for path in entries if path.is_file() or any(path.rglob("test_*.py"))]
+
+    def rank(path: Path) -> tuple[int, str]:
+        return (1 + LAST.index(path.name) if path.name in LAST else 0, path.name)
+
+    return [str(path.relative_to(tests.parent)) for path in sorted(entries, key=rank)]
+
+
+def _checkout() -> Path:
+    root = Path(__file__).resolve().parents[2]
+    if not (root / "tests").is_dir():
+        raise OpenArmError(
+            Code.ENVIRONMENT, f"there are no tests beside {root / 'openarm_bringup'}; run this in a checkout"
+        )
+    return root

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm doctor`: what of this machine and installation would keep the suite from working, and what to do."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import importlib.util
+import os
+import platform
+import socket
+import subprocess
+import sys
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+
+from openarm_bringup.doctor import checks, graph
+from openarm_bringup.doctor.checks import Finding
+from openarm_bringup.outcome import Outcome
+from openarm_common.errors import Code
+
+MARKS = {"ok": "[green]ok[/green]", "note": "[yellow]note[/yellow]", "error": "[bold red]error[/bold red]"}
+
+#: Three groups of packages that must import (row by row, so that the first fault is named).
+GROUPS: Mapping[str, tuple[str, ...]] = {
+    "messages": ("openarm_interfaces.msg", "control_msgs.action", "vision_msgs.msg", "tf2_msgs.msg", "sensor_msgs.msg"),
+    "simulator": ("mujoco",),
+    "planner": ("ompl", "pinocchio", "ruckig", "numba"),
+}
+
+_RENDER = """
+import time, mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><light/><geom size='1 1 1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 240, 320) as renderer:
+    renderer.update_scene(data)
+    renderer.render()
+    began = time.perf_counter()
+    renderer.update_scene(data)
+    picture = renderer.render()
+    print((time.perf_counter() - began) * 1000 if picture.any() else "black picture")
+"""
+
+
+def doctor(*, graph: str = "sim") -> Outcome:
+    """Look at versions, ROS, rendering, shared memory, ports and running graphs; say what to do about each fault.
+
+    Args:
+        graph: The graph whose needs are held against the machine.
+    """
+    findings = list(gather(graph))
+    errors = [finding for finding in findings if finding.level == "error"]
+    data = {"findings": [vars(finding) for finding in findings]}
+    text = _table(findings)
+    if errors:
+        first = errors[0]
+        message = f"{len(errors)} of {len(findings)} checks failed; {first.name}: {first.advice or first.seen}"
+        return Outcome(False, message, Code.ENVIRONMENT, data, text)
+    return Outcome(True, f"all {len(findings)} checks passed", data=data, text=text)
+
+
+def gather(graph: str) -> list[Finding]:
+    """Make every check, the simulator's version first."""
+    installed = {
+        dist.metadata["Name"].lower(): dist.version for dist in metadata.distributions() if dist.metadata["Name"]
+    }
+    version = (sys.version_info.major, sys.version_info.minor)
+    findings = checks.check_versions(installed)
+    findings.append(checks.check_python(version, platform.system(), platform.machine()))
+    findings.append(checks.check_opencv(installed, _opencv_links_gl()))
+    rclpy = importlib.util.find_spec("rclpy")
+    rclpy_version = installed.get("ros-rclpy") or installed.get("rclpy") or "unknown"
+    findings += checks.check_ros(os.environ, rclpy.origin if rclpy else None, rclpy_version, sys.prefix)
+    findings += checks.check_rmw(os.environ)
+    findings += [checks.check_imports(_failed_imports(names), purpose, names) for purpose, names in GROUPS.items()]
+    findings.append(checks.check_gl(_render_times(), os.environ.get("MUJOCO_GL", "egl")))
+    findings += _graph_findings(graph)
+    domain = os.environ.get("ROS_DOMAIN_ID", "") or "0"
+    findings.append(checks.check_domain(domain, _first_ephemeral_port()))
+    if findings[-1].level != "error":
+        findings.append(checks.check_ports(_taken_ports(int(domain)), int(domain)))
+    findings.append(_machine())
+    return findings
+
+
+def _table(findings: list[Finding]) -> str:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for title in ("", "what", "found", "what to do"):
+        table.add_column(title, overflow="fold")
+    for finding in findings:
+        table.add_row(MARKS[finding.level], finding.name, finding.seen, finding.advice)
+    console = Console(highlight=False)
+    with console.capture() as capture:
+        console.print(table)
+    return capture.get()
+
+
+def _graph_findings(name: str) -> list[Finding]:
+    import shutil
+
+    from openarm_bringup.supervision import runs, shm
+    from openarm_bringup.supervision.graph import load_graph
+
+    usage = shutil.disk_usage(shm.SHM)
+    need = shm.shm_need_mib(load_graph(name), extra_participants=4)
+    findings = [checks.check_shm(usage.total / 2**20, usage.free / 2**20, need, name)]
+    running = runs.running()
+    seen = "; ".join(f"{run.graph} in domain {run.domain}: {run.health} (pid {run.pid})" for run in running)
+    findings.append(Finding("graphs", "ok", seen or "none is running"))
+    for run in running:
+        findings += graph.check_nodes(run)
+        if run.ready_nodes:
+            from openarm_bringup.doctor.listening_client import listen
+
+            findings += graph.check_heard(run, listen(run))
+    return findings
+
+
+def _failed_imports(names: tuple[str, ...]) -> dict[str, str]:
+    failed: dict[str, str] = {}
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except (ImportError, OSError, AttributeError) as error:
+            failed[name] = str(error).partition("\n")[0]
+    return failed
+
+
+def _opencv_links_gl() -> bool:
+    """Tell whether cv2 pulls libGL in, from what a process that imports it has mapped."""
+    code = "import cv2; print('libGL.so' in open('/proc/self/maps').read())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    return (done.returncode != 0 and "libGL" in done.stderr) or done.stdout.strip() == "True"
+
+
+def _render_times() -> dict[str, float | str]:
+    results: dict[str, float | str] = {}
+    for backend in ("egl", "osmesa"):
+        env = {**os.environ, "MUJOCO_GL": backend}
+        env.pop("PYOPENGL_PLATFORM", None)
+        try:
+            done = subprocess.run(
+                [sys.executable, "-c", _RENDER], env=env, capture_output=True, text=True, timeout=60, check=False
+            )
+        except subprocess.TimeoutExpired:
+            results[backend] = "no picture within 60 s"
+            continue
+        words = (done.stdout.strip() or done.stderr.strip()).splitlines()
+        try:
+            results[backend] = float(words[-1]) if words else "no answer"
+        except ValueError:
+            results[backend] = f"failed ({words[-1][:80]})"
+    return results
+
+
+def _first_ephemeral_port() -> int:
+    path = Path("/proc/sys/net/ipv4/ip_local_port_range")
+    return int(path.read_text(encoding="ascii").split()[0]) if path.exists() else 32768
+
+
+def _taken_ports(domain: int) -> list[int]:
+    """Return the discovery ports that cannot be opened although Fast DDS shares them (SO_REUSEADDR)."""
+    taken: list[int] = []
+    for port in (7400 + 250 * domain, 7410 + 250 * domain):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError as error:
+                if error.errno != errno.EADDRINUSE:
+                    raise
+                # A unicast port that another participant of this domain holds is no fault: the next one is taken.
+                if port == 7400 + 250 * domain:
+                    taken.append(port)
+    return taken
+
+
+def _machine() -> Finding:
+    import psutil
+
+    release = platform.release().lower()
+    return checks.check_machine(
+        cores=len(os.sched_getaffinity(0)),
+        memory_gib=psutil.virtual_memory().total / 2**30,
+        load=os.getloadavg()[0],
+        display=bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")),
+        wsl="microsoft" in release,
+    )

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm record`, `openarm replay`: topics of a graph to a bag and back."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from openarm_bringup.outcome import Outcome
+from openarm_common.errors import Code, OpenArmError
+
+#: Whose versions a bag remembers.
+PACKAGES = ("openarm-vision", "mujoco", "numpy", "opencv-python-headless", "ros-jazzy-rclpy", "rosbags")
+
+
+def record(
+    bag: Path | None = None,
+    *,
+    profile: Literal["grasp", "camera", "all"] = "grasp",
+    topics: tuple[str, ...] = (),
+    duration: float = 0.0,
+    image_rate: float = 0.0,
+    domain: int | None = None,
+) -> Outcome:
+    """Record topics of the running graph until Ctrl-C, to a rosbag2 folder (MCAP, zstd).
+
+    Args:
+        bag: Folder to make; bag_DATE_TIME when not given.
+        profile: What to record: grasp (cameras, robot, detections, grasp), camera (cameras, robot), all.
+        topics: Regular expressions of topic names, instead of a profile.
+        duration: End after this long, s of wall clock; 0 waits for Ctrl-C.
+        image_rate: Keep at most this many frames a second of each camera; 0 keeps all.
+        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
+    """
+    from openarm_bringup.commands.pick import meet_graph
+
+    meet_graph(domain)
+    from openarm_bringup.bags.recorder_client import PROFILES, Recorder
+
+    path = bag or Path(datetime.now().strftime("bag_%Y%m%d_%H%M%S"))
+    number = int(os.environ.get("ROS_DOMAIN_ID") or "0")
+    stop = threading.Event()
+    before = {n: signal.signal(n, lambda *_: stop.set()) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with Recorder(number, path, topics or PROFILES[profile], _custom(number), image_rate) as recorder:
+            deadline = time.monotonic() + (duration or float("inf"))
+            while (left := deadline - time.monotonic()) > 0.0 and not stop.is_set():
+                if not recorder.wait(min(0.2, left)):
+                    break
+    finally:
+        for n, handler in before.items():
+            signal.signal(n, handler)
+    recorded = recorder.recorded
+    data: dict[str, Any] = {
+        "bag": str(path),
+        "messages": sum(recorded.counts.values()),
+        "lost": sum(recorded.lost.values()),
+        "topics": dict(sorted(recorded.counts.items())),
+        "lost_topics": dict(recorded.lost.most_common()),
+        "bytes": sum(file.stat().st_size for file in path.glob("*")),
+    }
+    rows = [f"{recorded.counts[t]:8d}  {recorded.lost[t]:8d}  {t}" for t in sorted({*recorded.counts, *recorded.lost})]
+    text = "\n".join([f"{'recorded':>8}  {'lost':>8}  topic", *rows])
+    if recorded.ended:
+        said = f"recording ended early: {recorded.ended}; {data['messages']} messages are in {path}"
+        return Outcome(False, said, Code.ENVIRONMENT, data, text)
+    if not recorded.counts:
+        said = f"no message came; topics that match: {', '.join(recorder.topics) or 'none'}. Is a graph running?"
+        return Outcome(False, said, Code.NOTHING_DETECTED, data)
+    said = f"{data['messages']} messages, {data['bytes'] / 1e6:.1f} MB in {path}, {data['lost']} lost"
+    if data["lost"]:
+        worst = ", ".join(f"{count} of {topic}" for topic, count in recorded.lost.most_common(3))
+        advice = (
+            "record fewer topics (--profile, --topics) or fewer frames (--image-rate), or give it a quieter machine"
+        )
+        return Outcome(False, f"{said} ({worst}); {advice}", Code.LIMITS, data, text)
+    return Outcome(True, said, data=data, text=text)
+
+
+def replay(
+    bag: Path,
+    *,
+    rate: float = 1.0,
+    clock: Annotated[bool, Parameter(negative=())] = False,
+    start: float = 0.0,
+    duration: float = 0.0,
+    loop: Annotated[bool, Parameter(negative=())] = False,
+    topics: tuple[str, ...] = (),
+    remap: tuple[str, ...] = (),
+    until_idle: Annotated[bool, Parameter(negative=())] = False,
+    domain: int | None = None,
+) -> Outcome:
+    """Publish a bag in place of the robot, in the order and with the quality of service in which it was recorded.
+
+    Args:
+        bag: Folder of rosbag2, or an MCAP file.
+        rate: Times real time; 0 is as fast as subscribers take it.
+        clock: Publish /clock from the stamps of the bag, when it holds none.
+        start: Begin this long after the first message, s; latched topics of before are published first.
+        duration: End after this much of the bag, s; 0 plays all.
+        loop: Begin anew at the end, until Ctrl-C.
+        topics: Only these.
+        remap: FROM:=TO of topic names; may be given several times.
+        until_idle: At the end, wait until what the graph publishes has ceased for a second.
+        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
+    """
+    if rate < 0.0 or start < 0.0 or duration < 0.0:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, f"--rate, --start, --duration: 0 or more, got {rate, start, duration}"
+        )
+    from openarm_bringup.bags.bag import open_bag
+    from openarm_bringup.commands.pick import meet_graph
+
+    names = dict(_split(pair) for pair in remap)
+    stop = threading.Event()
+    with open_bag(bag) as opened:
+        unknown = sorted(set(topics) - set(opened.topics))
+        if unknown:
+            known = ", ".join(sorted(opened.topics))
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"not in {bag}: {', '.join(unknown)}; topics: {known}")
+        meet_graph(domain)
+        from openarm_bringup.bags.player_client import Player
+
+        before = {n: signal.signal(n, lambda *_: stop.set()) for n in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            with Player(opened, topics or None, names, clock=clock) as player:
+                while True:
+                    player.play(rate, start, duration, stop)
+                    if not loop or stop.is_set():
+                        break
+                if until_idle and not stop.is_set():
+                    player.wait_idle(1.0, 60.0)
+        finally:
+            for n, handler in before.items():
+                signal.signal(n, handler)
+        mended = f"; it was cut short: {opened.mended} bytes at its end were not whole" if opened.mended else ""
+    data = {"bag": str(bag), "messages": player.published, "late_ms": player.late_ms}
+    data |= {"unknown_types": player.unknown, "left_to_graph": player.left}
+    if stop.is_set():
+        return Outcome(False, f"stopped after {player.published} messages", Code.CANCELLED, data)
+    if player.published == 0:
+        return Outcome(False, f"nothing to replay in {bag}{mended}", Code.NOTHING_DETECTED, data)
+    left = f"; left to the graph, which makes them itself: {', '.join(player.left)}" if player.left else ""
+    left += f"; not installed, left out: {', '.join(player.unknown)}" if player.unknown else ""
+    return Outcome(True, f"{player.published} messages of {bag}{mended}{left}", data=data)
+
+
+def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update: bool = False) -> Outcome:
+    """Run detection, map and board detection on a bag, and compare with golden numbers; for CI. Needs no graph.
+
+    Args:
+        bag: Folder of rosbag2, or an MCAP file.
+        golden: File with the numbers that are expected; golden.json in the bag's folder when not given.
+        scene: Whose table the objects stand on.
+        update: Write the numbers instead of comparing.
+    """
+    from openarm_bringup.bags import golden as stored
+    from openarm_bringup.bags.bag import open_bag
+    from openarm_bringup.bags.bag_client import numbers_of
+
+    path = golden or (bag if bag.is_dir() else bag.parent) / "golden.json"
+    expected = {} if update and not path.exists() else stored.read(path)
+    with open_bag(bag) as opened:
+        numbers = numbers_of(opened, scene=scene)
+    data: dict[str, Any] = {"bag": str(bag), "golden": str(path), "numbers": numbers}
+    if update:
+        stored.write(path, numbers, expected)
+        return Outcome(True, f"{len(numbers)} numbers written to {path}", data=data)
+    differences = stored.compare(expected, numbers)
+    data["differences"] = [str(difference) for difference in differences]
+    if differences:
+        said = f"{len(differences)} of {len(expected)} numbers differ from {path}"
+        return Outcome(False, said, Code.STALE_DATA, data, "\n".join(data["differences"]))
+    return Outcome(True, f"{len(numbers)} numbers are as {path} says", data=data)
+
+
+def _split(pair: str) -> tuple[str, str]:
+    old, found, new = pair.partition(":=")
+    if not found or not old.startswith("/") or not new.startswith("/"):
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--remap {pair!r}: expected /from:=/to")
+    return old, new
+
+
+def _custom(domain: int) -> dict[str, str]:
+    """What a bag remembers of its origin: versions, and graph, parameters and seed of the run it was made in."""
+    from openarm_bringup.supervision import runs
+
+    custom = {name: _version(name) for name in PACKAGES}
+    try:
+        run = runs.the_running(domain)
+    except OpenArmError:
+        return custom  # recorded from a graph that was started by other means
+    files = sorted(Path(run.run_dir, "params").glob("*.yaml"))
+    return custom | {"graph": run.graph, "parameters": "".join(path.read_text(encoding="utf-8") for path in files)}
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"

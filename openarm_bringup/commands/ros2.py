@@ -1,0 +1,347 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm topic`, `service`, `action`, `node`: what users of the ros2 command expect, without an installed ROS.
+
+Messages are written and read as YAML. Every command finds the graph that runs on this machine.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from contextlib import suppress
+from itertools import pairwise
+from statistics import median
+from typing import Annotated, Any
+
+import yaml
+from cyclopts import App, Parameter
+
+from openarm_bringup.commands.pick import meet_graph
+from openarm_bringup.outcome import Outcome, show
+from openarm_common.errors import Code, OpenArmError
+
+topic = App(name="topic", help="List topics, echo them, measure their rate, publish.")
+service = App(name="service", help="List services and call them.")
+action = App(name="action", help="List actions and send goals.")
+node = App(name="node", help="List nodes and what each offers and uses.")
+
+#: Longer arrays are shown as their size.
+_LONGEST = 32
+#: A subscriber knows of a publisher a little later than the publisher of it, s.
+_SETTLE_S = 0.3
+
+
+def _listing(names: dict[str, str], key: str) -> Outcome:
+    width = max((len(name) for name in names), default=0)
+    text = "\n".join(f"{name:<{width}}  {kind}" for name, kind in sorted(names.items()))
+    if not names:
+        return Outcome(False, f"no {key}; is a graph running?", Code.NOT_READY, {key: {}})
+    return Outcome(True, data={key: names}, text=text)
+
+
+@topic.command(name="list")
+def topic_list(*, domain: int | None = None) -> Outcome:
+    """List topics and their types.
+
+    Args:
+        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
+    """
+    meet_graph(domain)
+    from openarm_bringup.peer_client import Peer
+
+    with Peer() as peer:
+        return _listing(peer.topics(), "topics")
+
+
+@topic.command
+def echo(
+    name: str,
+    *,
+    count: Annotated[int, Parameter(name=["--count", "-n"])] = 0,
+    full: Annotated[bool, Parameter(negative=())] = False,
+    timeout: float = 10.0,
+    domain: int | None = None,
+) -> Outcome:
+    """Print the messages of a topic as YAML, until Ctrl-C.
+
+    Args:
+        name: Of the topic.
+        count: End after so many; 0 goes on.
+        full: Print long arrays whole.
+        timeout: Longest wait for the first message, s.
+        domain: ROS_DOMAIN_ID of the graph.
+    """
+    meet_graph(domain)
+    from openarm_bringup.message_client import interface, to_data
+    from openarm_bringup.peer_client import Peer, find
+
+    messages: list[Any] = []
+    with Peer() as peer:
+        found, kind = find("topic", name, peer.topics())
+
+        def take(message: Any) -> None:
+            data = to_data(message, None if full else _LONGEST)
+            if count:
+                messages.append(data)
+            if not count or len(messages) <= count:
+                show(yaml.safe_dump(data, sort_keys=False, default_flow_style=None) + "---\n")
+            heard[0] += 1
+
+        heard = [0]
+        peer.node.create_subscription(interface(kind), found, take, peer.offered(found))
+        if not peer.spin_until(lambda: heard[0] > 0, timeout):
+            raise OpenArmError(Code.TIMEOUT, f"{found} was silent for {timeout:g} s")
+        with suppress(KeyboardInterrupt):  # the way to end it
+            peer.spin_until(lambda: count and heard[0] >= count, float("inf"))
+    return Outcome(True, data={"topic": found, "type": kind, "messages": messages[:count]})
+
+
+@topic.command
+def hz(name: str, *, seconds: float = 5.0, domain: int | None = None) -> Outcome:
+    """Measure the rate of a topic by the wall clock, what is lost, and how long messages take to arrive.
+
+    The delay holds where publisher and this machine have one clock.
+
+    Args:
+        name: Of the topic.
+        seconds: How long.
+        domain: ROS_DOMAIN_ID of the graph.
+    """
+    meet_graph(domain)
+    from openarm_bringup.bags.losses import Arrivals
+    from openarm_bringup.message_client import interface
+    from openarm_bringup.peer_client import Peer, find
+
+    at: list[float] = []
+    delays: list[float] = []
+    size, lost, arrivals = [0], [0], Arrivals()
+    with Peer() as peer:
+        found, kind = find("topic", name, peer.topics())
+
+        def take(data: bytes, info: Any) -> None:
+            at.append(time.monotonic())
+            delays.append((info["received_timestamp"] - info["source_timestamp"]) * 1e-6)
+            size[0] += len(data)
+            lost[0] += arrivals.missing(info["publication_sequence_number"], lambda: peer.node.count_publishers(found))
+
+        peer.node.create_subscription(interface(kind), found, take, peer.offered(found), raw=True)
+        peer.spin_until(lambda: False, seconds)
+    if len(at) < 2:
+        return Outcome(False, f"{found}: {len(at)} messages in {seconds:g} s", Code.TIMEOUT, {"topic": found})
+    gaps = [later - earlier for earlier, later in pairwise(at)]
+    rate = len(gaps) / (at[-1] - at[0])
+    data = {
+        "topic": found,
+        "rate_hz": rate,
+        "period_min_ms": min(gaps) * 1e3,
+        "period_max_ms": max(gaps) * 1e3,
+        "messages": len(at),
+        "lost": lost[0],
+        "delay_median_ms": median(delays),
+        "delay_max_ms": max(delays),
+        "bytes_per_s": size[0] / seconds,
+    }
+    said = f"{found}: {rate:.2f} Hz, period {min(gaps) * 1e3:.1f} to {max(gaps) * 1e3:.1f} ms, {len(at)} messages"
+    said += f", {lost[0]} lost, {median(delays):.1f} ms on the way ({max(delays):.1f} at most)"
+    return Outcome(True, f"{said}, {size[0] / seconds / 1e6:.2f} MB/s", data=data)
+
+
+@topic.command
+def pub(
+    name: str,
+    message: str = "{}",
+    *,
+    type_: Annotated[str, Parameter(name="--type")] = "",
+    rate: float = 0.0,
+    count: Annotated[int, Parameter(name=["--count", "-n"])] = 1,
+    domain: int | None = None,
+) -> Outcome:
+    """Publish a message, given as YAML.
+
+    Args:
+        name: Of the topic.
+        message: Its fields, such as "{name: [a], position: [0.1]}"; what is left out keeps its default.
+        type_: Of the message, where nobody else has the topic.
+        rate: Hz, with more than one.
+        count: How many.
+        domain: ROS_DOMAIN_ID of the graph.
+    """
+    meet_graph(domain)
+    from openarm_bringup.message_client import fill, interface
+    from openarm_bringup.peer_client import Peer, find
+    from openarm_common.node import QOS_COMMAND
+
+    with Peer() as peer:
+        found, kind = (
+            (name if name.startswith("/") else f"/{name}", type_) if type_ else find("topic", name, peer.topics())
+        )
+        filled = fill(interface(kind)(), _parse(message))
+        publisher = peer.node.create_publisher(interface(kind), found, QOS_COMMAND)
+        heard = peer.spin_until(publisher.get_subscription_count, 2.0)
+        peer.spin_until(lambda: False, _SETTLE_S if heard else 0.0)
+        for i in range(count):
+            publisher.publish(filled)
+            peer.spin_until(lambda: False, 1.0 / rate if rate > 0.0 and i + 1 < count else 0.0)
+        if heard:
+            publisher.wait_for_all_acked()
+    said = f"{count} x {kind} on {found}" + ("" if heard else "; nobody listens there")
+    return Outcome(heard, said, Code.OK if heard else Code.NOT_READY, {"topic": found, "type": kind})
+
+
+@service.command(name="list")
+def service_list(
+    *, all_: Annotated[bool, Parameter("--all", negative=())] = False, domain: int | None = None
+) -> Outcome:
+    """List services and their types.
+
+    Args:
+        all_: Also those for parameters and types that every node has.
+        domain: ROS_DOMAIN_ID of the graph.
+    """
+    meet_graph(domain)
+    from openarm_bringup.peer_client import Peer, plain
+
+    with Peer() as peer:
+        return _listing(peer.services() if all_ else plain(peer.services()), "services")
+
+
+@service.command
+def call(name: str, request: str = "{}", *, timeout: float = 30.0, domain: int | None = None) -> Outcome:
+    """Call a service; the request and the answer are YAML. The exit code follows the answer's `success`, if it has one.
+
+    Args:
+        name: Of the service.
+        request: Its fields, such as "{label: red}".
+        timeout: Longest wait for the answer, s.
+        domain: ROS_DOMAIN_ID of the graph.
+    """
+    meet_graph(domain)
+    from openarm_bringup.message_client import fill, interface, to_data
+    from openarm_bringup.peer_client import Peer, find
+
+    with Peer() as peer:
+        found, kind = find("service", name, peer.services())
+        filled = fill(interface(kind).Request(), _parse(request))
+        client = peer.node.create_client(interface(kind), found)
+        if not peer.spin_until(client.service_is_ready, 5.0):
+            raise OpenArmError(Code.NOT_READY, f"{found} does not answer")
+        answer = peer.result(client.call_async(filled), timeout, found)
+    return _answered(to_data(answer), {"service": found, "type": kind})
+
+
+@action.command(name="list")
+def action_list(*, domain: int | None = None) -> Outcome:
+    """List actions and their types.
+
+    Args:
+        domain: ROS_DOMAIN_ID of the graph.
+    """
+    meet_graph(domain)
+    from openarm_bringup.peer_client import Peer
+
+    with Peer() as peer:
+        return _listing(peer.actions(), "actions")
+
+
+@action.command
+def send(
+    name: str,
+    goal: str = "{}",
+    *,
+    feedback: Annotated[bool, Parameter(negative=())] = False,
+    timeout: float = 300.0,
+    domain: int | None = None,
+) -> Outcome:
+    """Send a goal and wait for its result; Ctrl-C cancels it.
+
+    Args:
+        name: Of the action.
+        goal: Its fields as YAML.
+        feedback: Print the feedback.
+        timeout: Longest wait for the result, s.
+        domain: ROS_DOMAIN_ID of the graph.
+    """
+    meet_graph(domain)
+    from openarm_bringup.message_client import fill, interface, to_data
+    from openarm_bringup.peer_client import Peer, find
+
+    def tell(message: Any) -> None:
+        if feedback:
+            data = to_data(message.feedback, _LONGEST)
+            sys.stderr.write(yaml.safe_dump(data, sort_keys=False, default_flow_style=None) + "---\n")
+
+    with Peer() as peer:
+        found, kind = find("action", name, peer.actions())
+        filled = fill(interface(kind).Goal(), _parse(goal))
+        client = peer.action_client(interface(kind), found)
+        handle = peer.result(client.send_goal_async(filled, feedback_callback=tell), 10.0, found)
+        if not handle.accepted:
+            return Outcome(False, f"{found} refused the goal", Code.INVALID_ARGUMENT, {"action": found})
+        future = handle.get_result_async()
+        try:
+            result = peer.result(future, timeout, found)
+        except (KeyboardInterrupt, OpenArmError):
+            peer.result(handle.cancel_goal_async(), 5.0, f"cancelling {found}")
+            raise
+    return _answered(to_data(result.result, _LONGEST), {"action": found, "type": kind, "status": result.status})
+
+
+@node.command(name="list")
+def node_list(*, domain: int | None = None) -> Outcome:
+    """List nodes.
+
+    Args:
+        domain: ROS_DOMAIN_ID of the graph.
+    """
+    meet_graph(domain)
+    from openarm_bringup.peer_client import Peer
+
+    with Peer() as peer:
+        names = peer.nodes()
+    if not names:
+        return Outcome(False, "no nodes; is a graph running?", Code.NOT_READY, {"nodes": []})
+    return Outcome(True, data={"nodes": names}, text="\n".join(names))
+
+
+@node.command
+def info(name: str, *, domain: int | None = None) -> Outcome:
+    """Show what a node publishes, listens to and offers.
+
+    Args:
+        name: Of the node.
+        domain: ROS_DOMAIN_ID of the graph.
+    """
+    meet_graph(domain)
+    from openarm_bringup.peer_client import Peer, find
+
+    with Peer() as peer:
+        found, _ = find("node", name, dict.fromkeys(peer.nodes(), ""))
+        space, _, short = found.rpartition("/")
+        where = (short, space or "/")
+        parts = {
+            "publishes": peer.node.get_publisher_names_and_types_by_node(*where),
+            "listens to": peer.node.get_subscriber_names_and_types_by_node(*where),
+            "offers": peer.node.get_service_names_and_types_by_node(*where),
+            "calls": peer.node.get_client_names_and_types_by_node(*where),
+        }
+    data = {key: {topic: kinds[0] for topic, kinds in sorted(found_)} for key, found_ in parts.items()}
+    lines = [found]
+    for key, entries in data.items():
+        lines += [f"  {key}:", *(f"    {entry}  {kind}" for entry, kind in entries.items() if "/_action/" not in entry)]
+    return Outcome(True, data={"node": found, **data}, text="\n".join(lines))
+
+
+def _answered(answer: dict[str, Any], data: dict[str, Any]) -> Outcome:
+    text = yaml.safe_dump(answer, sort_keys=False, default_flow_style=None)
+    if answer.get("success") is False:
+        return Outcome(
+            False, str(answer.get("message", "")), answer.get("code") or Code.INTERNAL, {**data, "answer": answer}, text
+        )
+    return Outcome(True, data={**data, "answer": answer}, text=text)
+
+
+def _parse(text: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{text!r} is not YAML: {error}") from error

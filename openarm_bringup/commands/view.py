@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm view`: a web page with what the graph sees and does, and with a button for a grasp."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from openarm_bringup.commands.pick import meet_graph
+from openarm_bringup.outcome import Outcome, failure
+from openarm_bringup.view.guard import LOOPBACK
+from openarm_common.errors import Code, OpenArmError
+
+if TYPE_CHECKING:
+    from openarm_bringup.view.server import ViewServer
+
+
+def view(
+    *,
+    port: int = 8088,
+    host: str = LOOPBACK,
+    open_: Annotated[bool, Parameter(name="--open", negative=())] = False,
+    domain: int | None = None,
+) -> Outcome:
+    """Serve a page that shows the graph and asks it for grasps, until Ctrl-C.
+
+    The address that is printed holds a token, new each time: who knows it can move the robot.
+
+    Args:
+        port: TCP port; 0 takes any that is free.
+        host: Address to listen on. Beyond this machine the token crosses the net in the clear; `ssh -L` keeps it in.
+        open_: Open the page in a browser.
+        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
+    """
+    meet_graph(domain)
+    try:
+        address = asyncio.run(_serve(host, port, open_))
+    except OpenArmError as error:
+        return failure(error)
+    return Outcome(True, f"the page at {address} is closed")
+
+
+async def _serve(host: str, port: int, show: bool) -> str:
+    from aiohttp import web
+    from rich.console import Console
+
+    loop = asyncio.get_running_loop()
+    stop: asyncio.Future[None] = loop.create_future()
+
+    def end(error: BaseException | None = None) -> None:
+        if not stop.done():
+            stop.set_result(None) if error is None else stop.set_exception(error)
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        loop.add_signal_handler(number, end)
+    with make_server(host, end) as server:
+        runner = web.AppRunner(server.app(), access_log=None, shutdown_timeout=1.0)
+        await runner.setup()
+        try:
+            try:
+                await web.TCPSite(runner, host, port).start()
+            except OSError as error:
+                text = f"can't listen on {host}:{port}: {error.strerror}; choose another with --port or --host"
+                raise OpenArmError(Code.ENVIRONMENT, text) from error
+            shown = f"[{host}]" if ":" in host else host
+            address = f"http://{shown}:{runner.addresses[0][1]}/"
+            url = f"{address}?token={server.guard.token}"
+            Console(stderr=True, highlight=False).print(f"the page is at {url}", markup=False, soft_wrap=True)
+            if show:
+                webbrowser.open(url)
+            await stop
+        finally:
+            await runner.cleanup()
+    return address
+
+
+@contextmanager
+def make_server(host: str, on_end: Callable[[BaseException], None]) -> Iterator[ViewServer]:
+    """The server of the page and the thread that looks at the graph; within a running asyncio loop.
+
+    Args:
+        host: Address that the server will listen on.
+        on_end: Called in the loop with what ended the thread too early.
+    """
+    from openarm_bringup.view.guard import Guard
+    from openarm_bringup.view.page_client import GraphView
+    from openarm_bringup.view.server import ViewServer
+    from openarm_bringup.view.wire import robot_shapes
+    from openarm_grasp.states import State
+
+    loop = asyncio.get_running_loop()
+    graph = GraphView(
+        lambda item: loop.call_soon_threadsafe(server.put, item),
+        lambda error: loop.call_soon_threadsafe(on_end, error),
+    )
+    hello = {
+        "robot": robot_shapes(graph.description),
+        "cameras": [camera.name for camera in graph.cameras],
+        "states": [state.value for state in State],
+    }
+    server = ViewServer(Guard(host), hello, graph)
+    with graph:
+        yield server

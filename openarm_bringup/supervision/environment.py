@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a node process is started with: environment, arguments, Fast DDS profile."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from openarm_bringup.supervision.graph import Graph, NodeSpec
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import config_dir
+
+#: The variable that names the Fast DDS profile of a process.
+PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+#: Reaches of discovery that go beyond this machine.
+ACROSS_MACHINES = ("subnet", "system_default")
+
+
+def domain_id(graph: Graph, environ: Mapping[str, str] = os.environ) -> int:
+    """Return the ROS domain of a graph: its own, else the environment's, else 0.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, when ROS_DOMAIN_ID is not a number from 0 to 232.
+    """
+    if graph.domain is not None:
+        return graph.domain
+    text = environ.get("ROS_DOMAIN_ID", "") or "0"
+    if not text.isdecimal() or int(text) > 232:
+        raise OpenArmError(Code.ENVIRONMENT, f"ROS_DOMAIN_ID is {text!r}; expected a number from 0 to 232")
+    return int(text)
+
+
+def ros_environment(graph: Graph, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """Return the variables that decide whom a process of the graph can meet (for nodes and for probes)."""
+    wanted = {"ROS_DOMAIN_ID": str(domain_id(graph, environ))}
+    if graph.discovery != "system_default":
+        wanted["ROS_AUTOMATIC_DISCOVERY_RANGE"] = graph.discovery.upper()
+    return wanted
+
+
+def node_environment(graph: Graph, name: str, run_dir: Path, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """Return the whole environment of one node; writes its Fast DDS profile when it has one."""
+    spec = graph.node(name)
+    env = {**environ, **ros_environment(graph, environ)}
+    env.pop("ROS_LOCALHOST_ONLY", None)  # deprecated, and would override the discovery range
+    env["PYTHONUNBUFFERED"] = "1"
+    env.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "[{severity}] {message}")
+    # The nodes share few cores; a pool of BLAS threads in each would only fight over them.
+    for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        env.setdefault(key, "1")
+    if spec.large_messages:
+        env[PROFILE] = str(write_profile(spec, run_dir / "params" / f"{name}.fastdds.xml"))
+    elif graph.discovery in ACROSS_MACHINES:
+        env[PROFILE] = str(network_profile())
+    return {**env, **spec.env}
+
+
+def network_profile() -> Path:
+    """Return the Fast DDS profile of processes that hear images from another machine."""
+    return config_dir() / "fastdds_network.xml"
+
+
+def write_profile(spec: NodeSpec, path: Path) -> Path:
+    """Write config/fastdds.xml with the segment size of one node, and return where."""
+    text = (config_dir() / "fastdds.xml").read_text(encoding="utf-8")
+    sized, count = re.subn(r"(?<=<segment_size>)\d+(?=</segment_size>)", str(spec.segment_mib * 2**20), text)
+    if count != 1:
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"{config_dir() / 'fastdds.xml'}: expected one <segment_size>, found {count}"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(sized, encoding="utf-8")
+    return path
+
+
+def node_arguments(graph: Graph, name: str, run_dir: Path) -> list[str]:
+    """Return the command line of one node; writes its parameters to a file in the run folder."""
+    spec = graph.node(name)
+    argv = list(spec.command) if spec.command else [sys.executable, "-m", str(spec.module)]
+    if argv[0] == "python":
+        argv[0] = sys.executable
+    # Everything a node says goes to its log through the supervisor; rcl's own log files would only repeat it.
+    ros = ["--disable-external-lib-logs", "-r", f"__node:={name}"]
+    ros += [part for old, new in spec.remaps.items() for part in ("-r", f"{old}:={new}")]
+    if spec.params:
+        path = run_dir / "params" / f"{name}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # ROS parameter files know no null; a parameter that is left out takes its default.
+        params: dict[str, Any] = {key: value for key, value in spec.params.items() if value is not None}
+        path.write_text(yaml.safe_dump({name: {"ros__parameters": params}}, sort_keys=False), encoding="utf-8")
+        ros += ["--params-file", str(path)]
+    return [*argv, "--ros-args", *ros]

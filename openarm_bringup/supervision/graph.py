@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node graph as data: a YAML file becomes a validated, frozen model.
+
+A graph names its nodes, what each needs before it starts, when it counts as ready, and its parameters. A file can
+extend another one and keep only some of its nodes. `${scene}`, `${seed}` and `${mount_seed}` in parameters stand for
+the graph's own top-level values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import Field, model_validator
+
+from openarm_bringup.supervision.params import flatten, read_params, substitute
+from openarm_common.config import Config, validate
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import config_dir
+
+Discovery = Literal["localhost", "subnet", "off", "system_default"]
+ConditionKind = Literal["topic", "message", "service", "action"]
+
+#: Values of the graph that parameters may refer to.
+VARIABLES = ("scene", "seed", "mount_seed")
+
+
+class Ready(Config):
+    """One condition of readiness: exactly one of the four names is given."""
+
+    topic: str | None = Field(default=None, description="has a publisher")
+    message: str | None = Field(default=None, description="a message of this topic was received")
+    service: str | None = Field(default=None, description="has a server")
+    action: str | None = Field(default=None, description="has a server")
+
+    @model_validator(mode="after")
+    def _one(self) -> Ready:
+        given = [kind for kind in type(self).model_fields if getattr(self, kind) is not None]
+        if len(given) != 1:
+            raise ValueError("give exactly one of topic, message, service, action")
+        if not self.name.startswith("/"):
+            raise ValueError(f"{self.name!r} must be an absolute name, such as /{self.name}")
+        return self
+
+    @property
+    def kind(self) -> ConditionKind:
+        """Which of the four it is."""
+        kinds: tuple[ConditionKind, ...] = ("topic", "message", "service", "action")
+        return next(kind for kind in kinds if getattr(self, kind) is not None)
+
+    @property
+    def name(self) -> str:
+        """The absolute ROS name."""
+        name: str = getattr(self, self.kind)
+        return name
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.name}"
+
+
+class Restart(Config):
+    """What happens when a node ends by itself."""
+
+    policy: Literal["never", "on_failure", "always"] = "on_failure"
+    backoff: float = Field(default=0.5, gt=0, description="s before the first restart; doubles with each one")
+    backoff_max: float = Field(default=8.0, gt=0, description="s, the longest wait")
+    max: int = Field(default=5, ge=0, description="restarts before the node is given up")
+    forget_after: float = Field(default=60.0, gt=0, description="s of being ready that make up for earlier restarts")
+
+
+class NodeSpec(Config):
+    """One process of the graph."""
+
+    module: str | None = Field(default=None, description="started as `python -m module`")
+    command: tuple[str, ...] = Field(default=(), description="started instead of a module")
+    params: dict[str, Any] = Field(default_factory=dict, description="ROS parameters, nested or joined by dots")
+    params_file: str | None = Field(default=None, description="ROS parameter file, in config/ or beside the graph")
+    remaps: dict[str, str] = Field(default_factory=dict)
+    ready: tuple[Ready, ...] = Field(default=(), description="all must hold; none = ready when started")
+    ready_timeout: float = Field(default=60.0, gt=0, description="s")
+    needs: tuple[str, ...] = Field(default=(), description="nodes that must be ready before this one is started")
+    restart: Restart = Restart()
+    essential: bool = Field(default=True, description="false: once it was ready, the graph goes on when it is given up")
+    large_messages: bool = Field(default=False, description="publishes images or clouds: a large Fast DDS segment")
+    segment_mib: int = Field(default=32, ge=1, le=1024, description="MiB of /dev/shm for large messages")
+    shared_mib: float = Field(default=0.0, ge=0.0, le=1024.0, description="MiB of /dev/shm that it takes by itself")
+    env: dict[str, str] = Field(default_factory=dict)
+    offers: tuple[str, ...] = Field(default=(), description="topics, services, actions, for `graph draw`")
+    uses: tuple[str, ...] = Field(default=(), description="names that other nodes offer, for `graph draw`")
+
+    @model_validator(mode="after")
+    def _start(self) -> NodeSpec:
+        if (self.module is None) == (not self.command):
+            raise ValueError("give either module or command")
+        return self
+
+
+class Lockstep(Config):
+    """Simulated time waits for nodes: the same seed gives the same run, however fast the machine is."""
+
+    leader: str = Field(default="mujoco_bridge", description="node that steps the simulation")
+    participants: tuple[str, ...] = Field(min_length=1, description="nodes that it waits for")
+
+
+class Graph(Config):
+    """All nodes that run together."""
+
+    name: str
+    description: str = ""
+    scene: str = Field(default="demo", description="name or path of a scene, or `random`")
+    seed: int = Field(default=0, ge=0, description="of a random scene")
+    mount_seed: int | Literal["none"] = Field(default="none", description="of the true camera mounts; none = nominal")
+    domain: int | None = Field(default=None, ge=0, le=232, description="ROS_DOMAIN_ID; null = of the environment, or 0")
+    discovery: Discovery = Field(default="localhost", description="ROS_AUTOMATIC_DISCOVERY_RANGE")
+    lockstep: Lockstep | None = Field(default=None, description="null = every node at its own pace")
+    nodes: dict[str, NodeSpec] = Field(min_length=1)
+
+    def levels(self) -> tuple[tuple[str, ...], ...]:
+        """Return the node names by depth of dependency: the first needs nothing, each needs only earlier ones."""
+        depth: dict[str, int] = {}
+        while len(depth) < len(self.nodes):
+            for name, spec in self.nodes.items():
+                if name not in depth and all(need in depth for need in spec.needs):
+                    depth[name] = 1 + max((depth[need] for need in spec.needs), default=-1)
+        return tuple(tuple(n for n, d in depth.items() if d == level) for level in range(max(depth.values()) + 1))
+
+    def node(self, name: str) -> NodeSpec:
+        """Return one node.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing the nodes of the graph.
+        """
+        if name not in self.nodes:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"graph {self.name} has no node {name!r}; its nodes are {', '.join(self.nodes)}"
+            )
+        return self.nodes[name]
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """A YAML loader that refuses a key given twice, which YAML would let the last one win."""
+
+
+def _mapping(loader: _UniqueKeys, node: yaml.MappingNode) -> dict[Any, Any]:
+    seen: set[Any] = set()
+    for key_node, _ in node.value:
+        key = loader.construct_object(key_node, deep=True)  # pyright: ignore[reportUnknownMemberType]
+        if key in seen:
+            mark = key_node.start_mark
+            raise yaml.constructor.ConstructorError(None, None, f"{key!r} is given twice", mark)
+        seen.add(key)
+    return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
+
+
+_UniqueKeys.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+
+
+def graph_names() -> list[str]:
+    """Return the names of the graphs that come with the suite."""
+    return sorted(path.stem for path in (config_dir() / "graphs").glob("*.yaml"))
+
+
+def find_graph(name: str) -> Path:
+    """Return the file of a graph, given its name or its path.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, listing the graphs that exist.
+    """
+    known = config_dir() / "graphs" / f"{name}.yaml"
+    for path in (known, Path(name)):
+        if path.is_file():
+            return path
+    raise OpenArmError(
+        Code.INVALID_ARGUMENT, f"there is no graph {name!r}; give a file, or one of {', '.join(graph_names())}"
+    )
+
+
+def load_graph(
+    name: str, *, overrides: Mapping[str, Any] | None = None, sets: Sequence[str] = (), only: Sequence[str] = ()
+) -> Graph:
+    """Read a graph, apply overrides, substitute variables, and check it as a whole.
+
+    Args:
+        name: Name of a graph of the suite, or path of a file.
+        overrides: Top-level values (scene, seed, mount_seed, domain, discovery); None leaves the file's value.
+        sets: `node.param=value`, the value as YAML.
+        only: Names of nodes to keep; empty keeps all.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID for a fault in a file (named as file:key); INVALID_ARGUMENT for one in `sets`,
+            `overrides` or `name`.
+    """
+    path = find_graph(name)
+    data = _read(path, ())
+    given = {key: value for key, value in (overrides or {}).items() if value is not None}
+    data.update(given)
+    if only:
+        _keep(data, only, str(path))
+    where = f"{path} with {given}" if given else str(path)
+    graph = validate(Graph, data, where)
+    _check_needs(graph, str(path))
+    variables = {key: getattr(graph, key) for key in VARIABLES}
+    nodes = {
+        node: spec.model_copy(update={"params": _node_params(node, spec, path, variables)})
+        for node, spec in graph.nodes.items()
+    }
+    graph = _in_lockstep(graph.model_copy(update={"nodes": nodes}), str(path))
+    for item in sets:
+        set_parameter(graph, item)
+    return graph
+
+
+def _read(path: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
+    """Read one file and what it extends, as plain data."""
+    if path in trail:
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"{path}:extends: {' → '.join(p.name for p in (*trail, path))} is a circle"
+        )
+    try:
+        data: Any = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeys)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"{path} is not a valid graph: {error}") from error
+    if not isinstance(data, dict):
+        raise OpenArmError(Code.CONFIG_INVALID, f"{path} holds no mapping of keys; a graph has at least name and nodes")
+    graph: dict[str, Any] = dict(data)  # pyright: ignore[reportUnknownArgumentType]
+    graph.setdefault("name", path.stem)
+    base_name, only = graph.pop("extends", None), graph.pop("only", None)
+    if base_name is not None:
+        beside = path.parent / f"{base_name}.yaml"
+        base = _read(beside if beside.is_file() else find_graph(str(base_name)), (*trail, path))
+        if only is not None:
+            _keep(base, only, f"{path}:only")
+        own = graph.pop("nodes", None) or {}
+        for node, spec in own.items():
+            base["nodes"][node] = {**base["nodes"].get(node, {}), **spec}
+        graph = {**base, **graph}
+    elif only is not None:
+        raise OpenArmError(Code.CONFIG_INVALID, f"{path}:only: needs `extends`")
+    return graph
+
+
+def _keep(data: dict[str, Any], only: Sequence[str], where: str) -> None:
+    unknown = [node for node in only if node not in data["nodes"]]
+    if unknown:
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"{where}: unknown node {unknown[0]!r}; nodes are {', '.join(data['nodes'])}"
+        )
+    data["nodes"] = {node: spec for node, spec in data["nodes"].items() if node in only}
+
+
+def _check_needs(graph: Graph, where: str) -> None:
+    for node, spec in graph.nodes.items():
+        for need in spec.needs:
+            if need not in graph.nodes:
+                raise OpenArmError(
+                    Code.CONFIG_INVALID,
+                    f"{where}:nodes.{node}.needs: unknown node {need!r}; nodes are {', '.join(graph.nodes)}",
+                )
+    for start in graph.nodes:
+        trail: list[str] = [start]
+        circle = _circle(graph, start, trail)
+        if circle:
+            raise OpenArmError(
+                Code.CONFIG_INVALID, f"{where}:nodes.{start}.needs: {' → '.join(circle)} is a circle; remove one need"
+            )
+
+
+def _circle(graph: Graph, node: str, trail: list[str]) -> list[str] | None:
+    for need in graph.nodes[node].needs:
+        if need == trail[0]:
+            return [*trail, need]
+        if need not in trail:
+            found = _circle(graph, need, [*trail, need])
+            if found:
+                return found
+    return None
+
+
+def _node_params(node: str, spec: NodeSpec, graph_file: Path, variables: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge the parameter file and the inline parameters (which win), flat, with variables filled in."""
+    params: dict[str, Any] = {}
+    if spec.params_file is not None:
+        places = [config_dir() / spec.params_file, graph_file.parent / spec.params_file, Path(spec.params_file)]
+        found = [place for place in places if place.is_file()]
+        if not found:
+            raise OpenArmError(
+                Code.CONFIG_INVALID,
+                f"{graph_file}:nodes.{node}.params_file: {spec.params_file} is neither in {places[0].parent} "
+                f"nor in {places[1].parent}",
+            )
+        params.update(read_params(found[0], node))
+    params.update(flatten(spec.params))
+    return {
+        key: substitute(value, variables, f"{graph_file}:nodes.{node}.params.{key}") for key, value in params.items()
+    }
+
+
+def _in_lockstep(graph: Graph, where: str) -> Graph:
+    """Give the nodes of a lock-step their parameters; the end of any of them ends the run."""
+    if graph.lockstep is None:
+        return graph
+    leader, participants = graph.lockstep.leader, graph.lockstep.participants
+    for key, names in (("leader", (leader,)), ("participants", participants)):
+        unknown = [name for name in names if name not in graph.nodes]
+        if unknown:
+            raise OpenArmError(
+                Code.CONFIG_INVALID,
+                f"{where}:lockstep.{key}: unknown node {unknown[0]!r}; nodes are {', '.join(graph.nodes)}",
+            )
+    nodes, never = dict(graph.nodes), Restart(policy="never")
+    for name in (leader, *participants):
+        params = {**nodes[name].params, "lockstep": True}
+        if name == leader:
+            params["barrier.participants"] = list(participants)
+        # The order of sets of strings differs from process to process unless it is asked not to.
+        env = {"PYTHONHASHSEED": "0", **nodes[name].env}
+        nodes[name] = nodes[name].model_copy(update={"params": params, "env": env, "restart": never, "essential": True})
+    return graph.model_copy(update={"nodes": nodes})
+
+
+def set_parameter(graph: Graph, item: str) -> None:
+    """Apply one `node.param=value` to a graph that load_graph made: its dictionaries of parameters are its own.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for another form, an unknown node or a value that is not YAML.
+    """
+    target, equals, text = item.partition("=")
+    node, dot, param = target.partition(".")
+    if not (equals and dot and param):
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, f"--set {item}: expected node.param=value, such as grasp.velocity_scale=0.5"
+        )
+    try:
+        graph.node(node).params[param] = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--set {item}: {text!r} is not a value in YAML: {error}") from error

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keeps one node of a graph running: start when its needs are ready, readiness, restart, stop."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from openarm_bringup.supervision import environment, shm
+from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready
+from openarm_bringup.supervision.process import Haste, Ladder, NodeProcess
+from openarm_common.errors import Code, OpenArmError
+
+T = TypeVar("T")
+
+
+class Probe(Protocol):
+    """What is asked of the ROS graph; see readiness_client."""
+
+    def known(self, conditions: Sequence[Ready]) -> frozenset[str]:
+        """Return what fulfils the conditions before a start."""
+        ...
+
+    def unmet(self, conditions: Sequence[Ready], old: frozenset[str]) -> tuple[str, ...]:
+        """Return the conditions that do not hold yet."""
+        ...
+
+    def parameters(self, node: str) -> frozenset[str]:
+        """Return the names of a node's parameters."""
+        ...
+
+    def close(self) -> None:
+        """Leave the graph."""
+        ...
+
+
+class NodeState(StrEnum):
+    """Where a node stands."""
+
+    WAITING = "waiting"
+    STARTING = "starting"
+    READY = "ready"
+    BACKOFF = "backoff"
+    EXITED = "exited"
+    FAILED = "failed"
+    STOPPED = "stopped"
+
+
+class AskProbe(Protocol):
+    """Puts a question to the probe from the event loop."""
+
+    def __call__(self, question: Callable[[Probe], T]) -> Awaitable[T]:
+        """Return the answer."""
+        ...
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What all keepers of a graph have in common."""
+
+    graph: Graph
+    run_dir: Path
+    ask: AskProbe
+    spawning: asyncio.Lock
+    stop_asked: asyncio.Event
+    haste: Haste
+    ladder: Ladder
+    poll: float
+    tell_guard: Callable[[str], None]
+    say: Callable[[str], None]
+    changed: Callable[[str, NodeState, str], None]
+
+
+class Keeper:
+    """One node, from the first start to the stop."""
+
+    def __init__(self, name: str, spec: NodeSpec, shared: Shared) -> None:
+        self.name = name
+        self.spec = spec
+        self.state = NodeState.WAITING
+        self.process: NodeProcess | None = None
+        self.restarts = 0
+        self.ready = asyncio.Event()
+        self.log = shared.run_dir / "logs" / f"{name}.log"
+        #: Names in /dev/shm that its processes have used.
+        self.mapped: set[str] = set()
+        self._shared = shared
+        self._was_ready = False
+
+    @property
+    def pid(self) -> int | None:
+        """Process id while it runs."""
+        running = self.process is not None and self.process.returncode is None
+        return self.process.pid if running and self.process else None
+
+    @property
+    def dispensable(self) -> bool:
+        """Whether the graph goes on when it is given up: one that was never ready shows a fault of the graph itself."""
+        return self._was_ready and not self.spec.essential
+
+    async def keep(self, needs: Sequence[Keeper]) -> None:
+        """Start the node whenever its needs are ready, until it has ended for good.
+
+        Raises:
+            OpenArmError: NOT_READY, when it is given up; INVALID_ARGUMENT, for a parameter that it does not have.
+        """
+        policy = self.spec.restart
+        pause = policy.backoff
+        while True:
+            for need in needs:
+                await need.ready.wait()
+            code, why, ready_s = await self._run_once()
+            if code == 0 and policy.policy != "always" and self._was_ready:
+                self._enter(NodeState.EXITED, why)
+                return
+            if ready_s > policy.forget_after:
+                self.restarts, pause = 0, policy.backoff
+            # A node that was never ready fails for a reason that a second try will not remove.
+            if policy.policy == "never" or not self._was_ready:
+                raise self._given_up(why)
+            if self.restarts >= policy.max:
+                raise self._given_up(f"{why} after {self.restarts} restarts")
+            self.restarts += 1
+            self._enter(NodeState.BACKOFF, f"{why}; restart {self.restarts} of {policy.max} in {pause:g} s")
+            await asyncio.sleep(pause)
+            pause = min(2 * pause, policy.backoff_max)
+
+    async def stop(self) -> None:
+        """End the process by INT, TERM, KILL."""
+        if self.process is None:
+            return
+        code = self.process.returncode
+        if code is None:
+            self.mapped |= shm.mapped_by(self.process.pid)
+            code = await self.process.stop(self._shared.haste, self._shared.ladder)
+        self._shared.tell_guard(f"-{self.process.pid}")
+        if self.state not in (NodeState.FAILED, NodeState.EXITED):
+            self._enter(NodeState.STOPPED, f"killed ({code})" if self.process.killed else f"code {code}")
+
+    async def _run_once(self) -> tuple[int, str, float]:
+        """Run the process until it ends; return its exit code, why it ended, and how long it was ready, s."""
+        shared, conditions = self._shared, self.spec.ready
+        argv = environment.node_arguments(shared.graph, self.name, shared.run_dir)
+        env = environment.node_environment(shared.graph, self.name, shared.run_dir)
+        # Endpoints of a killed process linger in discovery; only those of the new one count.
+        old = await shared.ask(lambda probe: probe.known(conditions)) if self._was_ready else frozenset[str]()
+        async with shared.spawning:
+            if shared.stop_asked.is_set():
+                raise asyncio.CancelledError
+            self.process = process = await NodeProcess.start(argv, env, self.log)
+            shared.tell_guard(f"+{process.pid}")
+        self._enter(NodeState.STARTING, f"pid {process.pid}")
+        began = time.monotonic()
+        ended = asyncio.create_task(process.wait())
+        getting_ready = asyncio.create_task(self._get_ready(old))
+        try:
+            await asyncio.wait(
+                {ended, getting_ready}, timeout=self.spec.ready_timeout, return_when=asyncio.FIRST_COMPLETED
+            )
+            if not ended.done() and not getting_ready.done():
+                missing = ", ".join(await shared.ask(lambda probe: probe.unmet(conditions, old)))
+                await process.stop(shared.haste, shared.ladder)
+                return 1, f"was not ready after {self.spec.ready_timeout:g} s; missing: {missing}", 0.0
+            ready_at = time.monotonic()
+            if getting_ready.done() and not ended.done():
+                getting_ready.result()
+                self._was_ready = True
+                self.ready.set()
+                self.mapped |= shm.mapped_by(process.pid)
+                self._enter(NodeState.READY, f"after {ready_at - began:.1f} s")
+            code = await ended
+        finally:
+            getting_ready.cancel()
+            ended.cancel()
+        ready_s = time.monotonic() - ready_at if self.ready.is_set() else 0.0
+        self.ready.clear()
+        shared.tell_guard(f"-{process.pid}")
+        if code < 0 or process.killed:
+            # Killed processes leave their segments behind; free them before the next start needs the space.
+            shared.say(await asyncio.to_thread(shm.clean_shm))
+        return code, f"ended by signal {-code}" if code < 0 else f"ended with code {code}", ready_s
+
+    async def _get_ready(self, old: frozenset[str]) -> None:
+        conditions = self.spec.ready
+        while conditions and await self._shared.ask(lambda probe: probe.unmet(conditions, old)):
+            await asyncio.sleep(self._shared.poll)
+        if conditions and self.spec.params and not self._was_ready:
+            await self._check_parameters()
+
+    async def _check_parameters(self) -> None:
+        """Refuse parameters that the node does not have; ROS would ignore them silently."""
+        existing = await self._shared.ask(lambda probe: probe.parameters(self.name))
+        unknown = [param for param in self.spec.params if param not in existing]
+        if unknown:
+            valid = ", ".join(sorted(param for param in existing if not param.startswith("qos_overrides")))
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{self.name} has no parameter {unknown[0]!r}; it has {valid}")
+
+    def _given_up(self, why: str) -> OpenArmError:
+        tail = "\n".join(list(self.process.tail)[-12:]) if self.process else ""
+        return OpenArmError(Code.NOT_READY, f"{self.name} {why}; its log {self.log} ends with:\n{tail}")
+
+    def _enter(self, state: NodeState, detail: str) -> None:
+        self.state = state
+        self._shared.changed(self.name, state, detail)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Asks the ROS graph whether a node is ready: one probe node for the whole supervisor.
+
+A killed process stays in the discovery data of the others until its lease ends, so endpoints are told apart by their
+identifiers: those that were there before a (re)start do not count.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import rclpy
+from rcl_interfaces.srv import ListParameters
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+
+from openarm_bringup.supervision.graph import Ready
+from openarm_common.errors import Code, OpenArmError
+
+
+class ReadinessClient:
+    """The probe of a supervisor. Not for use from two threads at once.
+
+    Args:
+        environ: ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE of the graph.
+    """
+
+    def __init__(self, environ: Mapping[str, str]) -> None:
+        os.environ.update(environ)  # rmw reads the discovery range from the process environment
+        self._context = Context()
+        rclpy.init(
+            context=self._context,
+            domain_id=int(environ["ROS_DOMAIN_ID"]),
+            signal_handler_options=SignalHandlerOptions.NO,
+        )
+        self._node: Node = rclpy.create_node(
+            f"openarm_probe_{os.getpid()}", context=self._context, use_global_arguments=False
+        )
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._waiting: dict[str, Subscription] = {}
+        self._received: set[str] = set()
+
+    def known(self, conditions: Sequence[Ready]) -> frozenset[str]:
+        """Return the endpoints that fulfil the conditions now; call it before a process is started."""
+        for condition in conditions:
+            self._forget(condition.name)
+        return frozenset(gid for condition in conditions for gid in self._endpoints(condition))
+
+    def unmet(self, conditions: Sequence[Ready], old: frozenset[str]) -> tuple[str, ...]:
+        """Return the conditions that do not hold yet, not counting endpoints in `old`."""
+        for _ in range(4):
+            self._executor.spin_once(timeout_sec=0.0)
+        return tuple(str(condition) for condition in conditions if not self._met(condition, old))
+
+    def parameters(self, node: str, timeout_s: float = 20.0) -> frozenset[str]:
+        """Return the names of a node's parameters.
+
+        Raises:
+            OpenArmError: TIMEOUT, when the node does not answer.
+        """
+        client = self._node.create_client(ListParameters, f"/{node}/list_parameters")
+        try:
+            if client.wait_for_service(timeout_sec=timeout_s):
+                future = client.call_async(ListParameters.Request())
+                self._executor.spin_until_future_complete(future, timeout_sec=timeout_s)
+                answer = future.result()
+                if answer is not None:
+                    return frozenset(answer.result.names)
+        finally:
+            self._node.destroy_client(client)
+        raise OpenArmError(Code.TIMEOUT, f"/{node}/list_parameters did not answer within {timeout_s:g} s")
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown(timeout_sec=1.0)
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def _met(self, condition: Ready, old: frozenset[str]) -> bool:
+        if condition.kind == "message":
+            return self._has_message(condition.name, old)
+        return bool(self._endpoints(condition) - old)
+
+    def _endpoints(self, condition: Ready) -> set[str]:
+        name = condition.name
+        if condition.kind in ("topic", "message"):
+            infos = self._node.get_publishers_info_by_topic(name)
+        else:
+            # rclpy lists no endpoints of services; their request topics are ordinary topics below.
+            service = name if condition.kind == "service" else f"{name}/_action/send_goal"
+            infos = self._node.get_subscriptions_info_by_topic(f"rq{service}Request", no_mangle=True)
+        return {bytes(info.endpoint_gid).hex() for info in infos}
+
+    def _has_message(self, topic: str, old: frozenset[str]) -> bool:
+        if topic in self._received:
+            return True
+        if topic not in self._waiting:
+            infos = self._node.get_publishers_info_by_topic(topic)
+            new = next((info for info in infos if bytes(info.endpoint_gid).hex() not in old), None)
+            if new is not None:
+                kind, profile = _message_type(new.topic_type), _like(new.qos_profile)
+                self._waiting[topic] = self._node.create_subscription(
+                    kind, topic, self._receiver(topic), profile, raw=True
+                )
+        return False
+
+    def _receiver(self, topic: str) -> Any:
+        def receive(_: bytes) -> None:
+            self._received.add(topic)
+            self._end_waiting(topic)
+
+        return receive
+
+    def _end_waiting(self, topic: str) -> None:
+        if topic in self._waiting:
+            self._node.destroy_subscription(self._waiting.pop(topic))
+
+    def _forget(self, topic: str) -> None:
+        self._received.discard(topic)
+        self._end_waiting(topic)
+
+
+def _like(offered: QoSProfile) -> QoSProfile:
+    """Return a profile that the publisher can serve, with its latched message if it keeps one."""
+    return QoSProfile(depth=1, reliability=offered.reliability, durability=offered.durability)
+
+
+def _message_type(name: str) -> Any:
+    """Import a message class from its ROS name, such as sensor_msgs/msg/Image."""
+    package, kind, message = name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{kind}"), message)
+    except (ImportError, AttributeError) as error:
+        raise OpenArmError(Code.ENVIRONMENT, f"message type {name} is not installed here") from error

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shared memory in /dev/shm, of Fast DDS and of the suite: what a graph needs of it, and leaving nothing behind."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+from openarm_bringup.supervision.graph import Graph
+from openarm_common.errors import Code, OpenArmError
+
+SHM = Path("/dev/shm")
+
+#: MiB of /dev/shm that a participant takes beside its large segment, measured.
+_PLAIN_MIB = 0.65
+_LARGE_EXTRA_MIB = 2.2
+
+_SEGMENT = re.compile(r"^fastrtps_[0-9a-f]{16}$")
+_PORT = re.compile(r"^fastrtps_port(\d+)$")
+#: Distance fields (`openarm_common.distance_field.field_path`), and what one is called while it is made.
+_FIELD = re.compile(r"^openarm_field_([A-Za-z0-9_.-]+)$")
+_UNFINISHED = re.compile(r"^[a-z0-9_]{8}$")
+
+
+def shm_need_mib(graph: Graph, extra_participants: int = 1) -> float:
+    """Return how much of /dev/shm the graph takes, MiB, with `extra_participants` beside its nodes (probe, clients)."""
+    need = extra_participants * _PLAIN_MIB
+    for spec in graph.nodes.values():
+        need += spec.shared_mib
+        need += spec.segment_mib + _LARGE_EXTRA_MIB if spec.large_messages else _PLAIN_MIB
+    return need
+
+
+def shm_free_mib(path: Path = SHM) -> float:
+    """Return the free space of /dev/shm, MiB."""
+    return shutil.disk_usage(path).free / 2**20
+
+
+def check_shm(graph: Graph, free_mib: float | None = None) -> None:
+    """Refuse to start a graph whose images would be lost for lack of shared memory.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, with both figures and what to do.
+    """
+    need, free = shm_need_mib(graph, extra_participants=4), shm_free_mib() if free_mib is None else free_mib
+    if free >= need:
+        return
+    raise OpenArmError(
+        Code.ENVIRONMENT,
+        f"graph {graph.name} needs {need:.0f} MiB of {SHM}, {free:.0f} MiB are free; stop other graphs, remove what "
+        "dead processes left (`fastdds shm clean`), give a container more (`--shm-size=256m`), or lower `segment_mib` "
+        "in the graph",
+    )
+
+
+def clean_command() -> list[str] | None:
+    """Return the command that removes what killed processes left in /dev/shm, or None where Fast DDS has no tool."""
+    beside = Path(sys.executable).parent / "fastdds"
+    tool = str(beside) if beside.exists() else shutil.which("fastdds")
+    return [tool, "shm", "clean"] if tool else None
+
+
+def clean_shm() -> str:
+    """Remove the segments of dead processes (those in use are locked and stay); return what the tool said."""
+    command = clean_command()
+    if command is None:
+        return "fastdds is not installed; segments of killed processes stay in /dev/shm"
+    env = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}"}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=20, check=False)
+    return " ".join((done.stdout + done.stderr).split())
+
+
+def mapped_by(pid: int, shm: Path = SHM) -> set[str]:
+    """Return the names of segments, ports and distance fields that a process has mapped; none when it has ended."""
+    try:
+        lines = Path(f"/proc/{pid}/maps").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return set()
+    names = {line.rpartition("/")[2] for line in lines if f"{shm}/" in line}
+    return {name for name in names if any(kind.match(name) for kind in (_SEGMENT, _PORT, _FIELD))}
+
+
+def ports_of(domain: int, shm: Path = SHM) -> set[str]:
+    """Return the names of the ports of a ROS domain that exist in /dev/shm."""
+    first = 7400 + 250 * domain
+    matches = ((entry.name, _PORT.match(entry.name)) for entry in shm.iterdir())
+    return {name for name, match in matches if match and first <= int(match.group(1)) < first + 250}
+
+
+def fields_of(domain: int, shm: Path = SHM) -> set[str]:
+    """Return the names of the distance fields of a ROS domain in /dev/shm, unfinished ones too."""
+    found: set[str] = set()
+    for entry in shm.iterdir():
+        match = _FIELD.match(entry.name)
+        if match and match.group(1).startswith(str(domain)):
+            rest = match.group(1).removeprefix(str(domain))
+            if not rest or _UNFINISHED.match(rest):
+                found.add(entry.name)
+    return found
+
+
+def names_of(domain: int, shm: Path = SHM) -> set[str]:
+    """Return the names of all that a graph in a ROS domain may have left in /dev/shm."""
+    return ports_of(domain, shm) | fields_of(domain, shm)
+
+
+def unused(names: Iterable[str], shm: Path = SHM) -> list[str]:
+    """Return those of the named segments, ports and fields that exist and that nobody uses any more.
+
+    In use is what is locked, or mapped by any process that can be seen.
+    """
+    wanted = {name for name in names if (shm / name).exists()}
+    if not wanted:
+        return []
+    pids = [int(entry) for entry in os.listdir("/proc") if entry.isdigit()]
+    in_use: set[str] = set().union(*(mapped_by(pid, shm) for pid in pids))
+    return [name for name in sorted(wanted - in_use) if not _locked(shm / f"{name}_el")]
+
+
+def sweep(names: Iterable[str], shm: Path = SHM) -> list[str]:
+    """Remove those of the named segments, ports and fields that nobody uses any more; return them.
+
+    A process that sends to one that has just died opens its port anew, without the lock by which `fastdds shm clean`
+    knows a port; such ports would stay for ever.
+    """
+    removed = unused(names, shm)
+    for name in removed:
+        for part in (name, f"{name}_el", f"{name}_sl", f"sem.{name}_mutex"):
+            (shm / part).unlink(missing_ok=True)
+    return removed
+
+
+def _locked(path: Path) -> bool:
+    try:
+        with path.open("rb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except (BlockingIOError, PermissionError):
+        return True
+    return False
+
+
+def main() -> None:
+    """`python -m openarm_bringup.supervision.shm DOMAIN`: clean up after a graph whose supervisor is dead."""
+    clean_shm()
+    sweep(names_of(int(sys.argv[1])))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starts the nodes of a graph in the order of their needs, watches them, and stops every one of them.
+
+All of it runs in one asyncio loop; the ROS graph is asked through a `Probe` in a thread. A node that fails is started
+again with growing pauses. Stopping goes from the last dependents to the first needs; nothing survives it. Should the
+supervisor itself be killed, a guard process ends the nodes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TypeVar
+
+import psutil
+
+from openarm_bringup.supervision import environment, guard, runs, shm
+from openarm_bringup.supervision.graph import Graph
+from openarm_bringup.supervision.keeper import Keeper, NodeState, Probe, Shared
+from openarm_bringup.supervision.process import Haste, Ladder
+from openarm_common.errors import Code, OpenArmError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Event:
+    """A change of one node, for whoever shows it."""
+
+    seconds: float
+    node: str
+    state: NodeState
+    detail: str
+
+
+class Supervisor:
+    """Runs one graph; made inside a running asyncio loop.
+
+    Args:
+        graph: What to run.
+        run_dir: Gets `logs/<node>.log`, `logs/supervisor.log` and `params/`.
+        probe: Makes the probe; called in a thread, because it imports rclpy.
+        listener: Is told every change of state.
+        ladder: Patience with nodes at the end.
+        poll: s between two looks at a node that is not ready.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        run_dir: Path,
+        probe: Callable[[], Probe],
+        *,
+        listener: Callable[[Event], None] | None = None,
+        ladder: Ladder | None = None,
+        poll: float = 0.1,
+    ) -> None:
+        self.graph = graph
+        self.run_dir = run_dir
+        self._make_probe = probe
+        self._probe: asyncio.Future[Probe] | None = None
+        self._listener = listener
+        self._began = time.monotonic()
+        self._started = datetime.now().isoformat(timespec="seconds")
+        self._trouble: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._threads = ThreadPoolExecutor(max_workers=1, thread_name_prefix="probe")
+        self._watchers: list[asyncio.Task[None]] = []
+        self._guard: asyncio.subprocess.Process | None = None
+        self._shared = Shared(
+            graph=graph,
+            run_dir=run_dir,
+            ask=self._ask,
+            spawning=asyncio.Lock(),
+            stop_asked=asyncio.Event(),
+            haste=Haste(),
+            ladder=ladder or Ladder(),
+            poll=poll,
+            tell_guard=self._tell_guard,
+            say=self._say,
+            changed=self._changed,
+        )
+        self._keepers = {name: Keeper(name, spec, self._shared) for name, spec in graph.nodes.items()}
+
+    async def start(self) -> None:
+        """Begin to start the nodes; returns at once.
+
+        Raises:
+            OpenArmError: ENVIRONMENT, when /dev/shm is too small for the graph.
+        """
+        shm.check_shm(self.graph)
+        (self.run_dir / "logs").mkdir(parents=True, exist_ok=True)
+        self._guard = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-I",
+            "-S",
+            guard.__file__,
+            *(sys.executable, "-m", shm.__name__, str(environment.domain_id(self.graph))),
+            stdin=asyncio.subprocess.PIPE,
+            start_new_session=True,
+        )
+        loop = asyncio.get_running_loop()
+        self._probe = asyncio.ensure_future(loop.run_in_executor(self._threads, self._make_probe))
+        for keeper in self._keepers.values():
+            watcher = asyncio.create_task(keeper.keep([self._keepers[need] for need in keeper.spec.needs]))
+            watcher.add_done_callback(lambda task, keeper=keeper: self._watcher_ended(keeper, task))
+            self._watchers.append(watcher)
+        self._record()
+
+    async def wait_ready(self) -> None:
+        """Wait until every node is ready.
+
+        Raises:
+            OpenArmError: what kept a node from it (with the end of its log); CANCELLED when asked to stop meanwhile.
+        """
+        ready = asyncio.create_task(self._all_ready())
+        stopping = asyncio.create_task(self._shared.stop_asked.wait())
+        await asyncio.wait([ready, stopping, self._trouble], return_when=asyncio.FIRST_COMPLETED)
+        done = ready.done()
+        stopping.cancel()
+        ready.cancel()
+        if self._trouble.done():
+            self._trouble.result()
+        if not done:
+            raise OpenArmError(Code.CANCELLED, "asked to stop before the graph was ready")
+        self._record()
+
+    async def wait_stop_asked(self) -> None:
+        """Wait for `ask_stop`, or until a node was given up.
+
+        Raises:
+            OpenArmError: why a node was given up that the graph can't do without.
+        """
+        stopping = asyncio.create_task(self._shared.stop_asked.wait())
+        await asyncio.wait([stopping, self._trouble], return_when=asyncio.FIRST_COMPLETED)
+        stopping.cancel()
+        if self._trouble.done():
+            self._trouble.result()
+
+    def ask_stop(self) -> None:
+        """Ask for the end; a second time: hurry (the next signal at once)."""
+        if self._shared.stop_asked.is_set():
+            self._shared.haste.hurry()
+        self._shared.stop_asked.set()
+
+    async def stop(self) -> None:
+        """Stop every node, dependents before their needs, and leave nothing behind."""
+        self._shared.stop_asked.set()
+        async with self._shared.spawning:  # a process that is being started is known before its watcher is cancelled
+            for watcher in self._watchers:
+                watcher.cancel()
+        await asyncio.gather(*self._watchers, return_exceptions=True)
+        stops: list[asyncio.Task[None]] = []
+        for level in reversed(self.graph.levels()):
+            tasks = [asyncio.create_task(self._keepers[name].stop()) for name in level]
+            stops += tasks
+            # A node that is slow to end does not hold back the rest: its own ladder goes on meanwhile.
+            await asyncio.wait(tasks, timeout=1.0)
+        await asyncio.gather(*stops)
+        if self._probe is not None and (await asyncio.wait([self._probe])) and self._probe.exception() is None:
+            await self._ask(lambda probe: probe.close())
+        self._threads.shutdown()
+        mapped = set().union(*(keeper.mapped for keeper in self._keepers.values()))
+        swept = await asyncio.to_thread(lambda: shm.sweep(mapped | shm.names_of(environment.domain_id(self.graph))))
+        self._say(f"removed from /dev/shm: {', '.join(swept) or 'nothing'}")
+        await self._dismiss_guard()
+        runs.remove_record(os.getpid())
+
+    def states(self) -> dict[str, NodeState]:
+        """Return the state of every node."""
+        return {name: keeper.state for name, keeper in self._keepers.items()}
+
+    def pid(self, node: str) -> int:
+        """Return the process id of a running node.
+
+        Raises:
+            OpenArmError: NOT_READY, when it does not run.
+        """
+        pid = self._keepers[node].pid
+        if pid is None:
+            raise OpenArmError(Code.NOT_READY, f"{node} is not running; it is {self._keepers[node].state}")
+        return pid
+
+    def _watcher_ended(self, keeper: Keeper, task: asyncio.Task[None]) -> None:
+        error = None if task.cancelled() else task.exception()
+        if error is None:
+            return
+        keeper.state = NodeState.FAILED
+        told = error.message if isinstance(error, OpenArmError) else repr(error)
+        if keeper.dispensable and isinstance(error, OpenArmError):
+            self._changed(keeper.name, NodeState.FAILED, f"the graph goes on without it: {told}")
+            return
+        self._changed(keeper.name, NodeState.FAILED, told)
+        if not self._trouble.done():
+            self._trouble.set_exception(error)
+            self._trouble.exception()  # marked as seen: nobody may be waiting
+
+    async def _all_ready(self) -> None:
+        for keeper in self._keepers.values():
+            await keeper.ready.wait()
+
+    async def _ask(self, question: Callable[[Probe], T]) -> T:
+        if self._probe is None:
+            raise OpenArmError(Code.INTERNAL, "the supervisor was not started")
+        probe = await asyncio.shield(self._probe)
+        return await asyncio.get_running_loop().run_in_executor(self._threads, question, probe)
+
+    def _tell_guard(self, line: str) -> None:
+        if self._guard is not None and self._guard.stdin is not None and self._guard.returncode is None:
+            self._guard.stdin.write(f"{line}\n".encode())
+
+    async def _dismiss_guard(self) -> None:
+        self._tell_guard("bye")
+        if self._guard is not None and self._guard.stdin is not None:
+            self._guard.stdin.close()
+            await self._guard.wait()
+
+    def _changed(self, node: str, state: NodeState, detail: str) -> None:
+        self._say(f"{node}: {state}: {detail}")
+        self._record()
+        if self._listener is not None:
+            self._listener(Event(time.monotonic() - self._began, node, state, detail))
+
+    def _say(self, text: str) -> None:
+        with (self.run_dir / "logs" / "supervisor.log").open("a", encoding="utf-8") as log:
+            log.write(f"{datetime.now().isoformat(sep=' ', timespec='milliseconds')} {text}\n")
+
+    def _record(self) -> None:
+        me = psutil.Process()
+        nodes = {
+            name: runs.NodeRecord(state=keeper.state, pid=keeper.pid, restarts=keeper.restarts, log=str(keeper.log))
+            for name, keeper in self._keepers.items()
+        }
+        runs.write_record(
+            runs.RunRecord(
+                graph=self.graph.name,
+                pid=me.pid,
+                pid_created=me.create_time(),
+                domain=environment.domain_id(self.graph),
+                discovery=self.graph.discovery,
+                run_dir=str(self.run_dir),
+                started=self._started,
+                ready=all(keeper.state == NodeState.READY for keeper in self._keepers.values()),
+                nodes=nodes,
+            )
+        )

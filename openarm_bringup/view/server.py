@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The web server of `openarm view`: the page, a websocket that shows, and requests that ask.
+
+Every page gets the newest of what it wants, as fast as it takes it: what a slow one misses is not queued. Each request
+passes a `Guard`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import mimetypes
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Protocol
+
+from aiohttp import WSCloseCode, WSMsgType, web
+from pydantic import Field, ValidationError
+
+from openarm_bringup.view.guard import Guard
+from openarm_common.config import Config, describe_faults
+from openarm_common.errors import Code, OpenArmError
+
+PAGE = Path(__file__).parent / "page"
+#: What every page gets while it is open.
+ALWAYS = frozenset({"states"})
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self';"
+        " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Cache-Control": "no-store",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
+_MAX_PAGES = 8
+_MAX_BYTES = 4096
+
+
+class Order(Config):
+    """A grasp that a page asks for."""
+
+    label: str = Field(default="", max_length=64, description="what to pick; empty = what is seen best")
+    arm: Literal["auto", "left", "right"] = "auto"
+    dry_run: bool = False
+
+
+class Reset(Config):
+    """A reset of the simulation that a page asks for."""
+
+    scene: str = Field(default="", max_length=64, pattern=r"^[A-Za-z0-9_]*$", description="empty = the present one")
+    seed: int = Field(default=0, ge=0, description="of a random scene")
+
+
+class Wants(Config):
+    """What a page looks at."""
+
+    want: tuple[str, ...] = Field(max_length=32)
+
+
+class Item(NamedTuple):
+    """Something new: of the newest of each key, a page gets it when it wants the layer."""
+
+    layer: str
+    key: str
+    payload: str | bytes
+
+    @classmethod
+    def of_fault(cls, layer: str, text: str) -> Item:
+        """What keeps a layer from being shown; nothing when it is shown again."""
+        return cls(layer, f"fault:{layer}", json.dumps({"kind": "fault", "layer": layer, "text": text}))
+
+
+class View(Protocol):
+    """What the server needs of the graph; its methods but `want` block, and are called in threads."""
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of all that can be looked at."""
+        ...
+
+    def want(self, layers: frozenset[str]) -> None:
+        """Look at these layers from now on."""
+        ...
+
+    def pick(self, order: Order) -> dict[str, Any]:
+        """Grasp something; returns the fields of the result."""
+        ...
+
+    def cancel(self) -> tuple[bool, str]:
+        """End the grasp that runs; returns whether there was one, and a sentence."""
+        ...
+
+    def reset(self, order: Reset) -> tuple[bool, str]:
+        """Put the simulation back; returns whether it was, and a sentence."""
+        ...
+
+
+class _Page:
+    """One open page."""
+
+    def __init__(self) -> None:
+        self.wants: frozenset[str] = ALWAYS
+        self.pending: dict[str, str | bytes] = {}
+        self.news = asyncio.Event()
+
+    def give(self, key: str, payload: str | bytes) -> None:
+        self.pending[key] = payload
+        self.news.set()
+
+
+class ViewServer:
+    """Serves pages; made and used in one asyncio loop.
+
+    Args:
+        guard: Decides who may.
+        hello: What a page is told first: the robot, the cameras, the states of a grasp.
+        view: Looks at the graph.
+    """
+
+    def __init__(self, guard: Guard, hello: Mapping[str, Any], view: View) -> None:
+        self.guard = guard
+        self._view = view
+        self._hello = json.dumps({"kind": "hello", **hello})
+        self._pages: set[_Page] = set()
+        self._kept: dict[str, Item] = {}
+        self._picking: asyncio.Task[None] | None = None
+        self._files = {path.name: path.read_bytes() for path in sorted(PAGE.iterdir()) if path.is_file()}
+
+    def app(self) -> web.Application:
+        """The aiohttp application."""
+        app = web.Application(client_max_size=_MAX_BYTES, middlewares=[self._check])
+        app.router.add_get("/", self._page)
+        app.router.add_get("/socket", self._socket)
+        app.router.add_post("/pick", self._pick)
+        app.router.add_post("/cancel", self._cancel)
+        app.router.add_post("/reset", self._reset)
+        app.router.add_get("/{name}", self._file)
+        return app
+
+    def put(self, item: Item) -> None:
+        """Take something new; in the loop."""
+        self._kept[item.key] = item
+        for page in self._pages:
+            if item.layer in page.wants:
+                page.give(item.key, item.payload)
+
+    # --- who may
+    @web.middleware
+    async def _check(
+        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        host = request.headers.get("Host")
+        try:
+            self.guard.check_host(host)
+            if request.path == "/socket" or request.method not in ("GET", "HEAD"):
+                self.guard.check_origin(request.headers.get("Origin"), host)
+            if request.path in ("/", "/socket") or request.method not in ("GET", "HEAD"):
+                scheme, _, bearer = request.headers.get("Authorization", "").partition(" ")
+                self.guard.check_token(request.query.get("token") or (bearer if scheme == "Bearer" else None))
+        except OpenArmError as error:
+            return web.json_response(_failed(error), status=403, headers=_HEADERS)
+        try:
+            response = await handler(request)
+        except web.HTTPException as error:
+            error.headers.update(_HEADERS)
+            raise
+        if not response.prepared:
+            response.headers.update(_HEADERS)
+        return response
+
+    # --- what is shown
+    async def _page(self, _: web.Request) -> web.Response:
+        return self._response("index.html")
+
+    async def _file(self, request: web.Request) -> web.Response:
+        name = request.match_info["name"]
+        if name not in self._files or name == "index.html":
+            raise web.HTTPNotFound(text=f"there is no {name!r} here")
+        return self._response(name)
+
+    def _response(self, name: str) -> web.Response:
+        kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
+        charset = "utf-8" if kind.startswith("text/") else None
+        return web.Response(body=self._files[name], content_type=kind, charset=charset)
+
+    async def _socket(self, request: web.Request) -> web.WebSocketResponse:
+        if len(self._pages) >= _MAX_PAGES:
+            raise web.HTTPServiceUnavailable(text=f"{_MAX_PAGES} pages are open already; close one")
+        socket = web.WebSocketResponse(heartbeat=20.0, max_msg_size=_MAX_BYTES, compress=False)
+        await socket.prepare(request)
+        page = _Page()
+        self._pages.add(page)
+        sender = asyncio.create_task(self._send(page, socket))
+        try:
+            async for message in socket:
+                if message.type is not WSMsgType.TEXT:
+                    break
+                try:
+                    self._wants(page, Wants.model_validate_json(message.data).want)
+                except (ValidationError, OpenArmError) as error:
+                    reason = str(error).partition("\n")[0][:120]
+                    await socket.close(code=WSCloseCode.POLICY_VIOLATION, message=reason.encode())
+        finally:
+            self._pages.discard(page)
+            sender.cancel()
+            await asyncio.gather(sender, return_exceptions=True)
+            self._demand()
+        return socket
+
+    async def _send(self, page: _Page, socket: web.WebSocketResponse) -> None:
+        await socket.send_str(self._hello)
+        self._wants(page, ())
+        while True:
+            await page.news.wait()
+            page.news.clear()
+            for key in list(page.pending):
+                payload = page.pending.pop(key)
+                await (socket.send_bytes(payload) if isinstance(payload, bytes) else socket.send_str(payload))
+
+    def _wants(self, page: _Page, layers: tuple[str, ...]) -> None:
+        known = self._view.layers
+        unknown = [layer for layer in layers if layer not in known]
+        if unknown:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no layer {unknown[0]!r}; there are {', '.join(known)}")
+        before, page.wants = page.wants, frozenset(layers) | ALWAYS
+        for item in self._kept.values():
+            if item.layer in page.wants and (item.layer not in before or item.layer in ALWAYS):
+                page.give(item.key, item.payload)
+        self._demand()
+
+    def _demand(self) -> None:
+        """Look at what some page wants; what none wants any more is not kept, it would be old when one does."""
+        wanted = frozenset[str]().union(*(page.wants for page in self._pages))
+        self._kept = {key: item for key, item in self._kept.items() if item.layer in wanted | ALWAYS}
+        self._view.want(wanted)
+
+    # --- what is asked
+    async def _pick(self, request: web.Request) -> web.Response:
+        order = await _body(request, Order)
+        if self._picking is not None and not self._picking.done():
+            text = "a grasp that was asked for here is running; cancel it or wait until it has ended"
+            return web.json_response(_failed(OpenArmError(Code.BUSY, text)), status=409)
+        self._picking = asyncio.create_task(self._do_pick(order))
+        return web.json_response({"success": True, "code": Code.OK, "message": "asked"}, status=202)
+
+    async def _do_pick(self, order: Order) -> None:
+        self._outcome(running=True, message="", label=order.label)
+        try:
+            result = await asyncio.to_thread(self._view.pick, order)
+        except OpenArmError as error:
+            result = _failed(error)
+        self._outcome(running=False, **result)
+
+    def _outcome(self, **values: Any) -> None:
+        self.put(Item("states", "outcome", json.dumps({"kind": "outcome", **values})))
+
+    async def _cancel(self, _: web.Request) -> web.Response:
+        return await _answer(self._view.cancel)
+
+    async def _reset(self, request: web.Request) -> web.Response:
+        order = await _body(request, Reset)
+        return await _answer(lambda: self._view.reset(order))
+
+
+async def _body(request: web.Request, model: type[Any]) -> Any:
+    if request.content_type != "application/json":
+        raise web.HTTPUnsupportedMediaType(text=f"the body is {request.content_type}, expected application/json")
+    try:
+        return model.model_validate_json(await request.read())
+    except ValidationError as error:
+        fault = OpenArmError(Code.INVALID_ARGUMENT, describe_faults(error, request.path, model))
+        raise web.HTTPBadRequest(text=json.dumps(_failed(fault)), content_type="application/json") from error
+
+
+async def _answer(ask: Callable[[], tuple[bool, str]]) -> web.Response:
+    try:
+        success, message = await asyncio.to_thread(ask)
+    except OpenArmError as error:
+        return web.json_response(_failed(error))
+    return web.json_response({"success": success, "code": Code.OK if success else "REFUSED", "message": message})
+
+
+def _failed(error: OpenArmError) -> dict[str, Any]:
+    return {"success": False, "code": error.code, "message": error.message}
