@@ -126,8 +126,9 @@ class CourseExecutor:
             if not under_way and max_wait == 0.0:
                 check_against_others(arm, motion, state, [])
                 return 0, 0.0
-            others, course = self._courses(arm, begin_ns, state), Course(arm, motion, mine)
-            wait: float = await self._node.in_thread(least_wait, course, others, state, max_wait, stopped)
+            wide = self._hands_open(state)
+            others, course = self._courses(arm, begin_ns, wide), Course(arm, motion, mine)
+            wait: float = await self._node.in_thread(least_wait, course, others, wide, max_wait, stopped)
             begin_ns += round(wait * 1e9)
             if stops == self._stops and latest()[0] + round(_TELL * 1e9) <= begin_ns:
                 return begin_ns, wait
@@ -147,9 +148,10 @@ class CourseExecutor:
         if not self._under_way(arm):
             return 0.0
         now_ns, state = self._states.buffer.latest()
-        others = self._courses(arm, now_ns, state)
+        wide = self._hands_open(state)
+        others = self._courses(arm, now_ns, wide)
         mine = Course(arm, Motion.of(trajectory), held)
-        wait: float = await self._node.in_thread(lambda: least_wait(mine, others, state, stopped=stopped))
+        wait: float = await self._node.in_thread(lambda: least_wait(mine, others, wide, stopped=stopped))
         return wait
 
     def look_again(self, arm: Arm, name: str) -> OpenArmError | None:
@@ -169,6 +171,12 @@ class CourseExecutor:
     def stops(self) -> Mapping[str, int]:
         """How often each arm has stopped on its way."""
         return self._stops
+
+    def _hands_open(self, state: Mapping[str, float]) -> Mapping[str, float]:
+        """The joints with all hands open: they may open on the way."""
+        for arm in self._arms.values():
+            state = arm.with_gripper(state, arm.config.planning.gripper_open)
+        return state
 
     def _courses(self, arm: Arm, now_ns: int, state: Mapping[str, float]) -> list[Course]:
         """What the other arms have before them, from a moment on."""

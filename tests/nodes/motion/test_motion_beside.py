@@ -79,6 +79,16 @@ def test_n12_no_rest_is_long_enough_for_an_arm_that_ends_in_the_way(bench) -> No
     assert bench.ros.result(left).result.success
 
 
+def test_n12_hands_are_kept_apart_as_if_they_were_open(bench) -> None:
+    """The closed hands would stand 41 mm apart; one that opens there would come within 11 mm of the other."""
+    assert bench.run(bench.move_client, to(bench, "left", (0.28, 0.08, 0.60))).success
+    there = bench.run(bench.move_client, to(bench, "right", (0.28, -0.08, 0.68), plan_only=True))
+    assert there.success, there.message
+    refused = bench.run(bench.execute_client, execute("right", there.trajectory))
+    assert refused.code == "IN_COLLISION"
+    assert "finger" in refused.message
+
+
 def test_n12_an_arm_holds_when_the_other_stops_in_its_way(bench) -> None:
     slow, quick = leaving(bench)
     handle, left = bench.start(bench.execute_client, execute("left", slow))
