@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from openarm_bringup.judge import JudgeConfig
-from openarm_bringup.observer_client import Observer
-from openarm_bringup.trial import wait_scene
+from openarm_bringup.judging.judge import JudgeConfig
+from openarm_bringup.judging.observer_client import Observer
+from openarm_bringup.judging.trial import wait_scene
 from openarm_common.errors import Code
 from openarm_common.scene import load_scene
 from openarm_grasp.client import GraspClient, GraspResult
