@@ -36,8 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.graph import load_graph
-from openarm_bringup.session import running_graph
+from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.session import running_graph
 from openarm_common.domain import release_domain, reserve_domain
 from openarm_common.lattice import Lattice
 from openarm_common.octomap_codec import decode

@@ -133,6 +133,7 @@ def _place_goal(effect: PlanPlace, velocity_scale: float) -> PlanApproach.Goal:
         targets=_targets(effect.targets),
         obstacles=[box_to_msg(box) for box in effect.obstacles],
         attached=[box_to_msg(effect.held)],
+        gone=[box_to_msg(box) for box in effect.gone],
         detached_after_approach=True,
         start=start,
         velocity_scale=velocity_scale,

@@ -109,6 +109,7 @@ class PlanPlace:
     Attributes:
         held: What the hand carries, TCP frame.
         after: Trajectory whose end is the start; None starts at the present joints.
+        gone: Where the object stood: the map may not know yet that it was taken away.
     """
 
     arm: str
@@ -116,6 +117,7 @@ class PlanPlace:
     obstacles: tuple[Box, ...]
     held: Box
     after: Trajectory | None = None
+    gone: tuple[Box, ...] = ()
 
 
 @dataclass(frozen=True)

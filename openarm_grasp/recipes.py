@@ -69,8 +69,8 @@ def plan(m: Memory, around: Surroundings) -> Effects:
     obstacles = obstacle_boxes(s.others, config)
     if m.grasp_plan is None:
         return (PlanGrasp(m.arm, m.offered, obstacles, target_box(s.target, config)),)
-    held = held_box(s.target, m.need_candidate(), config)
-    return (PlanPlace(m.arm, m.place_offered, obstacles, held, m.grasp_plan.retreat),)
+    held, stood = held_box(s.target, m.need_candidate(), config), (target_box(s.target, config),)
+    return (PlanPlace(m.arm, m.place_offered, obstacles, held, m.grasp_plan.retreat, stood),)
 
 
 def move_to_pregrasp(m: Memory, around: Surroundings) -> Effects:
@@ -117,8 +117,8 @@ def place(m: Memory, around: Surroundings) -> Effects:
     """Plan from where the arm is; carry and look at the hand; put down, let go, leave."""
     s, c, config = m.need_sighting(), m.need_candidate(), around.config
     if m.place_plan is None:
-        held = held_box(s.target, c, config)
-        return (PlanPlace(m.arm, m.place_offered, obstacle_boxes(s.others, config), held),)
+        held, stood = held_box(s.target, c, config), (target_box(s.target, config),)
+        return (PlanPlace(m.arm, m.place_offered, obstacle_boxes(s.others, config), held, gone=stood),)
     if not m.hand.carried:
         carry = Execute(m.arm, m.place_plan.transfer, "carry", carrying=True)
         return (carry, Measure(m.arm, c.width, settle=config.timing.settle_limit))

@@ -82,7 +82,8 @@ class Rehearsal:
         config = self._around.config
         self._link.check()
         held = held_box(target, pick.candidate, config)
-        effect = PlanPlace(arm, tuple(ways), obstacle_boxes(others, config), held, pick.plan.retreat)
+        stood = (target_box(target, config),)
+        effect = PlanPlace(arm, tuple(ways), obstacle_boxes(others, config), held, pick.plan.retreat, stood)
         return ways[(await self._link.plan(effect)).chosen]
 
     async def pick_and_place(

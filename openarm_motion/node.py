@@ -118,7 +118,7 @@ class MotionNode(BaseNode[MotionConfig]):
                 goal.start,
                 goal.velocity_scale,
                 stopped,
-                request.obstacles,
+                (*request.obstacles, *convert.boxes_from_msg(goal.gone)),
                 request.attached,
                 goal.expected_scene_version,
             )

@@ -99,6 +99,7 @@ def test_dry_run_plans_both_and_moves_nothing(world):
     assert not world.done(fx.Execute) + world.done(fx.MoveGripper) + world.done(fx.GoHome) + world.done(fx.MoveLinear)
     (place,) = world.done(fx.PlanPlace)
     assert place.after == "lift"
+    assert [b.id for b in place.gone] == ["target/red"], "the map still shows it where it stands"
 
 
 # --- seeing

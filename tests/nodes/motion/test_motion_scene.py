@@ -9,13 +9,14 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from geometry_msgs.msg import Point, PoseStamped, Vector3
-from openarm_interfaces.action import ExecuteTrajectory, MoveArm
-from openarm_interfaces.msg import CollisionObject
+from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
+from openarm_interfaces.msg import ApproachTarget, CollisionBox, CollisionObject
 from openarm_interfaces.srv import ApplyScene, GetScene
 from rclpy.parameter import Parameter
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
+from openarm_common.convert import matrix_to_pose
 from openarm_common.distance_field import CameraMoment, DistanceFieldWriter, field_path
 from openarm_common.lattice import Lattice
 from openarm_common.node import BASE_FRAME, QOS_LATCHED
@@ -189,6 +190,27 @@ def test_a59_the_map_is_in_the_way_unless_something_known_explains_it(make_bench
     assert bench.ros.call(bench.apply_client, ApplyScene.Request(add=[ball])).success
     result = bench.run(bench.move_client, bench.named(plan_only=True))
     assert (result.code, result.failure.second) == ("IN_COLLISION", "ball"), result.message
+
+
+def test_what_will_be_gone_by_then_is_in_nobodys_way(make_bench, writer) -> None:
+    """A place planned ahead of the pick: the map still shows the object where it stands."""
+    bench = make_bench()
+    stands = se3.make(None, (0.26, -0.24, 0.43))
+    cube = CollisionBox(id="cube", pose=matrix_to_pose(stands), size=Vector3(x=0.05, y=0.05, z=0.06))
+    held = CollisionBox(id="cube", pose=matrix_to_pose(np.eye(4)), size=cube.size)
+    down = ApproachTarget(id="down", pose=matrix_to_pose(se3.make(bench.DOWN, (0.26, -0.20, 0.435))), score=1.0)
+    down.approach_offset.z = down.retreat_offset.z = 0.08
+    goal = PlanApproach.Goal(arm="right", targets=[down], attached=[held], detached_after_approach=True)
+    cells = [stands[:3, 3] + [x, y, z] for x in (-0.02, 0, 0.02) for y in (-0.02, 0, 0.02) for z in (-0.02, 0, 0.02)]
+    write(writer, cells)
+    result = bench.run(bench.plan_client, goal)
+    assert (result.success, result.failure.second) == (False, "the map"), result.message
+    goal.gone = [cube]
+    write(writer, cells)
+    result = bench.run(bench.plan_client, goal)
+    assert result.success, result.message
+    write(writer, [*cells, (0.26, -0.17, 0.45)])  # something else stands where it is to go
+    assert bench.run(bench.plan_client, goal).failure.second == "the map"
 
 
 def test_a_stale_map_is_refused_where_it_is_required_and_said_where_not(make_bench, writer) -> None:
