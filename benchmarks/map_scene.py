@@ -22,11 +22,11 @@ from openarm_octomap.grid import DepthScan
 from openarm_octomap.mapper import Frame
 from openarm_sim_bridge.cameras import SnapshotRenderer
 from openarm_sim_bridge.model import compile_model
+from openarm_sim_bridge.noise import DepthNoiseConfig, add_depth_noise
 from openarm_sim_bridge.world import Snapshot
 
 Array = NDArray[np.float64]
-#: Standard deviation of the depth noise at 1 m, growing with the square of the depth, and share of pixels without any.
-NOISE, DROPOUTS = 0.0012, 0.01
+_D435 = DepthNoiseConfig()
 
 
 @dataclass(frozen=True)
@@ -77,19 +77,18 @@ class MapScene:
         T_link_optical = se3.inverse(camera.T_parent_link) @ camera.T_parent_optical
         return self.description.link_pose(camera.parent, self.joints) @ mount @ T_link_optical
 
-    def frames(self, t_ns: int, rng: np.random.Generator | None = None) -> list[Frame]:
-        """What both cameras see, mm; with noise and dropouts when there is a generator."""
+    def frames(self, t_ns: int, rng: np.random.Generator | None = None, noise: DepthNoiseConfig = _D435) -> list[Frame]:
+        """What both cameras see, mm; as noisy as a D435 when there is a generator."""
         self._place_robot()
         self._renderer.load(Snapshot(self.model, t_ns, self._data.qpos.copy()))
         out: list[Frame] = []
         for name, camera in self.cameras.items():
             depth = np.empty((camera.height, camera.width), np.uint16)
-            self._renderer.draw(name, self._colour[name], depth)
-            if rng is not None:
-                z = depth * 1e-3
-                depth = np.where(depth > 0, np.round(1e3 * (z + rng.normal(0.0, NOISE, z.shape) * z * z)), 0)
-                depth[rng.random(depth.shape) < DROPOUTS] = 0
-                depth = depth.astype(np.uint16)
+
+            def spoil(_: str, z: NDArray[np.float32], focal: float = camera.intrinsics.fy) -> NDArray[np.float32]:
+                return z if rng is None else add_depth_noise(z, focal, noise, rng)
+
+            self._renderer.draw(name, self._colour[name], depth, spoil)
             scan = DepthScan(depth, camera.intrinsics, self.T_base_camera(name), camera.near, camera.far)
             out.append(Frame(name, t_ns, scan, dict(self.joints)))
         return out

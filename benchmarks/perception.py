@@ -3,8 +3,9 @@
 
     python benchmarks/perception.py [--quick] [--bindings PYTHON] [--json PATH]
 
-Images are those of both cameras of the simulated robot (640 x 480, 16UC1, noise and dropouts) over demo and random
-scenes. Times are CPU times of one thread, median; a cycle is one update from the images of both cameras.
+Images are those of both cameras of the simulated robot (640 x 480, 16UC1, as noisy as a D435's: errors that grow with
+the square of the depth, flying pixels, holes) over demo and random scenes. Times are CPU times of one thread, median; a
+cycle is one update from the images of both cameras.
 
     cloud_ms               depth image to organised points; peer: numpy with a meshgrid for every image
     octree_cycle_ms        end cells, rays, log-odds and the binary octree of two cameras; peer: liboctomap (C++)
@@ -13,6 +14,7 @@ scenes. Times are CPU times of one thread, median; a cycle is one update from th
     ..._round_trip         1 when our .bt file has the same bytes after that binding has read and written it
     distance_field_ms      of that: the distance field
     self_filter_ms         of that: the labels of both images
+    flying_ms              of that: the pixels between surfaces in both images
     voxel_mismatch         cells that differ from liboctomap's after all frames, cleared ones among them
     map_iou, map_ghosts, map_missed   the map against the geometry of the simulator, true mounts, noisy depth
     clear_ms, mark_ms      simulated time from an object's removal (arrival) to the map without (with) it, worst phase
@@ -39,6 +41,7 @@ import numpy as np
 
 from benchmarks.map_scene import MapScene
 from benchmarks.report import Row, write_report
+from openarm_common.flying_pixels import FlyingConfig, label_flying
 from openarm_common.octomap_codec import read_file, write_file
 from openarm_common.scene import load_scene, random_scene
 from openarm_common.self_filter import SelfFilter
@@ -201,6 +204,11 @@ def full_rows(scene: MapScene, pairs: Sequence[Sequence[Frame]], repeats: int) -
         for frame in pairs[0]:
             robot.label_depth(frame.scan, robot.shapes(frame.joints or {}))
 
+    def drop_flying() -> None:
+        for frame in pairs[0]:
+            if isinstance(frame.scan, DepthScan):
+                label_flying(frame.scan, FlyingConfig(), np.zeros(frame.scan.depth.shape, np.uint8))
+
     n = len(times)
     return [
         Row("octree_cycle_full_ms", float(np.median(times)) * 1e3, "ms", "lower", 40.0, n=n),
@@ -208,6 +216,7 @@ def full_rows(scene: MapScene, pairs: Sequence[Sequence[Frame]], repeats: int) -
             "distance_field_ms", cpu_ms(lambda: transform.compute(states, distances), repeats), "ms", "lower", 13.0, n=n
         ),
         Row("self_filter_ms", cpu_ms(label, repeats), "ms", "lower", None, n=n),
+        Row("flying_ms", cpu_ms(drop_flying, repeats), "ms", "lower", 1.0, n=n),
     ]
 
 

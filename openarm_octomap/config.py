@@ -8,6 +8,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from openarm_common.config import Config
+from openarm_common.flying_pixels import FlyingConfig
 from openarm_common.self_filter import SelfFilterConfig
 
 Vector3 = tuple[float, float, float]
@@ -67,11 +68,12 @@ class GridConfig(Config):
 
 
 class FilterConfig(SelfFilterConfig):
-    """How the robot is cut out of what its cameras see, and out of the map."""
+    """What of the images does not get into the map: the robot, and pixels that float between surfaces."""
 
     reset_padding: float = Field(
         default=0.01, ge=0.0, le=0.2, description="cells this near to the robot are made unknown, m"
     )
+    flying: FlyingConfig = FlyingConfig()
 
 
 UnknownPolicy = Literal["free", "occupied"]

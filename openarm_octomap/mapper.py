@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.flying_pixels import FlyingConfig, label_flying
 from openarm_common.held import HeldBox
 from openarm_common.lattice import DEPTH, Lattice
 from openarm_common.octomap_codec import Payload, encode_states, read_file, write_file
@@ -89,6 +90,7 @@ class Report:
         changed: Flat indices of the cells whose state changed.
         sources: Whose frames are in it.
         removed: Pixels or points that each link (or held box) took, by source.
+        flying: Pixels that were left out because they float between surfaces, by source.
         reset: Cells that the robot filled.
         valid: Valid pixels or points.
         ends: Cells that rays ended in.
@@ -98,6 +100,7 @@ class Report:
     changed: NDArray[np.int32]
     sources: tuple[str, ...]
     removed: Mapping[str, Mapping[str, int]] = field(default_factory=dict[str, Mapping[str, int]])
+    flying: Mapping[str, int] = field(default_factory=dict[str, int])
     reset: int = 0
     valid: int = 0
     ends: int = 0
@@ -109,7 +112,7 @@ class Mapper:
     Args:
         description: The robot.
         grid: Parameters of the map.
-        robot: Parameters of the self-filter.
+        robot: Parameters of what is cut out of the images.
         distances: Parameters of the distance field.
     """
 
@@ -120,6 +123,7 @@ class Mapper:
         self._filter = SelfFilter(description, robot)
         self._filtering = robot.enabled
         self._reset_padding = robot.reset_padding
+        self._flying = robot.flying
         self._transform = DistanceTransform(self._grid.lattice, distances.reach, distances.unknown)
         self._lock = threading.Lock()
 
@@ -150,6 +154,7 @@ class Mapper:
             raise OpenArmError(Code.INVALID_ARGUMENT, "an update needs at least one frame")
         scans: list[DepthScan | CloudScan] = []
         removed: dict[str, Mapping[str, int]] = {}
+        flying: dict[str, int] = {}
         newest = max(frames, key=lambda frame: frame.t_ns)
         shapes: Shapes | None = None
         for frame in frames:
@@ -162,6 +167,8 @@ class Mapper:
                 else:
                     label, removed[frame.source] = self._filter.label_points(scan.points, body)
                 scan = replace(scan, label=label)
+            if self._flying.enabled and isinstance(scan, DepthScan):
+                scan, flying[frame.source] = _without_flying(scan, self._flying)
             scans.append(scan)
         with self._lock:
             update = self._grid.integrate(scans, newest.t_ns)
@@ -175,6 +182,7 @@ class Mapper:
                 changed=np.unique(np.concatenate(changes)),
                 sources=tuple(frame.source for frame in frames),
                 removed=removed,
+                flying=flying,
                 reset=int(changes[-1].size) if shapes is not None else 0,
                 valid=update.valid,
                 ends=update.ends,
@@ -284,3 +292,15 @@ class Mapper:
             full=grid.full() if "full" in wanted else None,
             states=grid.states.copy() if "states" in wanted else None,
         )
+
+
+def _without_flying(scan: DepthScan, config: FlyingConfig) -> tuple[DepthScan, int]:
+    """The image with its flying pixels labelled, and how many there are.
+
+    They mark nothing, and they clear nothing either. Of the two surfaces that such a pixel saw, only the nearer one's
+    depth is surely free, and the neighbour on that surface clears the same cells: pixels are a few millimetres apart,
+    cells 2 cm. To clear up to the pixel's own depth would free what the near surface hides.
+    """
+    label = np.zeros(scan.depth.shape, np.uint8) if scan.label is None else scan.label.copy()
+    count = label_flying(scan, config, label)
+    return replace(scan, label=label), count

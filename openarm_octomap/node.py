@@ -147,6 +147,7 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
             values |= self._mapper.counts(self._t_ns)
             for source_name, links in self._last.removed.items():
                 values |= {f"{source_name}_removed/{link}": n for link, n in links.items()}
+            values |= {f"{source_name}_flying": n for source_name, n in self._last.flying.items()}
         values |= {"update_ms": f"{self._elapsed_ms:.1f}", "held": ", ".join(b.name for b in self._held) or "nothing"}
         self.diagnose(not faults, "; ".join(faults) or f"map of {', '.join(self.config.cameras)}", **values)
 

@@ -9,6 +9,7 @@ from openarm_common import se3
 from openarm_common.cameras import Intrinsics
 from openarm_common.description import RobotDescription
 from openarm_common.distance_field import sphere_clearance
+from openarm_common.flying_pixels import FlyingConfig, label_flying
 from openarm_common.octomap_codec import decode
 from openarm_common.self_filter import SelfFilter, SelfFilterConfig
 from openarm_octomap.config import GridConfig
@@ -26,7 +27,8 @@ def warm() -> None:
     intrinsics, T = Intrinsics.from_fovy(8, 6, 60.0), se3.make(None, (0.15, 0.15, 0.0))
     for depth in (np.full((6, 8), 200, np.uint16), np.full((6, 8), 0.2, np.float32)):
         scan = DepthScan(depth, intrinsics, T, 0.05, 1.0)
-        robot.label_depth(scan, shapes)
+        label, _ = robot.label_depth(scan, shapes)
+        label_flying(scan, FlyingConfig(), label)
         grid.integrate([scan], 0)
     cloud = CloudScan(scan.points(), T[:3, 3])
     robot.label_points(cloud.points, shapes)

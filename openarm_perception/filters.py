@@ -19,12 +19,15 @@ from scipy.spatial import KDTree
 
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.flying_pixels import label_lonely
 from openarm_perception.depth import DepthImage, Points, unit_scale
 
 Ints = NDArray[np.int64]
 
 #: Cells along an axis that a packed key can tell apart, half of them on each side of zero.
 _HALF = 1 << 20
+#: A pixel of a surface has this many of its eight neighbours on it, also at a corner.
+_SAME_SURFACE = 3
 
 
 class FilterConfig(Config):
@@ -84,29 +87,12 @@ def drop_flying(depth: DepthImage, tolerance: float) -> DepthImage:
     Returns:
         A copy with 0 in place of what is dropped.
     """
-    scale = np.float32(unit_scale(depth))
+    lonely = np.zeros(depth.shape, np.uint8)
+    scale, near, far = np.float32(unit_scale(depth)), np.finfo(np.float32).tiny, np.float32(np.inf)
+    label_lonely(depth, scale, near, far, np.float32(tolerance), np.float32(0.0), _SAME_SURFACE, lonely)
     out = depth.copy()
-    _drop_flying(depth, scale, np.float32(tolerance), out)
+    np.copyto(out, 0, where=lonely > 0)
     return out
-
-
-@njit(cache=True, nogil=True)
-def _drop_flying(depth: DepthImage, scale: np.float32, tolerance: np.float32, out: DepthImage) -> None:
-    h, w = depth.shape
-    for v in range(h):
-        for u in range(w):
-            z = np.float32(depth[v, u]) * scale
-            if not z > 0:
-                continue
-            same, limit = 0, tolerance * z
-            for dv in range(-1, 2):
-                for du in range(-1, 2):
-                    a, b = v + dv, u + du
-                    if (dv == 0 and du == 0) or a < 0 or b < 0 or a >= h or b >= w:
-                        continue
-                    same += abs(np.float32(depth[a, b]) * scale - z) < limit
-            if same < 3:
-                out[v, u] = 0
 
 
 def voxel_filter(points: Points, edge: float) -> Points:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.ndimage import binary_dilation
 
 from benchmarks.map_scene import MapScene, Visible
 from openarm_common import se3
+from openarm_common.flying_pixels import FlyingConfig
 from openarm_common.held import HeldBox
 from openarm_common.scene import load_scene
 from openarm_common.self_filter import SelfFilter
@@ -18,6 +20,7 @@ from openarm_octomap.accuracy import compare
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.kernels import OCCUPIED
 from openarm_octomap.mapper import Mapper
+from openarm_sim_bridge.noise import DepthNoiseConfig
 
 PERIOD_NS = 500_000_000
 DEMO = load_scene("demo")
@@ -35,12 +38,12 @@ def truth(scene: MapScene) -> Visible:
     return scene.truth(mapper(scene).lattice)
 
 
-def mapper(scene: MapScene, **robot: float) -> Mapper:
+def mapper(scene: MapScene, **robot: Any) -> Mapper:
     return Mapper(scene.body, GridConfig(), FilterConfig(**robot), FieldConfig())
 
 
-def states_after(target: Mapper, scene: MapScene, t_ns: int, rng=None, held=()) -> np.ndarray:
-    states = target.update(scene.frames(t_ns, rng), held, wanted={"states"}).snapshot.states
+def states_after(target: Mapper, scene: MapScene, t_ns: int, rng=None, held=(), **noise) -> np.ndarray:
+    states = target.update(scene.frames(t_ns, rng, **noise), held, wanted={"states"}).snapshot.states
     assert states is not None
     return states
 
@@ -61,7 +64,7 @@ def test_compare_counts_what_it_says() -> None:
 
 @pytest.mark.parametrize("noisy", [False, True])
 def test_n10_a46_the_map_is_the_visible_geometry(scene: MapScene, truth: Visible, noisy: bool) -> None:
-    """Both cameras, clean and noisy: no ghost, hardly anything missed, the robot itself not in it."""
+    """Both cameras, clean and as noisy as a D435: no ghost, hardly anything missed, the robot itself not in it."""
     target, rng = mapper(scene), np.random.default_rng(1) if noisy else None
     for i in range(4):
         states = states_after(target, scene, i * PERIOD_NS, rng)
@@ -70,6 +73,30 @@ def test_n10_a46_the_map_is_the_visible_geometry(scene: MapScene, truth: Visible
     assert result.ghosts == 0
     assert result.missed <= 0.005 * result.surface
     assert result.iou >= 0.98
+
+
+def test_a51_a52_without_the_filter_flying_pixels_fill_the_map_and_nothing_else_does(
+    scene: MapScene, truth: Visible
+) -> None:
+    """Hundreds of ghosts; so the tests with noise can fail. Noise along the rays alone makes none."""
+    ghosts = []
+    for config in (DepthNoiseConfig(), DepthNoiseConfig(flying=0.0)):
+        target, rng = mapper(scene, flying=FlyingConfig(enabled=False)), np.random.default_rng(1)
+        states = states_after(target, scene, 0, rng, noise=config)
+        ghosts.append(compare(states, truth.surface, truth.solid).ghosts)
+    assert ghosts[0] > 300
+    assert ghosts[1] == 0
+
+
+def test_flying_pixels_are_counted_by_camera(scene: MapScene) -> None:
+    """A clean picture has a few at the edges of the arms, a noisy one thousands; the frames that were given are as they were."""
+    rng = np.random.default_rng(1)
+    counts = []
+    for frames in (scene.frames(0), scene.frames(0, rng)):
+        counts.append(mapper(scene).update(frames).flying)
+        assert all(frame.scan.label is None for frame in frames)
+    assert counts[0].keys() == counts[1].keys() == {"overhead", "wrist"}
+    assert sum(counts[0].values()) < 300 < 1000 < sum(counts[1].values())
 
 
 def test_a46_the_clouds_of_both_cameras_meet_in_the_base_frame(scene: MapScene) -> None:
