@@ -6,14 +6,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
 import rclpy
 from action_msgs.msg import GoalStatus
-from openarm_interfaces.action import Pick
-from openarm_interfaces.msg import GraspStatus
+from openarm_interfaces.action import Pick, PickTwo
+from openarm_interfaces.msg import GraspStatus, PickAnswer, PickRequest
 from rclpy.action import ActionClient
 from rclpy.action.client import ClientGoalHandle
 from rclpy.context import Context
@@ -24,52 +23,13 @@ from rclpy.task import Future
 
 from openarm_common.convert import point, xyz
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.answers import GraspResult, PairResult, Wanted
 
 OnFeedback = Callable[[GraspStatus], None]
 #: How often a waiting call looks up, so that Ctrl-C is noticed.
 _LOOK_S = 0.1
 #: A server that is not in the graph at so many looks in a row is gone.
 _GONE = 30
-
-
-@dataclass(frozen=True)
-class GraspResult:
-    """How a grasp ended.
-
-    Attributes:
-        success: The object was placed and seen there (dry run: it could be).
-        outcome: SUCCESS; PARTIAL: held, not placed as asked; FAILED; REFUSED: never touched; CANCELLED.
-        code: `openarm_common.errors.Code`.
-        message: What happened, in a sentence or two.
-        label: What was picked.
-        arm: The arm that was used, or "".
-        attempts: Physical attempts.
-        place_position: (x, y, z) of the target on the table, base frame, m.
-        duration: s of robot time.
-        route: "direct"; "hand_over": by way of the middle, with both arms; "push": pushed into reach; "" when it was
-            not placed.
-    """
-
-    success: bool
-    outcome: str
-    code: Code
-    message: str
-    label: str
-    arm: str
-    attempts: int
-    place_position: tuple[float, float, float]
-    duration: float
-    route: str = ""
-
-    def raise_for_code(self) -> Self:
-        """Return the result of a success.
-
-        Raises:
-            OpenArmError: With code and message, for anything else.
-        """
-        if not self.success:
-            raise OpenArmError(self.code, self.message)
-        return self
 
 
 class GraspClient:
@@ -90,7 +50,8 @@ class GraspClient:
         # Ctrl-C stays the caller's.
         rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._node = Node("grasp_client", context=self._context)
-        self._client = ActionClient(self._node, Pick, "/grasp/pick")
+        self._pick = ActionClient(self._node, Pick, "/grasp/pick")
+        self._pick_two = ActionClient(self._node, PickTwo, "/grasp/pick_two")
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._goal: ClientGoalHandle | None = None
@@ -110,7 +71,8 @@ class GraspClient:
             return
         self._executor.shutdown(timeout_sec=2.0)
         self._thread.join(timeout=5.0)
-        self._client.destroy()
+        self._pick.destroy()
+        self._pick_two.destroy()
         self._node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
@@ -153,25 +115,65 @@ class GraspClient:
                 or three numbers.
         """
         goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run, phase=phase, timeout=time_limit)
-        if place_yaw is not None:
-            goal.has_place_yaw, goal.place_yaw = True, place_yaw
-        if place is not None:
-            if len(place) not in (2, 3):
-                raise OpenArmError(Code.INVALID_ARGUMENT, f"place {list(place)} must be x, y or x, y, z in metres")
-            goal.has_place_position = True
-            goal.place_position.x, goal.place_position.y = float(place[0]), float(place[1])
-            goal.place_position.z = float(place[2]) if len(place) == 3 else 0.0
-        if object_at is not None:
-            goal.has_object_position, goal.object_position = True, point((object_at[0], object_at[1], 0.0))
+        _where(goal, place, place_yaw, object_at)
         goal.leave = [point((p[0], p[1], 0.0)) for p in leave]
+        return _result(self._ask(self._pick, "/grasp/pick", goal, timeout, on_feedback))
+
+    def pick_two(
+        self,
+        first: str | Wanted,
+        second: str | Wanted,
+        *,
+        dry_run: bool = False,
+        time_limit: float = 0.0,
+        timeout: float = 300.0,
+        on_feedback: OnFeedback | None = None,
+    ) -> PairResult:
+        """Pick two objects and place them, with both arms at the same time where planning allows that.
+
+        Args:
+            first: A label, or more about what is wanted.
+            second: Another.
+            dry_run: Plan and report, do not move.
+            time_limit: s of robot time for both; then they end with TIMEOUT, hands keeping what they hold. 0: none.
+            timeout: s of wall clock; then both are cancelled.
+            on_feedback: Called with each `GraspStatus`, which says of what label and arm it is, in the background
+                thread; it may call `cancel`.
+
+        Returns:
+            The result; `raise_for_code` turns a failure into an exception.
+
+        Raises:
+            OpenArmError: As `pick`.
+        """
+        goal = PickTwo.Goal(dry_run=dry_run, timeout=time_limit)
+        for request, wanted in zip(goal.requests, (first, second), strict=True):
+            wish = Wanted(wanted) if isinstance(wanted, str) else wanted
+            request.label, request.arm = wish.label, wish.arm
+            _where(request, wish.place, wish.place_yaw, wish.object_at)
+        answer: PickTwo.Result = self._ask(self._pick_two, "/grasp/pick_two", goal, timeout, on_feedback)
+        return PairResult(
+            success=answer.success,
+            outcome=answer.outcome,
+            code=_code(answer.code),
+            message=answer.message,
+            at_once=answer.at_once,
+            answers=tuple(_result(one) for one in answer.answers),
+            duration=answer.duration,
+        )
+
+    def _ask(
+        self, client: ActionClient, name: str, goal: object, timeout: float, on_feedback: OnFeedback | None
+    ) -> Any:
+        """Send a goal and return its result message."""
         self._callback_error = None
-        if not self._client.wait_for_server(timeout_sec=self._timeout):
+        if not client.wait_for_server(timeout_sec=self._timeout):
             raise OpenArmError(
                 Code.NOT_READY,
-                f"no action /grasp/pick within {self._timeout:g} s: is the graph up (./openarm up), with the same"
+                f"no action {name} within {self._timeout:g} s: is the graph up (./openarm up), with the same"
                 " ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE?",
             )
-        sent = self._begin(self._client.send_goal_async, goal, self._feedback(on_feedback))
+        sent = self._begin(client.send_goal_async, goal, self._feedback(on_feedback))
         handle = self._wait(sent, self._timeout, "acceptance of the goal")
         if not handle.accepted:
             raise OpenArmError(Code.BUSY, "the grasp node rejected the goal")
@@ -186,10 +188,10 @@ class GraspClient:
             self._goal = None
         if answer.status == GoalStatus.STATUS_UNKNOWN:
             raise OpenArmError(Code.NOT_READY, "the grasp node no longer knows the goal: it was started anew")
-        return _result(answer.result)
+        return answer.result
 
     def cancel(self) -> None:
-        """Ask the running pick to stop; it returns with CANCELLED, the arm holding where it is."""
+        """Ask what runs to stop; it returns with CANCELLED, the arms holding where they are."""
         goal = self._goal
         if goal is not None:
             self._begin(goal.cancel_goal_async)
@@ -223,7 +225,7 @@ class GraspClient:
         deadline = time.monotonic() + timeout
         missed = 0
         while not done.wait(_LOOK_S):
-            missed = 0 if self._client.server_is_ready() else missed + 1
+            missed = 0 if self._pick.server_is_ready() else missed + 1
             if missed > _GONE:
                 raise OpenArmError(Code.NOT_READY, f"the grasp node is gone while waiting for {what}")
             if self._callback_error is not None:
@@ -248,12 +250,34 @@ def _done(future: Future) -> threading.Event:
     return done
 
 
-def _result(message: Pick.Result) -> GraspResult:
+def _where(
+    request: Pick.Goal | PickRequest,
+    place: Sequence[float] | None,
+    place_yaw: float | None,
+    object_at: Sequence[float] | None,
+) -> None:
+    """Fill in where an object stands and where it shall stand."""
+    if place_yaw is not None:
+        request.has_place_yaw, request.place_yaw = True, place_yaw
+    if place is not None:
+        if len(place) not in (2, 3):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"place {list(place)} must be x, y or x, y, z in metres")
+        request.has_place_position = True
+        request.place_position = point((place[0], place[1], place[2] if len(place) == 3 else 0.0))
+    if object_at is not None:
+        request.has_object_position, request.object_position = True, point((object_at[0], object_at[1], 0.0))
+
+
+def _code(text: str) -> Code:
+    return Code(text) if text in Code.__members__ else Code.INTERNAL
+
+
+def _result(message: Pick.Result | PickAnswer) -> GraspResult:
     x, y, z = (float(v) for v in xyz(message.place_position))
     return GraspResult(
         success=message.success,
         outcome=message.outcome,
-        code=Code(message.code) if message.code in Code.__members__ else Code.INTERNAL,
+        code=_code(message.code),
         message=message.message,
         label=message.label,
         arm=message.arm,

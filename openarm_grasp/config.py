@@ -217,6 +217,9 @@ class LimitsConfig(Config):
     beside_timeout: float = Field(
         default=60.0, gt=0.0, le=600.0, description="an arm waits for the other one, s (robot time in simulation)"
     )
+    beside_wait: float = Field(
+        default=20.0, gt=0.0, le=60.0, description="an arm rests so long before a motion until the other leaves room, s"
+    )
     move_timeout: float = Field(default=60.0, gt=0.0, le=600.0, description="one motion, wall clock, s")
     gripper_timeout: float = Field(default=20.0, gt=0.0, le=120.0, description="one gripper motion, wall clock, s")
 

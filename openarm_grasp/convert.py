@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from control_msgs.action import GripperCommand, ParallelGripperCommand
 from geometry_msgs.msg import Point
 from numpy.typing import NDArray
-from openarm_interfaces.action import MoveArm, Pick, PlanApproach
-from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspStatus
+from openarm_interfaces.action import MoveArm, Pick, PickTwo, PlanApproach
+from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspStatus, PickAnswer, PickRequest
 from openarm_interfaces.srv import ComputeIK, Grasp
 from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA
@@ -25,6 +26,7 @@ from openarm_grasp.candidates import Box, GraspCandidate
 from openarm_grasp.effects import GoHome, GraspOutcome, GraspRequest, MoveLinear, PlanGrasp, Planned, PlanPlace
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.observation import Detection, Frame
+from openarm_grasp.pair import PairOutcome
 from openarm_grasp.place import PlaceTarget
 
 Array = NDArray[np.float64]
@@ -36,25 +38,35 @@ _OFFERED = ColorRGBA(r=0.4, g=0.5, b=0.9, a=0.35)
 # --- requests and answers
 def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
     """The user's wish; a service request and an action goal have the same fields."""
-    p = message.place_position
-    place = (p.x, p.y, p.z) if message.has_place_position else None
-    yaw = message.place_yaw if message.has_place_yaw else None
-    phase = message.phase or "all"
-    return GraspRequest(
-        label=message.label,
-        arm=message.arm or "auto",
-        place=place,
+    return replace(
+        _wish(message),
         dry_run=message.dry_run,
-        phase=phase,
-        place_yaw=yaw,
+        phase=message.phase or "all",
         timeout=message.timeout,
-        object_at=(message.object_position.x, message.object_position.y) if message.has_object_position else None,
         leave=tuple((p.x, p.y) for p in message.leave),
     )
 
 
-def fill_answer(answer: Grasp.Response | Pick.Result, outcome: GraspOutcome) -> None:
-    """Write an outcome into a service response or an action result."""
+def requests_from_msg(goal: PickTwo.Goal) -> tuple[GraspRequest, GraspRequest]:
+    """Two wishes at once."""
+    first, second = (replace(_wish(item), dry_run=goal.dry_run, timeout=goal.timeout) for item in goal.requests)
+    return first, second
+
+
+def _wish(message: Grasp.Request | Pick.Goal | PickRequest) -> GraspRequest:
+    """What all of them say of an object and its place."""
+    p, at = message.place_position, message.object_position
+    return GraspRequest(
+        label=message.label,
+        arm=message.arm or "auto",
+        place=(p.x, p.y, p.z) if message.has_place_position else None,
+        place_yaw=message.place_yaw if message.has_place_yaw else None,
+        object_at=(at.x, at.y) if message.has_object_position else None,
+    )
+
+
+def fill_answer(answer: Grasp.Response | Pick.Result | PickAnswer, outcome: GraspOutcome) -> None:
+    """Write an outcome into a service response, an action result, or one of its answers."""
     answer.success = outcome.success
     answer.outcome = outcome.kind
     answer.code = outcome.code.value
@@ -67,15 +79,33 @@ def fill_answer(answer: Grasp.Response | Pick.Result, outcome: GraspOutcome) -> 
     answer.route = outcome.route
 
 
-def status_msg(machine: GraspMachine, t_ns: int) -> GraspStatus:
-    """Where the grasp stands."""
+def pair_result(outcome: PairOutcome) -> PickTwo.Result:
+    """The answer to two wishes."""
+    result = PickTwo.Result(
+        success=outcome.success,
+        outcome=outcome.kind,
+        code=outcome.code.value,
+        message=outcome.message,
+        at_once=outcome.at_once,
+        duration=outcome.duration,
+    )
+    for one in outcome.answers:
+        answer = PickAnswer()
+        fill_answer(answer, one)
+        result.answers.append(answer)
+    return result
+
+
+def status_msg(machine: GraspMachine, t_ns: int, *, again: bool = False) -> GraspStatus:
+    """Where the grasp stands; when it is said again, it came from where it is."""
+    ended = machine.outcome
     message = GraspStatus(
         state=machine.state.value,
-        previous_state=machine.previous.value,
+        previous_state=machine.state.value if again else machine.previous.value,
         reason=machine.reason,
         attempt=machine.attempt,
-        label=machine.label,
-        arm=machine.arm,
+        label=ended.label if ended else machine.label,
+        arm=ended.arm if ended else machine.arm,
     )
     message.header.stamp = ns_to_stamp(t_ns)
     message.header.frame_id = BASE_FRAME
@@ -198,8 +228,8 @@ def reach_from_msg(arm: str, answer: ComputeIK.Response, T_base_tcp: Array) -> d
     return {arm: float(np.linalg.norm(xyz(answer.nearest.position) - T_base_tcp[:3, 3]))}
 
 
-def home_goal(arm: str, named: str, effect: GoHome, velocity_scale: float) -> MoveArm.Goal:
-    """A free path to a named posture."""
+def home_goal(arm: str, named: str, effect: GoHome, velocity_scale: float, max_wait: float = 0.0) -> MoveArm.Goal:
+    """A free path to a named posture; it may rest first for the other arm, s."""
     return MoveArm.Goal(
         arm=arm,
         kind=MoveArm.Goal.NAMED,
@@ -207,12 +237,19 @@ def home_goal(arm: str, named: str, effect: GoHome, velocity_scale: float) -> Mo
         obstacles=[box_to_msg(box) for box in effect.obstacles],
         hand_empty=True,
         velocity_scale=velocity_scale,
+        max_wait=max_wait,
     )
 
 
-def linear_goal(effect: MoveLinear, velocity_scale: float) -> MoveArm.Goal:
-    """A straight line of the TCP."""
-    goal = MoveArm.Goal(arm=effect.arm, kind=MoveArm.Goal.LINEAR, velocity_scale=velocity_scale, hand_empty=True)
+def linear_goal(effect: MoveLinear, velocity_scale: float, max_wait: float = 0.0) -> MoveArm.Goal:
+    """A straight line of the TCP; it may rest first for the other arm, s."""
+    goal = MoveArm.Goal(
+        arm=effect.arm,
+        kind=MoveArm.Goal.LINEAR,
+        velocity_scale=velocity_scale,
+        hand_empty=True,
+        max_wait=max_wait,
+    )
     goal.pose.header.frame_id = BASE_FRAME
     goal.pose.pose = matrix_to_pose(effect.T_base_tcp)
     return goal

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,15 @@ class GraspExecutor:
             arm: ActionClient(node, gripper_action, f"/{arm}_gripper_controller/gripper_cmd") for arm in ARMS
         }
         self.deadline_ns = 0
+        #: Longest rest before a motion until the other arm leaves room, s; 0: the arms never move at once.
+        self.max_wait = 0.0
         self.performer = Performer(self, config)
+
+    def beside(self) -> GraspExecutor:
+        """The same link for an arm that moves while the other does: its motions may rest first, its time is its own."""
+        link = copy(self)
+        link.max_wait = self._config.limits.beside_wait
+        return link
 
     # --- begin, end, cancel
     async def begin(self, *, moves: bool) -> None:
@@ -195,20 +204,24 @@ class GraspExecutor:
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
     ) -> None:
         """Ask /motion/execute."""
-        await self._moved(self._execute, ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory), what, guard)
+        goal = ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_wait=self.max_wait)
+        await self._moved(self._execute, goal, what, guard)
 
     async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
         """Ask /motion/move for a straight line."""
-        await self._moved(self._move, convert.linear_goal(effect, self._config.velocity_scale), what)
+        goal = convert.linear_goal(effect, self._config.velocity_scale, self.max_wait)
+        await self._moved(self._move, goal, what)
 
     async def move_named(self, arm: str, named: str, effect: effects.GoHome, what: str) -> None:
         """Ask /motion/move for a free path to a posture."""
-        await self._moved(self._move, convert.home_goal(arm, named, effect, self._config.velocity_scale), what)
+        goal = convert.home_goal(arm, named, effect, self._config.velocity_scale, self.max_wait)
+        await self._moved(self._move, goal, what)
 
     async def _moved(
         self, client: ActionClient, goal: object, what: str, guard: Callable[[], None] | None = None
     ) -> None:
-        result = await self._link.goal(client, goal, self._config.limits.move_timeout, what, self._watched(guard))
+        limit = self._config.limits.move_timeout + self.max_wait
+        result = await self._link.goal(client, goal, limit, what, self._watched(guard))
         if not result.success:
             code = convert.code_from_text(result.code, Code.EXECUTION_FAILED)
             raise OpenArmError(code, f"{what}: {result.message or 'failed'}")

@@ -32,9 +32,10 @@ class GraspMachine:
 
     Args:
         around: Parameters, table and arms.
+        drift: What grasps say about the camera, when another machine's do, too.
     """
 
-    def __init__(self, around: Surroundings) -> None:
+    def __init__(self, around: Surroundings, drift: DriftWatch | None = None) -> None:
         self._around = around
         path = around.config.transitions
         self._transitions = load_transitions(Path(path)) if path else TRANSITIONS
@@ -45,7 +46,7 @@ class GraspMachine:
         #: How the last request ended; None while one runs.
         self.outcome: GraspOutcome | None = None
         #: What grasps say about the camera.
-        self.drift = DriftWatch(around.config.drift)
+        self.drift = drift or DriftWatch(around.config.drift)
         #: What stayed in a hand when the last request ended.
         self.kept: Kept | None = None
         #: What was seen of the last object, and why arms were refused for it, when its request ended.

@@ -19,11 +19,13 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames, GoHome, GraspOutcome, GraspRequest, Observe, ToBase
 from openarm_grasp.legs import run_task
 from openarm_grasp.machine import GraspMachine
-from openarm_grasp.observation import Sighting, find, on_table
+from openarm_grasp.observation import SAME_PLACE, Sighting, find, on_table
 from openarm_grasp.performer import Link, Performer, run_request
 from openarm_grasp.rehearsal import NO_WAY, Rehearsal
-from openarm_grasp.routing import ARMS
+from openarm_grasp.routing import ARMS, arm_order
 
+#: These end both requests.
+_STOPS = (Code.CANCELLED, Code.ROBOT_LOST, Code.TIMEOUT)
 #: Places nearer to each other than this are served one after the other, m.
 _APART = 0.20
 
@@ -41,11 +43,45 @@ class Pair:
     reason: str
 
 
+@dataclass(frozen=True)
+class PairOutcome:
+    """The answer to two requests.
+
+    Attributes:
+        answers: To each, in their order; none when they were not taken.
+        code: OK, or of the first that failed; CANCELLED, when one of them was.
+        message: What happened to each.
+        at_once: Both arms worked at the same time.
+        duration: s of robot time.
+    """
+
+    answers: tuple[GraspOutcome, ...]
+    code: Code
+    message: str
+    at_once: bool = False
+    duration: float = 0.0
+
+    @property
+    def success(self) -> bool:
+        """Whether both happened."""
+        return self.code is Code.OK
+
+    @property
+    def kind(self) -> str:
+        """What both are; else CANCELLED when one is, PARTIAL when one has come somewhere, FAILED."""
+        kinds = {answer.kind for answer in self.answers} or {"REFUSED"}
+        if len(kinds) == 1:
+            return kinds.pop()
+        if "CANCELLED" in kinds:
+            return "CANCELLED"
+        return "PARTIAL" if kinds & {"SUCCESS", "PARTIAL"} else "FAILED"
+
+
 class PairRunner:
     """Carries two requests out at the same time.
 
     Args:
-        machines: Of the first and the second request; the first also serves those that are carried out alone.
+        machines: Of the first and the second request.
         links: Of each arm.
         alone: Link and performer for requests that are carried out alone.
         config: Parameters.
@@ -64,31 +100,45 @@ class PairRunner:
         self._company = Company()
         self._links = {arm: BesideLink(arm, link, self._company, config) for arm, link in links.items()}
         self._performers = {arm: Performer(link, config, arms=(arm,)) for arm, link in self._links.items()}
+        self._began_ns = 0
 
-    async def run(self, requests: tuple[GraspRequest, GraspRequest]) -> tuple[GraspOutcome, GraspOutcome]:
+    async def run(self, requests: tuple[GraspRequest, GraspRequest]) -> PairOutcome:
         """Carry both out.
 
         Raises:
-            OpenArmError: BUSY, INVALID_ARGUMENT or NOT_READY, when a request is not taken.
+            OpenArmError: INVALID_ARGUMENT or NOT_READY, when a request is not taken; CANCELLED, TIMEOUT or ROBOT_LOST,
+                when both ended before an object was touched.
         """
-        if requests[0].label == requests[1].label or not all(request.label for request in requests):
-            labels = ", ".join(repr(request.label) for request in requests)
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"two different labels are needed for two arms, got {labels}")
+        check_pair(requests)
         for machine in self._machines:
             for request in requests:
                 self._alone[1].check_hands(machine, request)
-        began_ns = self._alone[0].now_ns
+        self._began_ns = self._alone[0].now_ns
+        self._note(f"asked for {requests[0].label!r} and {requests[1].label!r} at once: looking at both")
         how = await self._shared_out(requests)
-        self._machines[0].note(how.reason)
-        self._tell(self._machines[0])
-        if not how.arms:
-            return await self._in_turn(requests, began_ns)
-        outcomes = await self._at_once(requests, how)
-        # What was not touched beside the other arm may go when that is home.
-        return (
-            await self._again(requests[0], outcomes[0], began_ns),
-            await self._again(requests[1], outcomes[1], began_ns),
-        )
+        self._note(how.reason)
+        if how.arms:
+            outcomes = await self._at_once(requests, how)
+            # What was not touched beside the other arm may go when that is home.
+            first = await self._again(0, requests[0], outcomes[0])
+            answers = (first, await self._again(1, requests[1], outcomes[1]))
+        else:
+            answers = await self._in_turn(requests)
+        return self._whole(answers, how)
+
+    def _whole(self, answers: tuple[GraspOutcome, GraspOutcome], how: Pair) -> PairOutcome:
+        codes = [answer.code for answer in answers if not answer.success]
+        code = Code.CANCELLED if Code.CANCELLED in codes else next(iter(codes), Code.OK)
+        text = "; ".join(f"{answer.label}: {answer.message}" for answer in answers)
+        duration = (self._alone[0].now_ns - self._began_ns) * 1e-9
+        return PairOutcome(answers, code, f"{how.reason}. {text}", bool(how.arms), duration)
+
+    def _note(self, reason: str) -> None:
+        """Say what is done before the machines are asked."""
+        machine = self._machines[0]
+        machine.outcome = None  # of a request before these
+        machine.note(reason)
+        self._tell(machine)
 
     # --- which arm
     async def _shared_out(self, requests: tuple[GraspRequest, GraspRequest]) -> Pair:
@@ -97,10 +147,11 @@ class PairRunner:
         if len(places) == 2 and float(np.hypot(*(np.subtract(places[0][:2], places[1][:2])))) < _APART:
             return Pair((), "the places are close to each other: one after the other")
         try:
-            seen = [await self._see(request) for request in requests]
+            frames = await self._look(requests)
+            seen = [self._find(frames, request) for request in requests]
         except OpenArmError as error:
-            if error.code in (Code.CANCELLED, Code.ROBOT_LOST, Code.TIMEOUT):
-                raise
+            if error.code in _STOPS:
+                raise self._late(requests, error) from error
             return Pair((), f"{error.message}: one after the other")
         straight: tuple[Side, Side] = ("left", "right")
         crossed: tuple[Side, Side] = ("right", "left")
@@ -116,21 +167,30 @@ class PairRunner:
             faults.append(fault)
         return Pair((), f"not both at once ({'; '.join(faults) or 'the same arm is asked for'}): one after the other")
 
-    async def _see(self, request: GraspRequest) -> Sighting:
-        config, performer = self._config, self._alone[1]
+    async def _look(self, requests: tuple[GraspRequest, GraspRequest]) -> Frames:
+        """Frames that show both, in the base frame. A dry run moves nothing."""
+        config, (link, performer) = self._config, self._alone
+        link.deadline_ns = self._began_ns + round(requests[0].timeout * 1e9) if requests[0].timeout > 0.0 else 0
         low = self._machines[0].around.table.top_z + 2.0 * config.approach.lift_height
-        outcome = await performer.perform((GoHome(ARMS, back_off_below=low), Observe(config.detect.frames)))
+        look = Observe(config.detect.frames)
+        recipe = (look,) if requests[0].dry_run else (GoHome(ARMS, back_off_below=low), look)
+        outcome = await performer.perform(recipe)
         if outcome.ok:
             frames = outcome.last(Frames)
             outcome = await performer.perform((ToBase(frames.frames, frames.frame_id),))
         if not outcome.ok:
             raise OpenArmError(outcome.code, outcome.message)
-        limits = config.detect
+        return outcome.last(Frames)
+
+    def _find(self, frames: Frames, request: GraspRequest) -> Sighting:
+        limits = self._config.detect
         sighting = find(
-            outcome.last(Frames).frames,
+            frames.frames,
             request.label,
             match_radius=limits.match_radius,
             agree_within=limits.agree_within,
+            at=request.object_at,
+            leave=request.leave,
         )
         return replace(sighting, target=on_table(sighting.target, self._machines[0].around.table.top_z))
 
@@ -164,38 +224,88 @@ class PairRunner:
         async def work(i: int) -> None:
             arm, machine = how.arms[i], self._machines[i]
             link, performer = self._links[arm], self._performers[arm]
-            asked = replace(requests[i], arm=arm, why=how.reason)
             try:
-                outcomes[i] = await run_request(machine, performer, link, asked, lambda: self._tell(machine))
+                asked = replace(self._in_time(requests[i]), arm=arm, why=how.reason)
+                outcome = await run_request(machine, performer, link, asked, lambda: self._tell(machine))
+                outcomes[i] = replace(outcome, route="direct" if outcome.success else "")
+            except OpenArmError as error:
+                outcomes[i] = GraspOutcome(error.code, error.message, requests[i].label)
             finally:
                 self._company.done.add(arm)
 
         await self._alone[0].together([lambda: work(0), lambda: work(1)])
-        first, second = (
-            replace(outcomes[i], route="direct" if outcomes[i].success else "") for i in range(len(requests))
-        )
-        return first, second
+        return outcomes[0], outcomes[1]
 
-    async def _in_turn(
-        self, requests: tuple[GraspRequest, GraspRequest], began_ns: int
-    ) -> tuple[GraspOutcome, GraspOutcome]:
-        first = await self._one(requests[0], began_ns)
-        if first.code in (Code.CANCELLED, Code.ROBOT_LOST, Code.TIMEOUT) or first.held:
+    async def _in_turn(self, requests: tuple[GraspRequest, GraspRequest]) -> tuple[GraspOutcome, GraspOutcome]:
+        first = await self._one(0, requests[0])
+        if first.code in _STOPS or first.held:
             text = f"not begun: {first.label!r} ended with {first.code}: {first.message}"
             return first, GraspOutcome(first.code, text, requests[1].label)
-        return first, await self._one(requests[1], began_ns)
+        return first, await self._one(1, requests[1])
 
-    async def _again(self, request: GraspRequest, outcome: GraspOutcome, began_ns: int) -> GraspOutcome:
+    async def _again(self, i: int, request: GraspRequest, outcome: GraspOutcome) -> GraspOutcome:
         held = any(machine.kept is not None for machine in self._machines)
-        return await self._one(request, began_ns) if outcome.kind == "REFUSED" and not held else outcome
+        return await self._one(i, request) if outcome.kind == "REFUSED" and not held else outcome
 
-    async def _one(self, request: GraspRequest, began_ns: int) -> GraspOutcome:
+    async def _one(self, i: int, request: GraspRequest) -> GraspOutcome:
         """A request alone, by whatever way, in what is left of the time."""
         link, performer = self._alone
-        if request.timeout > 0.0:
-            left = request.timeout - (link.now_ns - began_ns) * 1e-9
-            if left <= 0.0:
-                return GraspOutcome(Code.TIMEOUT, f"the {request.timeout:g} s were over before it began", request.label)
-            request = replace(request, timeout=left)
-        machine = self._machines[0]
-        return await run_task(machine, performer, link, request, lambda: self._tell(machine))
+        machine = self._machines[i]
+        try:
+            return await run_task(machine, performer, link, self._in_time(request), lambda: self._tell(machine))
+        except OpenArmError as error:
+            return GraspOutcome(error.code, error.message, request.label)
+
+    # --- time
+    def _in_time(self, request: GraspRequest) -> GraspRequest:
+        """The request with what is left of its time.
+
+        Raises:
+            OpenArmError: TIMEOUT, when nothing is.
+        """
+        if request.timeout <= 0.0:
+            return request
+        left = request.timeout - (self._alone[0].now_ns - self._began_ns) * 1e-9
+        if left <= 0.0:
+            raise OpenArmError(Code.TIMEOUT, f"the {request.timeout:g} s were over before it began")
+        return replace(request, timeout=left)
+
+    def _late(self, requests: tuple[GraspRequest, GraspRequest], error: OpenArmError) -> OpenArmError:
+        """A deadline ends work as a cancel does; here it gets its own name."""
+        try:
+            self._in_time(requests[0])
+        except OpenArmError as late:
+            return late if error.code is Code.CANCELLED else error
+        return error
+
+
+def check_pair(requests: tuple[GraspRequest, GraspRequest]) -> None:
+    """Refuse what is no pair.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT.
+    """
+    for request in requests:
+        arm_order(request.arm, 0.0, 0.0)
+        if request.phase != "all":
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"two at once are picked and placed; phase {request.phase!r} is of one alone"
+            )
+    first, second = requests
+    if not first.label or not second.label:
+        labels = f"{first.label!r} and {second.label!r}"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"two at once need a label each, got {labels}")
+    if first.label != second.label:
+        return
+    if first.object_at is None or second.object_at is None:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"{first.label!r} is asked for twice: say of each where it stands, or ask for another object",
+        )
+    apart = float(np.hypot(*np.subtract(first.object_at[:2], second.object_at[:2])))
+    if apart <= 2.0 * SAME_PLACE:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"{first.label!r} is asked for at two places {apart * 1e3:.0f} mm apart, expected more than"
+            f" {2e3 * SAME_PLACE:.0f} mm: it may be one object",
+        )

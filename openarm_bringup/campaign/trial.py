@@ -37,8 +37,6 @@ from openarm_sim_bridge.faults import checked_fault
 
 Array = NDArray[np.float64]
 
-#: An arm rests no longer than this before a motion until the other leaves room, s.
-_MOST_WAIT_S = 20.0
 _SETTLE_S = 0.5
 _REST_LIMIT_S = 5.0
 #: Directions that a push tries before something stands in its way on every side.
@@ -159,12 +157,12 @@ class Trials:
             self._tell(machine)
             steps[id(machine)].append(self.steps[-1])
 
-        links: dict[Side, Link] = {arm: self.link.beside(_MOST_WAIT_S) for arm in ARMS}
+        links: dict[Side, Link] = {arm: self.link.beside(self._config.limits.beside_wait) for arm in ARMS}
         pair = PairRunner((self.machine, second), links, (self.link, self.performer), self._config, tell)
         robot.pass_time(0.1)
         outcomes: Sequence[GraspOutcome]
         try:
-            outcomes = self.link.run(pair.run((GraspRequest(task.labels[0]), GraspRequest(task.labels[1]))))
+            outcomes = self.link.run(pair.run((GraspRequest(task.labels[0]), GraspRequest(task.labels[1])))).answers
         except OpenArmError as error:
             outcomes = [GraspOutcome(error.code, error.message, label) for label in task.labels]
         wall_s = 0.5 * (time.monotonic() - began)

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import pytest
 from control_msgs.action import ParallelGripperCommand
-from openarm_interfaces.action import ExecuteTrajectory, MoveArm, Pick, PlanApproach
+from openarm_interfaces.action import ExecuteTrajectory, MoveArm, Pick, PickTwo, PlanApproach
 from openarm_interfaces.msg import GraspStatus
 from openarm_interfaces.srv import ComputeIK, Grasp
 from rclpy.action import ActionClient, ActionServer, CancelResponse
@@ -44,7 +44,9 @@ class FakeGraph(Node):
 
     Attributes:
         objects: Position of the centre by label.
+        hands: What each hand holds.
         log: What was asked of arms and hands, in order.
+        asked: The same of motions alone: arm, what, and how long it may rest first.
         during: Called at the start of a motion; may return a future that it waits for.
         slips: Closes that get nothing.
         silent: No joint states any more.
@@ -61,10 +63,11 @@ class FakeGraph(Node):
         self.unreachable = False
         self.during: Callable[[str], Future | None] = lambda what: None
         self.objects = {"red": np.array([0.26, -0.2, 0.425]), "blue": np.array([0.26, 0.2, 0.425])}
-        self.held: str | None = None
+        self.hands: dict[str, str] = {}
         self.log: list[str] = []
+        self.asked: list[tuple[str, str, float]] = []
         self.cancelled: list[str] = []
-        self._waiting: Future | None = None
+        self._waiting: dict[bytes, Future] = {}
         self.efforts: dict[str, float] = {}
         self.q: dict[str, float] = {}
         for arm in ARMS:
@@ -83,6 +86,11 @@ class FakeGraph(Node):
         for arm in ARMS:
             self._serve(ParallelGripperCommand, f"/{arm}_gripper_controller/gripper_cmd", self._grip)
 
+    @property
+    def held(self) -> str | None:
+        """What one of the hands holds."""
+        return next(iter(self.hands.values()), None)
+
     # --- robot
     def _publish_states(self) -> None:
         if self.silent:
@@ -98,19 +106,19 @@ class FakeGraph(Node):
         (joint,), (position,) = goal.request.command.name, goal.request.command.position
         self.log.append(f"gripper {position:g}")
         result = ParallelGripperCommand.Result(reached_goal=True)
-        tcp = self.tcp("left" if "left" in joint else "right")
+        arm = "left" if "left" in joint else "right"
+        tcp = self.tcp(arm)
         near = [n for n, p in self.objects.items() if np.linalg.norm(tcp[:2] - p[:2]) < 0.02 and tcp[2] < 0.45]
         if position > 0.0:
-            if self.held:
-                self.objects[self.held] = np.array([*tcp[:2], 0.425])
-            self.held = None
+            if arm in self.hands:
+                self.objects[self.hands.pop(arm)] = np.array([*tcp[:2], 0.425])
         elif near and not self.slips:
-            self.held, position = near[0], CUBE / 2.0
+            self.hands[arm], position = near[0], CUBE / 2.0
             result.stalled, result.reached_goal = True, False
         else:
             self.slips = max(0, self.slips - 1)
         self.q[joint] = position
-        self.efforts[joint] = -30.0 if self.held else 0.0
+        self.efforts[joint] = -30.0 if arm in self.hands else 0.0
         goal.succeed()
         return result
 
@@ -182,14 +190,16 @@ class FakeGraph(Node):
         return result
 
     def _carry(self, arm: str) -> None:
-        if self.held:
-            self.objects[self.held] = self.tcp(arm) + np.array([0.0, 0.0, 0.013])
+        if arm in self.hands:
+            self.objects[self.hands[arm]] = self.tcp(arm) + np.array([0.0, 0.0, 0.013])
 
     async def _interrupted(self, goal, what: str) -> bool:
         self.log.append(what)
-        self._waiting = self.during(what)
-        if self._waiting is not None:
-            await self._waiting
+        self.asked.append((goal.request.arm, what, goal.request.max_wait))
+        waiting = self.during(what)
+        if waiting is not None:
+            self._waiting[bytes(goal.goal_id.uuid)] = waiting
+            await waiting
         if goal.is_cancel_requested:
             self.cancelled.append(what)
             goal.canceled()
@@ -230,8 +240,9 @@ class FakeGraph(Node):
             server.destroy()
 
     def _cancel(self, goal) -> CancelResponse:
-        if self._waiting is not None and not self._waiting.done():
-            self._waiting.set_result(None)
+        waiting = self._waiting.get(bytes(goal.goal_id.uuid))
+        if waiting is not None and not waiting.done():
+            waiting.set_result(None)
         return CancelResponse.ACCEPT
 
 
@@ -250,6 +261,7 @@ class Bench:
         probe.create_subscription(MarkerArray, "/grasp/markers", self.markers.append, QOS_LATCHED)
         self.service = probe.create_client(Grasp, "/grasp")
         self.action = ActionClient(probe, Pick, "/grasp/pick")
+        self.two = ActionClient(probe, PickTwo, "/grasp/pick_two")
 
     def ask(self, label: str = "red", timeout: float = 30.0, **request) -> Grasp.Response:
         return self.ros.call(self.service, Grasp.Request(label=label, **request), timeout)

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What users of the client ask for, and what they are told. Base frame, m, rad."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+from openarm_common.errors import Code, OpenArmError
+
+
+@dataclass(frozen=True)
+class GraspResult:
+    """How a grasp ended.
+
+    Attributes:
+        success: The object was placed and seen there (dry run: it could be).
+        outcome: SUCCESS; PARTIAL: held, not placed as asked; FAILED; REFUSED: never touched; CANCELLED.
+        code: `openarm_common.errors.Code`.
+        message: What happened, in a sentence or two.
+        label: What was picked.
+        arm: The arm that was used, or "".
+        attempts: Physical attempts.
+        place_position: (x, y, z) of the target on the table, base frame, m.
+        duration: s of robot time.
+        route: "direct"; "hand_over": by way of the middle, with both arms; "push": pushed into reach; "" when it was
+            not placed.
+    """
+
+    success: bool
+    outcome: str
+    code: Code
+    message: str
+    label: str
+    arm: str
+    attempts: int
+    place_position: tuple[float, float, float]
+    duration: float
+    route: str = ""
+
+    def raise_for_code(self) -> Self:
+        """Return the result of a success.
+
+        Raises:
+            OpenArmError: With code and message, for anything else.
+        """
+        if not self.success:
+            raise OpenArmError(self.code, self.message)
+        return self
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """One of two objects that are picked at once.
+
+    Attributes:
+        label: What to pick.
+        arm: "auto", "left" or "right".
+        place: (x, y) or (x, y, z) of the footprint centre, base frame, m; z is not read. None lets a free spot be
+            chosen.
+        place_yaw: Of the object's x axis about the base z where it is put down, rad; None: as the hand likes.
+        object_at: (x, y) near which the object stands, base frame, m, when there are several alike.
+    """
+
+    label: str
+    arm: str = "auto"
+    place: Sequence[float] | None = None
+    place_yaw: float | None = None
+    object_at: Sequence[float] | None = None
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """How two grasps that were asked for at once ended.
+
+    Attributes:
+        success: Of both.
+        outcome: SUCCESS; PARTIAL: one of them, or picked and not placed as asked; FAILED; REFUSED: none was touched;
+            CANCELLED.
+        code: OK, or of the first that failed.
+        message: What happened.
+        at_once: Both arms worked at the same time.
+        answers: To each, in the order asked; none when they were not taken.
+        duration: s of robot time.
+    """
+
+    success: bool
+    outcome: str
+    code: Code
+    message: str
+    at_once: bool
+    answers: tuple[GraspResult, ...]
+    duration: float
+
+    def raise_for_code(self) -> Self:
+        """Return the result of a success.
+
+        Raises:
+            OpenArmError: With code and message, for anything else.
+        """
+        if not self.success:
+            raise OpenArmError(self.code, self.message)
+        return self

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Takes requests, one at a time or two that belong together, and carries them out over the node graph."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeVar
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.node import BaseNode
+from openarm_grasp.crew import Crew
+from openarm_grasp.effects import GraspOutcome, GraspRequest
+from openarm_grasp.executor import GraspExecutor
+from openarm_grasp.legs import run_task
+from openarm_grasp.machine import GraspMachine
+from openarm_grasp.memory import Surroundings
+from openarm_grasp.pair import PairOutcome, PairRunner
+from openarm_grasp.performer import Performer
+from openarm_grasp.routing import ARMS
+
+T = TypeVar("T")
+Tell = Callable[[GraspMachine], None]
+
+
+class RequestExecutor:
+    """See the module's head.
+
+    Args:
+        node: The node that owns the clients.
+        around: Parameters, table and arms.
+    """
+
+    def __init__(self, node: BaseNode[Any], around: Surroundings) -> None:
+        self._config = around.config
+        self._robot = GraspExecutor(node, around.config)
+        self._crew = Crew(around)
+        self.running = False
+
+    @property
+    def machines(self) -> tuple[GraspMachine, GraspMachine]:
+        """Both machines; single requests are the first one's, unless the other's hand holds what is to be placed."""
+        return self._crew.machines
+
+    @property
+    def now_ns(self) -> int:
+        """Robot time; 0 before the first joint state."""
+        return self._robot.now_ns
+
+    def cancel(self) -> None:
+        """Let what runs end with CANCELLED; arms hold, hands keep what they hold."""
+        self._robot.cancel()
+
+    def close(self) -> None:
+        """Take the clients down."""
+        self._robot.close()
+
+    async def one(self, request: GraspRequest, tell: Tell) -> GraspOutcome:
+        """Carry out a request; `tell` is called after each transition.
+
+        Raises:
+            OpenArmError: BUSY, NOT_READY or INVALID_ARGUMENT, when it is not taken; CANCELLED before it began.
+        """
+
+        async def work() -> GraspOutcome:
+            link, machine = self._robot, self._crew.serving(request)
+            self._crew.check_hands(link.performer, request)
+            full = self._crew.full_hands_beside(machine)
+            free = [arm for arm in ARMS if arm not in full]
+            performer = Performer(link, self._config, arms=free) if full else link.performer
+            return await run_task(machine, performer, link, request, lambda: tell(machine))
+
+        return await self._taken(work, moves=not request.dry_run)
+
+    async def two(self, requests: tuple[GraspRequest, GraspRequest], tell: Tell) -> PairOutcome:
+        """Carry out two requests at once.
+
+        Raises:
+            OpenArmError: As `one`, when they are not taken.
+        """
+
+        async def work() -> PairOutcome:
+            link = self._robot
+            links = {arm: link.beside() for arm in ARMS}
+            return await PairRunner(self.machines, links, (link, link.performer), self._config, tell).run(requests)
+
+        return await self._taken(work, moves=not requests[0].dry_run)
+
+    async def _taken(self, work: Callable[[], Awaitable[T]], *, moves: bool) -> T:
+        if self.running:
+            labels = " and ".join(repr(label) if label else "an object" for label in self._crew.running)
+            text = f"a grasp of {labels or 'an object'} is running; cancel it or wait until it has ended"
+            raise OpenArmError(Code.BUSY, text)
+        self.running = True
+        try:
+            await self._robot.begin(moves=moves)
+            return await work()
+        finally:
+            self._robot.end()
+            self.running = False

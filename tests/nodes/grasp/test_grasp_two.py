@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two objects at once, by the action /grasp/pick_two."""
+
+from __future__ import annotations
+
+from itertools import groupby
+from threading import Thread
+
+import pytest
+from action_msgs.msg import GoalStatus
+from openarm_interfaces.action import Pick, PickTwo
+from openarm_interfaces.msg import PickRequest
+from rclpy.task import Future
+
+from openarm_common.errors import Code
+from openarm_grasp.client import GraspClient, PairResult, Wanted
+
+STATES = "DETECT TRANSFORM PLAN MOVE_TO_PREGRASP MOVE_TO_GRASP CLOSE_GRIPPER LIFT PLACE RESET IDLE"
+
+
+def goal(*labels: str, arms: tuple[str, str] = ("", ""), **fields) -> PickTwo.Goal:
+    requests = [PickRequest(label=label, arm=arm) for label, arm in zip(labels, arms, strict=True)]
+    return PickTwo.Goal(requests=requests, **fields)
+
+
+def ask(bench, *labels: str, **fields) -> PickTwo.Result:
+    _, result = bench.ros.send_goal(bench.two, goal(*labels, **fields))
+    return bench.ros.result(result, 60.0).result
+
+
+def at_once(bench) -> tuple[object, Future]:
+    """Two grasps whose lifts do not end; the goal and its result."""
+    bench.world.during = lambda what: Future() if len(bench.world.hands) == 2 and what == "execute" else None
+    handle, result = bench.ros.send_goal(bench.two, goal("red", "blue"))
+    bench.until(lambda: len(bench.world.hands) == 2 and bench.world.log[-2:] == ["execute"] * 2, what="both lifts")
+    return handle, result
+
+
+def test_a65_two_objects_are_picked_at_once_each_by_its_arm_and_each_tells_its_states(bench) -> None:
+    heard: list[PickTwo.Feedback] = []
+    wish = goal("red", "blue")
+    wish.requests[1].has_place_position = True
+    wish.requests[1].place_position.x, wish.requests[1].place_position.y = 0.3, 0.3
+    _, future = bench.ros.send_goal(bench.two, wish, feedback_callback=lambda m: heard.append(m.feedback))
+    result: PickTwo.Result = bench.ros.result(future, 60.0).result
+    assert (result.success, result.outcome, result.code, result.at_once) == (True, "SUCCESS", "OK", True), result
+    assert [(a.label, a.arm, a.attempts, a.route) for a in result.answers] == [
+        ("red", "right", 1, "direct"),
+        ("blue", "left", 1, "direct"),
+    ]
+    for answer in result.answers:
+        target = (answer.place_position.x, answer.place_position.y)
+        assert bench.world.objects[answer.label][:2] == pytest.approx(target, abs=0.005)
+    assert (result.answers[1].place_position.x, result.answers[1].place_position.y) == (0.3, 0.3)
+    # both are under way before either has ended, and each motion may rest for the other arm
+    told = [(f.request, f.status.state) for f in heard]
+    assert max(told.index((k, "MOVE_TO_PREGRASP")) for k in (0, 1)) < min(told.index((k, "LIFT")) for k in (0, 1))
+    assert {arm for arm, _, _ in bench.world.asked} == {"left", "right"}
+    assert all(wait > 0.0 for _, _, wait in bench.world.asked)
+    for k, label in enumerate(("red", "blue")):
+        mine = [f.status for f in heard if f.request == k and f.status.label == label]
+        assert " ".join(state for state, _ in groupby(s.state for s in mine)) == STATES
+        assert mine[-1].arm == result.answers[k].arm
+
+
+def test_the_newest_status_is_of_the_one_that_is_at_work(bench) -> None:
+    held_up = Future()
+    bench.world.during = lambda what: held_up if bench.world.asked[-1][0] == "left" else None
+    _, result = bench.ros.send_goal(bench.two, goal("red", "blue"))
+    bench.until(lambda: any(s.state == "IDLE" and s.label == "red" for s in bench.status), what="red is done")
+    bench.until(lambda: bench.status[-1].label == "blue", what="blue is told again")
+    ended = next(i for i, s in enumerate(bench.status) if (s.state, s.label) == ("IDLE", "red"))
+    again = bench.status[ended + 1]
+    assert (again.label, again.arm, again.state) == ("blue", "left", "MOVE_TO_PREGRASP")
+    assert again.previous_state == again.state
+    held_up.set_result(None)
+    assert bench.ros.result(result, 60.0).result.success
+    bench.until(lambda: (bench.status[-1].state, bench.status[-1].label) == ("IDLE", "blue"), what="blue is done")
+
+
+def test_one_request_at_a_time_whatever_its_kind(bench) -> None:
+    held_up = Future()
+    bench.world.during = lambda what: held_up if what == "execute" else None
+    _, two = bench.ros.send_goal(bench.two, goal("red", "blue"))
+    bench.until(lambda: "execute" in bench.world.log, what="an arm moves")
+    answer = bench.ask("red", 5.0)
+    assert (answer.code, answer.success) == ("BUSY", False)
+    assert "a grasp of 'red' and 'blue' is running" in answer.message
+    busy = ask(bench, "red", "blue")
+    assert (busy.code, busy.outcome, len(busy.answers)) == ("BUSY", "REFUSED", 0)
+    handle, _ = bench.ros.send_goal(bench.action, Pick.Goal(label="red"))
+    assert not bench.ros.result(handle.cancel_goal_async()).goals_canceling
+    held_up.set_result(None)
+    assert bench.ros.result(two, 60.0).result.success
+    assert bench.ask("red").success
+
+
+def test_p01_p21_a_cancel_stops_both_arms_and_each_hand_keeps_its_object_until_it_is_placed(bench) -> None:
+    handle, result = at_once(bench)
+    assert bench.ros.result(handle.cancel_goal_async()).goals_canceling
+    end = bench.ros.result(result, 5.0)
+    assert end.status == GoalStatus.STATUS_CANCELED
+    assert (end.result.code, end.result.outcome) == ("CANCELLED", "CANCELLED")
+    assert [answer.code for answer in end.result.answers] == ["CANCELLED", "CANCELLED"]
+    assert bench.world.cancelled == ["execute", "execute"]
+    assert bench.world.hands == {"right": "red", "left": "blue"}
+    # either hand would drop what it holds
+    bench.world.during = lambda what: None
+    for refused in (bench.ask("green"), ask(bench, "red", "blue")):
+        assert (refused.code, refused.outcome) == ("NOT_READY", "REFUSED")
+        assert "hand still holds" in refused.message
+    for label, arm, other in (("blue", "left", "right"), ("red", "right", "left")):
+        bench.world.asked.clear()
+        placed = bench.ask("", phase="place", arm=arm)
+        assert (placed.success, placed.label, placed.arm) == (True, label, arm), placed.message
+        assert {name for name, _, _ in bench.world.asked} == {arm}, f"the {other} hand stays where it is"
+    assert bench.world.hands == {}
+    assert ask(bench, "red", "blue").success
+
+
+def test_a_limit_of_time_ends_both_with_their_hands_closed(bench) -> None:
+    bench.world.during = lambda what: Future() if len(bench.world.hands) == 2 and what == "execute" else None
+    result = ask(bench, "red", "blue", timeout=20.0)
+    assert (result.success, result.code, result.outcome) == (False, "TIMEOUT", "PARTIAL")
+    assert [answer.code for answer in result.answers] == ["TIMEOUT", "TIMEOUT"]
+    assert result.duration == pytest.approx(20.0, abs=5.0)
+    assert bench.world.hands == {"right": "red", "left": "blue"}
+
+
+def test_a_dry_run_of_two_moves_nothing(bench) -> None:
+    result = ask(bench, "red", "blue", dry_run=True)
+    assert (result.success, result.at_once) == (True, True), result.message
+    assert {entry.split()[0] for entry in bench.world.log} == {"plan"}
+    assert {answer.arm for answer in result.answers} == {"left", "right"}
+
+
+def test_of_two_that_one_arm_is_asked_for_one_waits_for_the_other(bench) -> None:
+    bench.world.objects["blue"][:2] = (0.30, -0.08)
+    result = ask(bench, "red", "blue", arms=("right", "right"))
+    assert (result.success, result.at_once) == (True, False), result.message
+    assert [answer.arm for answer in result.answers] == ["right", "right"]
+    assert "the same arm is asked for: one after the other" in result.message.replace(")", "")
+
+
+def test_p02_one_of_two_that_is_not_in_view_is_refused_and_the_other_placed(bench) -> None:
+    result = ask(bench, "mug", "blue")
+    assert (result.success, result.outcome, result.code) == (False, "PARTIAL", "UNKNOWN_OBJECT")
+    assert [answer.outcome for answer in result.answers] == ["REFUSED", "SUCCESS"]
+    assert "no 'mug' in view" in result.message
+    assert bench.ask("", phase="place").code == "NOT_READY"
+
+
+def test_what_is_no_pair_is_refused_before_anything_moves(bench) -> None:
+    result = ask(bench, "red", "red")
+    assert (result.code, result.outcome, len(result.answers)) == ("INVALID_ARGUMENT", "REFUSED", 0)
+    assert "'red' is asked for twice" in result.message
+    assert bench.world.log == []
+
+
+def test_a65_the_client_picks_two_from_plain_python(bench) -> None:
+    heard: list[tuple[str, str]] = []
+    results: list[PairResult] = []
+
+    def script() -> None:
+        with GraspClient() as grasp:
+            wanted = Wanted("blue", arm="left", place=(0.3, 0.3), object_at=(0.26, 0.21))
+            results.append(
+                grasp.pick_two("red", wanted, on_feedback=lambda status: heard.append((status.label, status.state)))
+            )
+            results.append(grasp.pick_two("red", "red"))
+
+    thread = Thread(target=script)
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    thread.join()
+    done, refused = results
+    assert done.success, done.message
+    assert done.raise_for_code() is done
+    assert done.at_once
+    assert [(a.label, a.arm) for a in done.answers] == [("red", "right"), ("blue", "left")]
+    assert done.answers[1].place_position[:2] == (0.3, 0.3)
+    assert {("red", "LIFT"), ("blue", "LIFT")} <= set(heard)
+    assert (refused.code, refused.answers) == (Code.INVALID_ARGUMENT, ())
