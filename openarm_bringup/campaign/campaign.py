@@ -12,69 +12,21 @@ import json
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from openarm_bringup.campaign import cluster, report
-from openarm_bringup.campaign.tasks import make_task
+from openarm_bringup.campaign.one_task import run_one
+from openarm_bringup.campaign.options import CampaignOptions, Row
+from openarm_bringup.campaign.sets import make_task
 from openarm_bringup.judging import provenance
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
-from openarm_perception.kinds import DetectorKind
 
-Row = dict[str, Any]
 ROWS = "rows.jsonl"
-
-
-@dataclass(frozen=True)
-class CampaignOptions:
-    """What a campaign runs.
-
-    Attributes:
-        set_name: Of `campaign_tasks.sets`.
-        seeds: One task each.
-        workers: Processes.
-        noise: Depth as noisy as a D435's.
-        mount_seeds: True camera mounts to go through, each with its calibration; empty: nominal mounts.
-        use_effort: Whether the finger's effort counts as evidence.
-        detector: What finds objects: color, network, both.
-        ray: Address of a Ray cluster whose machines run the workers; "": this machine.
-    """
-
-    set_name: str = "nominal"
-    seeds: tuple[int, ...] = ()
-    workers: int = 1
-    noise: bool = False
-    mount_seeds: tuple[int, ...] = ()
-    use_effort: bool = True
-    detector: DetectorKind = "color"
-    ray: str = ""
-
-    def settings(self) -> dict[str, Any]:
-        """What must be the same for rows to belong together."""
-        return {
-            "set": self.set_name,
-            "noise": self.noise,
-            "mount_seeds": list(self.mount_seeds),
-            "use_effort": self.use_effort,
-            **({"detector": self.detector} if self.detector != "color" else {}),
-        }
-
-    def command(self, seed: int) -> str:
-        """The command that runs one row again."""
-        parts = [
-            "./openarm campaign",
-            f"--set {self.set_name}" if self.set_name != "nominal" else "",
-            f"--seeds {seed}",
-        ]
-        parts.append("--noise" if self.noise else "")
-        parts.append("--mount-seeds " + ",".join(map(str, self.mount_seeds)) if self.mount_seeds else "")
-        parts.append("" if self.use_effort else "--no-effort")
-        parts.append(f"--detector {self.detector}" if self.detector != "color" else "")
-        return " ".join(part for part in parts if part)
 
 
 @dataclass
@@ -191,31 +143,6 @@ def _quiet_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(key, "1")
-
-
-def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
-    """Run one task in this process and return its row, whatever happens."""
-    from openarm_bringup.campaign.mounts import with_mounts
-    from openarm_bringup.campaign.robot import SimulatedSenses
-    from openarm_bringup.campaign.trial import Trials, crashed_row
-    from openarm_grasp.config import GraspConfig, HeldConfig
-
-    task = make_task(options.set_name, seed)
-    mounts: Mapping[str, Any] = {}
-    try:
-        if options.mount_seeds:
-            task, mounts = with_mounts(task, options.mount_seeds, folder / "mounts")
-        trials = Trials(
-            task,
-            SimulatedSenses(depth_noise=options.noise, detector=options.detector),
-            GraspConfig(held=HeldConfig(use_effort=options.use_effort)),
-            mounts=mounts,
-            folder=folder / "failures" / str(seed),
-            again=options.command(seed),
-        )
-        return trials.run()
-    except Exception as error:  # one task must not end a campaign of a thousand; its row says what happened
-        return {**crashed_row(task, error), "again": options.command(seed)}
 
 
 def write_reports(campaign: Campaign) -> dict[str, Any]:

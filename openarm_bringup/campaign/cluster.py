@@ -13,15 +13,14 @@ import tempfile
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from openarm_bringup.campaign.one_task import run_one
+from openarm_bringup.campaign.options import CampaignOptions, Row
+from openarm_bringup.campaign.sets import make_task
 from openarm_bringup.judging import provenance
 from openarm_common.errors import Code, OpenArmError
 
-if TYPE_CHECKING:
-    from openarm_bringup.campaign.campaign import CampaignOptions
-
-Row = dict[str, Any]
 Files = dict[str, bytes]
 
 #: Workers that may be lost (a machine that is switched off, a process that is killed) with one seed.
@@ -50,8 +49,6 @@ class _Worker:
     def run(self, options: CampaignOptions, seed: int) -> _Answer:
         """Run one task."""
         import ray
-
-        from openarm_bringup.campaign.campaign import run_one
 
         folder = Path(self._folder.name)
         row = run_one(options, seed, folder)
@@ -136,7 +133,6 @@ def _prepare_mounts(options: CampaignOptions, seeds: Sequence[int], folder: Path
     if not options.mount_seeds:
         return
     from openarm_bringup.campaign.mounts import with_mounts
-    from openarm_bringup.campaign.tasks import make_task
 
     first = {options.mount_seeds[seed % len(options.mount_seeds)]: seed for seed in seeds}
     for seed in first.values():

@@ -10,8 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from openarm_bringup.campaign.campaign import Campaign, CampaignOptions, Row, keep_row, read_rows, write_reports
-from openarm_bringup.campaign.tasks import Task, make_task
+from openarm_bringup.campaign.campaign import Campaign, keep_row, read_rows, write_reports
+from openarm_bringup.campaign.options import CampaignOptions, Row
+from openarm_bringup.campaign.sets import make_task
+from openarm_bringup.campaign.tasks import Task
 from openarm_bringup.campaign.trial import crashed_row, row_of
 from openarm_bringup.judging.trial import Ask, run_trial
 from openarm_bringup.supervision import environment

@@ -7,13 +7,13 @@ Positions are in the base frame, m; the same set and seed always give the same t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.scene import PALETTE, SPACING, Scene, random_scene
 
 #: Faults of the campaign's own: as many plans as the parameter `times` says find no way,
@@ -117,31 +117,3 @@ def endurance(seed: int) -> Task:
     scene = random_scene(seed, count=2)
     labels = tuple(item.label for item in scene.objects)
     return Task("endurance", seed, scene, _ENDURANCE * labels, kind="endurance")
-
-
-def sets() -> Mapping[str, Callable[[int], Task]]:
-    """Makers of tasks by the name of the set."""
-    from openarm_bringup.campaign import faults, two_arms
-
-    return {
-        "nominal": nominal,
-        "clutter": clutter,
-        "endurance": endurance,
-        "faults": faults.fault_task,
-        "handover": two_arms.handover_task,
-        "push": two_arms.push_task,
-        "pairs": two_arms.pair_task,
-        "pairs_in_turn": two_arms.in_turn_task,
-    }
-
-
-def make_task(set_name: str, seed: int) -> Task:
-    """Make the task of a set and a seed.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, listing the sets.
-    """
-    known = sets()
-    if set_name not in known:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"no set {set_name!r}; sets: {', '.join(known)}")
-    return known[set_name](seed)

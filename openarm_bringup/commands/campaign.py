@@ -13,7 +13,7 @@ from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code
 
 if TYPE_CHECKING:
-    from openarm_bringup.campaign.campaign import CampaignOptions
+    from openarm_bringup.campaign.options import CampaignOptions
 
 
 def campaign(
@@ -52,7 +52,7 @@ def campaign(
         accept: Share of scenes that must go as expected.
     """
     from openarm_bringup.campaign.agree import rows_of
-    from openarm_bringup.campaign.campaign import CampaignOptions
+    from openarm_bringup.campaign.options import CampaignOptions
     from openarm_bringup.demo.demo import parse_seeds
     from openarm_bringup.supervision import runs
 

@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 
 from openarm_bringup.campaign import campaign, link, report, trial
-from openarm_bringup.campaign.campaign import CampaignOptions, run_campaign
+from openarm_bringup.campaign.campaign import run_campaign
 from openarm_bringup.campaign.faults import KINDS
+from openarm_bringup.campaign.options import CampaignOptions
 from openarm_bringup.campaign.progress import Pace
 from openarm_bringup.campaign.robot import SimulatedSenses
-from openarm_bringup.campaign.tasks import FaultPlan, make_task, sets
+from openarm_bringup.campaign.sets import SETS, make_task
+from openarm_bringup.campaign.tasks import FaultPlan
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octomap_codec import read_file
 from openarm_grasp import performer
@@ -109,7 +111,7 @@ def test_clutter_is_five_to_eight_objects_each_asked_for() -> None:
 
 
 def test_tasks_come_from_set_and_seed_alone() -> None:
-    for name in sets():
+    for name in SETS:
         assert make_task(name, 7) == make_task(name, 7)
     with pytest.raises(OpenArmError, match="nominal"):
         make_task("nothing", 0)

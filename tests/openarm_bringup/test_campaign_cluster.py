@@ -7,8 +7,9 @@ import os
 
 import pytest
 
-from openarm_bringup.campaign.campaign import CampaignOptions, run_campaign
+from openarm_bringup.campaign.campaign import run_campaign
 from openarm_bringup.campaign.cluster import pack, unpack
+from openarm_bringup.campaign.options import CampaignOptions
 from openarm_common.errors import Code, OpenArmError
 
 ray = pytest.importorskip("ray", reason="needs Ray: install the extra `cluster`")

@@ -10,7 +10,7 @@ import pytest
 from openarm_bringup.campaign.gap import LEAST_GAP, ArmGap
 from openarm_bringup.campaign.planner import arms_behind
 from openarm_bringup.campaign.robot import SimRobot, SimulatedSenses
-from openarm_bringup.campaign.tasks import make_task
+from openarm_bringup.campaign.sets import make_task
 from openarm_bringup.campaign.traffic import Traffic
 from openarm_bringup.campaign.trial import Trials
 from openarm_common.errors import Code, OpenArmError

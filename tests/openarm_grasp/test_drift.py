@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from openarm_bringup.campaign.robot import SimulatedSenses
-from openarm_bringup.campaign.tasks import make_task
+from openarm_bringup.campaign.sets import make_task
 from openarm_bringup.campaign.trial import Trials
 from openarm_common import se3
 from openarm_common.cameras import load_cameras
