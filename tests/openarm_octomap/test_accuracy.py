@@ -89,7 +89,7 @@ def test_a51_a52_without_the_filter_flying_pixels_fill_the_map_and_nothing_else_
 
 
 def test_flying_pixels_are_counted_by_camera(scene: MapScene) -> None:
-    """A clean picture has a few at the edges of the arms, a noisy one thousands; the frames that were given are as they were."""
+    """A clean picture has a few at the edges of the arms, a noisy one thousands; frames stay as given."""
     rng = np.random.default_rng(1)
     counts = []
     for frames in (scene.frames(0), scene.frames(0, rng)):
