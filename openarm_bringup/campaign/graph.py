@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 #: Sets whose scenes are random scenes, which the bridge draws from the seed by itself.
 GRAPH_SETS = ("nominal",)
-#: Looks in a row that make a free cell of the map occupied, where depth is noisy.
-_NOISY_MARK = 3
 
 
 def run_graph_campaign(
@@ -70,9 +68,6 @@ async def _run(campaign: Campaign, tasks: list[Task], on_row: Callable[[Row], No
     if options.mount_seeds:
         overrides["mount_seed"] = options.mount_seeds[0]
     sets = [f"mujoco_bridge.depth_noise.enabled={str(options.noise).lower()}"]
-    if options.noise:
-        # at edges a noisy camera sees points in the air: the map believes what it sees again and again
-        sets.append(f"octomap.grid.frames_to_mark={_NOISY_MARK}")
     sets.append(f"grasp.held.use_effort={str(options.use_effort).lower()}")
     sets += [f"{node}.detector={options.detector}" for node in ("detector", "wrist_detector")]
     graph = load_graph("sim", overrides=overrides, sets=tuple(sets))
