@@ -8,8 +8,9 @@ shapes. A scene is a snapshot: boxes that are moved later, and other joints, are
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import coal
 import numpy as np
@@ -250,67 +251,66 @@ class _Packer:
     def _groups(
         self, of: dict[int, int], clusters: list[_Cluster]
     ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
-        lone = {cluster: k for k, cluster in of.items() if clusters[cluster].body == 0}
-        together: dict[tuple[int, int], list[tuple[int, int, float]]] = {}
-        for i, j, keep in self._keep:
-            a, b = sorted((of[i], of[j]))  # what stands still comes second
-            together.setdefault((a, b), []).append((i, j, keep))
-        groups: list[tuple[int, int, int, int, int]] = []
-        flat: list[tuple[int, int, float]] = []
-        reaches: list[float] = []
-        for (a, b), pairs in sorted(together.items(), key=lambda item: (item[0][1] not in lone, item[0])):
-            groups.append((a, b, len(flat), len(flat) + len(pairs), lone.get(b, -1)))
-            flat += pairs
-            reaches.append(max(0.0, *(keep for _, _, keep in pairs), 0.0))
-        return (
-            np.array(groups, np.int64).reshape(-1, 5),
-            np.array(reaches, np.float64),
-            np.array([(i, j) for i, j, _ in flat], np.int64).reshape(-1, 2),
-            np.array([keep for _, _, keep in flat], np.float64),
-        )
+        if not self._keep:
+            return np.empty((0, 5), np.int64), np.empty(0), np.empty((0, 2), np.int64), np.empty(0)
+        cluster_of = np.array([of[k] for k in range(len(self._kinds))])
+        lone = np.full(len(clusters), -1)
+        for k, cluster in of.items():
+            if clusters[cluster].body == 0:
+                lone[cluster] = k
+        i, j, keep = (np.array(column) for column in zip(*self._keep, strict=True))
+        a, b = np.sort([cluster_of[i], cluster_of[j]], axis=0)  # what stands still comes second
+        order = np.lexsort((b, a, lone[b] < 0))
+        a, b, keep = a[order], b[order], keep[order]
+        first = np.flatnonzero(np.diff(a, prepend=-1) | np.diff(b, prepend=-1))
+        groups = np.stack([a[first], b[first], first, np.append(first[1:], len(a)), lone[b[first]]], axis=1)
+        pairs = np.stack([i[order], j[order]], axis=1)
+        return groups, np.maximum(np.maximum.reduceat(keep, first), 0.0), pairs, keep
 
     def _spheres(self) -> tuple[Array, NDArray[np.int64], Array, Array]:
         """Spheres that cover what moves, body by body; shape and clearance of each; empty without a map."""
         spheres: list[Array] = []
-        shapes: list[tuple[int, float]] = []
+        shapes: list[Array] = []
         groups: list[tuple[int, int, int]] = []
         bounds: list[Array] = []
         bodies = sorted({self._bodies[k] for k in self._covered}) if self._field is not None else []
+        count = 0
         for body in bodies:
-            first = len(spheres)
+            mine: list[Array] = []
             for k, keep in self._covered.items():
                 if self._bodies[k] == body:
-                    for centre, radius in cover(self._kinds[k], self._sizes[k]):
-                        p = self._poses[k][:, :3] @ centre + self._poses[k][:, 3]
-                        spheres.append(np.array([*p, radius + keep]))
-                        shapes.append((k, keep + _ROUNDING))
-            mine = np.array(spheres[first:])
-            centre = 0.5 * (mine[:, :3].min(axis=0) + mine[:, :3].max(axis=0))
-            bound = float(np.max(np.linalg.norm(mine[:, :3] - centre, axis=1) + mine[:, 3]))
-            groups.append((body, first, len(spheres)))
+                    balls = cover(self._kinds[k], tuple(self._sizes[k].tolist()))
+                    p = balls[:, :3] @ self._poses[k][:, :3].T + self._poses[k][:, 3]
+                    mine.append(np.column_stack([p, balls[:, 3] + keep]))
+                    shapes.append(np.tile((float(k), keep + _ROUNDING), (len(balls), 1)))
+            there = np.concatenate(mine)
+            centre = 0.5 * (there[:, :3].min(axis=0) + there[:, :3].max(axis=0))
+            bound = float(np.max(np.linalg.norm(there[:, :3] - centre, axis=1) + there[:, 3]))
+            spheres.append(there)
+            groups.append((body, count, count + len(there)))
             bounds.append(np.array([*centre, bound]))
+            count += len(there)
         return (
-            np.array(spheres, np.float64).reshape(-1, 4),
+            np.concatenate([np.empty((0, 4)), *spheres]),
             np.array(groups, np.int64).reshape(-1, 3),
             np.array(bounds, np.float64).reshape(-1, 4),
-            np.array(shapes, np.float64).reshape(-1, 2),
+            np.concatenate([np.empty((0, 2)), *shapes]),
         )
 
 
-def cover(kind: int, size: Array) -> Iterable[tuple[Array, float]]:
-    """Spheres (centre (3,), radius) that together hold a shape, in its frame."""
+@cache
+def cover(kind: int, size: tuple[float, float, float]) -> Array:
+    """Spheres (m, 4), centre and radius, that together hold a shape, in its frame."""
     if kind == SPHERE:
-        yield np.zeros(3), float(size[0])
-        return
-    half = size if kind == BOX else np.array([size[0], size[0], size[1]])
+        return np.array([[0.0, 0.0, 0.0, size[0]]])
+    half = np.array(size if kind == BOX else (size[0], size[0], size[1]))
     counts = np.maximum(np.ceil(2.0 * half / _CELL), 1).astype(int)
     cell = 2.0 * half / counts
-    for at in np.ndindex(*counts.tolist()):
-        centre = -half + (np.array(at) + 0.5) * cell
-        beyond = np.maximum(np.abs(centre[:2]) - 0.5 * cell[:2], 0.0)
-        if kind == CYLINDER and float(np.hypot(*beyond)) > size[0]:
-            continue  # a corner that the cylinder does not reach
-        yield centre, 0.5 * float(np.linalg.norm(cell)) + 1e-9
+    centres = -half + (np.indices(counts.tolist()).reshape(3, -1).T + 0.5) * cell
+    if kind == CYLINDER:  # without corners that the cylinder does not reach
+        beyond = np.maximum(np.abs(centres[:, :2]) - 0.5 * cell[:2], 0.0)
+        centres = centres[np.hypot(beyond[:, 0], beyond[:, 1]) <= size[0]]
+    return np.column_stack([centres, np.full(len(centres), 0.5 * float(np.linalg.norm(cell)) + 1e-9)])
 
 
 def _kind(shape: coal.ShapeBase) -> tuple[int, Array]:

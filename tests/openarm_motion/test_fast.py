@@ -153,8 +153,8 @@ def test_spheres_cover_their_shape(kind: int) -> None:
             p = p[np.hypot(p[:, 0], p[:, 1]) <= 1.0] * [size[0], size[0], size[1]]
         else:
             p = p[np.linalg.norm(p, axis=1) <= 1.0] * size[0]
-        spheres = list(cover(kind, size))
-        gaps = np.min([np.linalg.norm(p - centre, axis=1) - radius for centre, radius in spheres], axis=0)
+        spheres = cover(kind, tuple(size.tolist()))
+        gaps = np.min([np.linalg.norm(p - centre, axis=1) - radius for *centre, radius in spheres], axis=0)
         assert np.all(gaps <= 0.0)
 
 
