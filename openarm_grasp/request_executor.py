@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
+from openarm_common.description import Side
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import BaseNode
 from openarm_grasp.crew import Crew
@@ -15,7 +16,7 @@ from openarm_grasp.legs import run_task
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.pair import PairOutcome, PairRunner
-from openarm_grasp.performer import Performer
+from openarm_grasp.performer import Link, Performer
 from openarm_grasp.routing import ARMS
 
 T = TypeVar("T")
@@ -80,7 +81,7 @@ class RequestExecutor:
 
         async def work() -> PairOutcome:
             link = self._robot
-            links = {arm: link.beside() for arm in ARMS}
+            links: dict[Side, Link] = {arm: link.beside() for arm in ARMS}
             return await PairRunner(self.machines, links, (link, link.performer), self._config, tell).run(requests)
 
         return await self._taken(work, moves=not requests[0].dry_run)

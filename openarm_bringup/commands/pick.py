@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from cyclopts import Parameter
 
@@ -15,25 +16,37 @@ from openarm_common.errors import Code, OpenArmError
 if TYPE_CHECKING:
     from openarm_interfaces.msg import GraspStatus
 
+    from openarm_grasp.answers import GraspResult, PairResult
+
+
+Arm = Literal["auto", "left", "right"]
+Flag = Annotated[bool, Parameter(negative=())]
+T = TypeVar("T")
+
 
 def pick(
     label: str = "",
+    second: str = "",
     *,
-    arm: Literal["auto", "left", "right"] = "auto",
-    at: tuple[float, float] | None = None,
-    place: tuple[float, float, float] | None = None,
-    yaw: float | None = None,
+    arm: list[Arm] | None = None,
+    at: list[tuple[float, float]] | None = None,
+    place: list[tuple[float, float, float]] | None = None,
+    yaw: list[float] | None = None,
     phase: Literal["all", "pick", "place"] = "all",
     time_limit: float = 0.0,
-    dry_run: Annotated[bool, Parameter(negative=())] = False,
+    dry_run: Flag = False,
     domain: int | None = None,
     timeout: float = 300.0,
 ) -> Outcome:
-    """Pick an object and place it; the states are shown while it runs, Ctrl-C cancels it.
+    """Pick an object and place it, or two at once; the states are shown while it runs, Ctrl-C cancels it.
+
+    `openarm pick red blue` picks both with both arms at the same time; one after the other where the arms would be in
+    each other's way. Where something is said of two objects, it is said of each: `--arm left --arm right`.
 
     Args:
         label: What to pick, such as red; without one, what is seen best.
-        arm: Which arm.
+        second: Another object, at the same time.
+        arm: Which arm: auto when not given.
         at: x y near which the object stands, base frame, m: which of several alike.
         place: Where to: x y z of the footprint centre, base frame, m (z is not read: the table); chosen when not given.
         yaw: Of the object where it is put down, degrees about the vertical; as the hand likes when not given.
@@ -43,28 +56,35 @@ def pick(
         domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
         timeout: Longest wait, s.
     """
-    from rich.console import Console
-
+    labels = (label, second) if second else (label,)
+    arms, spots = _each("arm", arm, labels), _each("at", at, labels)
+    places, yaws = _each("place", place, labels), _each("yaw", yaw, labels)
+    if second and phase != "all":
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--phase {phase} is of one object; two are picked and placed")
     meet_graph(domain)
+    from openarm_grasp.answers import Wanted
     from openarm_grasp.client import GraspClient
 
-    console = Console(stderr=True, highlight=False)
-    first: list[float] = []
-
-    def show(status: GraspStatus) -> None:
-        stamp = status.header.stamp.sec + status.header.stamp.nanosec * 1e-9
-        first.append(stamp)
-        console.print(f"{stamp - first[0]:7.2f} s  [cyan]{status.state:<18}[/cyan]", end=" ")
-        console.print(status.reason, markup=False)
-
+    wanted = [
+        Wanted(name, which or "auto", where, None if turn is None else math.radians(turn), spot)
+        for name, which, where, turn, spot in zip(labels, arms, places, yaws, spots, strict=True)
+    ]
+    show = _Steps(labels)
     with GraspClient() as client:
         try:
+            if second:
+                first, other = wanted
+                both = client.pick_two(
+                    first, other, dry_run=dry_run, time_limit=time_limit, timeout=timeout, on_feedback=show
+                )
+                return _of_two(both, dry_run=dry_run)
+            (one,) = wanted
             result = client.pick(
-                label,
-                arm=arm,
-                object_at=at,
-                place=place,
-                place_yaw=None if yaw is None else math.radians(yaw),
+                one.label,
+                arm=one.arm,
+                object_at=one.object_at,
+                place=one.place,
+                place_yaw=one.place_yaw,
                 phase=phase,
                 dry_run=dry_run,
                 time_limit=time_limit,
@@ -72,14 +92,63 @@ def pick(
                 on_feedback=show,
             )
         except KeyboardInterrupt:
-            return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED, {"label": label})
-    data: dict[str, Any] = {
+            asked = {"labels": labels} if second else {"label": label}
+            return Outcome(False, "cancelled by Ctrl-C; the robot holds where it is", Code.CANCELLED, asked)
+    return Outcome(result.success, result.message, result.code, {**_told(result), "dry_run": dry_run})
+
+
+def _each(name: str, given: list[T] | None, labels: Sequence[str]) -> Sequence[T | None]:
+    """What an option says of each object; None where it says nothing."""
+    if given is None:
+        return [None] * len(labels)
+    if len(given) != len(labels):
+        of = " and ".join(repr(label) for label in labels)
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"--{name} is given {len(given)} times, expected {len(labels)}: once for each of {of}",
+        )
+    return given
+
+
+class _Steps:
+    """Shows each state as it is entered, at robot time since the first."""
+
+    def __init__(self, labels: Sequence[str]) -> None:
+        from rich.console import Console
+
+        self._console = Console(stderr=True, highlight=False)
+        self._width = max(map(len, labels)) if len(labels) > 1 else 0
+        self._first_s: float | None = None
+
+    def __call__(self, status: GraspStatus) -> None:
+        stamp = status.header.stamp.sec + status.header.stamp.nanosec * 1e-9
+        self._first_s = stamp if self._first_s is None else self._first_s
+        who = f"{status.label:<{self._width}}  " if self._width else ""
+        line = f"{stamp - self._first_s:7.2f} s  {who}[cyan]{status.state:<18}[/cyan]"
+        self._console.print(line, end=" ")
+        self._console.print(status.reason, markup=False)
+
+
+def _told(result: GraspResult) -> dict[str, Any]:
+    return {
         "outcome": result.outcome,
         "label": result.label,
         "arm": result.arm,
         "route": result.route,
         "attempts": result.attempts,
         "place_position": list(result.place_position),
+        "duration": result.duration,
+    }
+
+
+def _of_two(result: PairResult, *, dry_run: bool) -> Outcome:
+    answers = [
+        {"success": one.success, "code": str(one.code), "message": one.message, **_told(one)} for one in result.answers
+    ]
+    data = {
+        "outcome": result.outcome,
+        "at_once": result.at_once,
+        "answers": answers,
         "duration": result.duration,
         "dry_run": dry_run,
     }

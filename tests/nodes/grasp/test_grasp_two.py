@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from itertools import groupby
 from threading import Thread
 
@@ -12,6 +14,7 @@ from openarm_interfaces.action import Pick, PickTwo
 from openarm_interfaces.msg import PickRequest
 from rclpy.task import Future
 
+from openarm_bringup import cli
 from openarm_common.errors import Code
 from openarm_grasp.client import GraspClient, PairResult, Wanted
 
@@ -181,3 +184,35 @@ def test_a65_the_client_picks_two_from_plain_python(bench) -> None:
     assert done.answers[1].place_position[:2] == (0.3, 0.3)
     assert {("red", "LIFT"), ("blue", "LIFT")} <= set(heard)
     assert (refused.code, refused.answers) == (Code.INVALID_ARGUMENT, ())
+
+
+def test_openarm_pick_red_blue_picks_both_and_says_so_as_json(bench, tmp_path, capsys) -> None:
+    codes: list[int] = []
+    domain, report = os.environ["ROS_DOMAIN_ID"], tmp_path / "answer.json"
+    words = f"pick red blue --arm right --arm left --domain {domain} --json {report}".split()
+    thread = Thread(target=lambda: codes.append(cli.run(words)))
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), 60.0, "the command ends")
+    thread.join()
+    told = json.loads(report.read_text(encoding="utf-8"))
+    assert (codes, told["success"], told["code"], told["at_once"]) == ([0], True, "OK", True), told
+    assert [(a["label"], a["arm"], a["outcome"]) for a in told["answers"]] == [
+        ("red", "right", "SUCCESS"),
+        ("blue", "left", "SUCCESS"),
+    ]
+    steps = capsys.readouterr().err.splitlines()
+    assert any("red   LIFT" in line for line in steps)
+    assert any("blue  LIFT" in line for line in steps)
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("red blue --arm left", "--arm is given 1 times, expected 2: once for each of 'red' and 'blue'"),
+        ("red --place 0.3 0.3 0 --place 0.3 -0.3 0", "--place is given 2 times, expected 1: once for each of 'red'"),
+        ("red blue --phase pick", "--phase pick is of one object; two are picked and placed"),
+    ],
+)
+def test_a_wrong_call_for_two_is_met_with_what_is_right(words: str, why: str, capsys) -> None:
+    assert cli.run(["pick", *words.split()]) == 2
+    assert why in capsys.readouterr().err
