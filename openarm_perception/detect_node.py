@@ -95,9 +95,9 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         if self.lockstep:
             self._subscribe()
 
-    def _make(self, config: DetectNodeConfig) -> Pipeline:
+    def _make(self, config: DetectNodeConfig, before: Pipeline | None = None) -> Pipeline:
         return make_pipeline(
-            config.detector, self._colors, config.network, self._localizer, config.policy, config.label
+            config.detector, self._colors, config.network, self._localizer, config.policy, config.label, before
         )
 
     def _first_pipeline(self) -> Pipeline:
@@ -111,7 +111,11 @@ class DetectNode(BaseNode[DetectNodeConfig]):
 
     def _take(self, config: DetectNodeConfig) -> None:
         """Detect as configured from the next frame on."""
-        self._pipeline = self._make(config)
+        if (config.detector, config.network) == (self.config.detector, self.config.network):
+            # holds too while colours stand in for a network that cannot be used
+            self._pipeline.policy, self._pipeline.label = config.policy, config.label
+            return
+        self._pipeline = self._make(config, self._pipeline)
         self._fallback = ""
 
     def lockstep_missing(self) -> str:

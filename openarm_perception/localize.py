@@ -132,7 +132,18 @@ class Localizer:
         self.table_height = table_height
         self._heights = config.known_heights()
 
-    def coarse(self, found: Detection2D, depth: DepthImage, intrinsics: Intrinsics, T_base_camera: Array) -> Array:
+    def cut(
+        self,
+        found: Detection2D,
+        depth: DepthImage,
+        intrinsics: Intrinsics,
+        T_base_camera: Array,
+        robot: Mask | None = None,
+    ) -> Patch:
+        """The surroundings of a detection, for the methods below; arguments and errors are those of `patch.cut`."""
+        return cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
+
+    def coarse(self, patch: Patch) -> Array:
         """Point on the visible surface: the median pixel of the mask at the median of its valid depths.
 
         A single pixel carries the whole noise of the sensor; the median of hundreds carries next to none of it.
@@ -141,52 +152,36 @@ class Localizer:
             (3,) in the base frame, m.
 
         Raises:
-            OpenArmError: BAD_IMAGE, when there are too few valid depths, or image and intrinsics disagree.
+            OpenArmError: BAD_IMAGE, when there are too few valid depths.
         """
-        patch = cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band)
-        v, u = np.nonzero(self._on_object(found, patch))
+        v, u = np.nonzero(self._on_object(patch))
         ray = patch.rays[int(np.median(v)), int(np.median(u))]
-        return T_base_camera[:3, 3] + ray * float(np.median(patch.z[v, u]))
+        return patch.T_base_camera[:3, 3] + ray * float(np.median(patch.z[v, u]))
 
-    def locate(
-        self,
-        found: Detection2D,
-        depth: DepthImage,
-        intrinsics: Intrinsics,
-        T_base_camera: Array,
-        robot: Mask | None = None,
-    ) -> Detection3D:
+    def locate(self, patch: Patch) -> Detection3D:
         """The object of a detection.
 
-        Args:
-            found: In the colour image that the depth is aligned with.
-            depth: (h, w) uint16 millimetres or float32 metres, planar.
-            intrinsics: Of the camera, from its CameraInfo.
-            T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image.
-            robot: (h, w) pixels that show the robot or what it holds: no part of the object, but they may hide it.
-
         Raises:
-            OpenArmError: BAD_IMAGE, when the image border cuts the object, depths are missing, or image and intrinsics
-                disagree; NOTHING_DETECTED, when nothing stands above the table there, too much of it is hidden,
-                or most of it is the robot.
+            OpenArmError: BAD_IMAGE, when the image border cuts the object or depths are missing; NOTHING_DETECTED, when
+                nothing stands above the table there, too much of it is hidden, or most of it is the robot.
         """
+        found = patch.found
         if found.truncated:
             raise OpenArmError(
                 Code.BAD_IMAGE,
                 f"{found.label} at pixel {_pixel(found)} is cut by the border of the image; its size is unknown",
             )
-        patch = cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
         if found.label in self._heights and self._valid(patch).sum() < self.config.min_points:
-            return self.locate_on_plane(found, self._heights[found.label], intrinsics, T_base_camera)
-        solid = self._solid(found, patch)
+            return self.locate_on_plane(found, self._heights[found.label], patch.intrinsics, patch.T_base_camera)
+        solid = self._solid(patch)
         top = self._top_height(patch.points[..., 2][solid], patch.band)
         face = self._top_face(patch, top)
-        pixel = float(np.median(patch.z[solid])) / intrinsics.fx
+        pixel = float(np.median(patch.z[solid])) / patch.intrinsics.fx
         # not beside its borders: where depth jumps, a real sensor reports any value between both sides
         flank = solid & (patch.points[..., 2] < top - patch.band)
         sides = patch.points[cv2.erode(flank.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, :2]
         sides = sides[:: max(1, len(sides) // _SIDE_POINTS)]
-        edges, visible = self._edges(patch, face, flank, top, T_base_camera[:3, 3])
+        edges, visible = self._edges(patch, face, flank, top)
         try:
             shape = footprint.fit(np.concatenate([edges, sides]), pixel)
             if shape.rms > self.config.prism_rms:
@@ -196,26 +191,18 @@ class Localizer:
             raise OpenArmError(error.code, f"{where}: {error.message}") from error
         return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
 
-    def enclose(
-        self,
-        found: Detection2D,
-        depth: DepthImage,
-        intrinsics: Intrinsics,
-        T_base_camera: Array,
-        robot: Mask | None = None,
-    ) -> Detection3D:
+    def enclose(self, patch: Patch) -> Detection3D:
         """A box around what is seen of a detection that cannot be measured: in the way at least there. Its score is 0.
 
-        Args and errors as for `locate`; what is hidden or beyond the border of the image is not in the box.
+        Errors as for `locate`; what is hidden or beyond the border of the image is not in the box.
         """
-        patch = cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
-        solid = self._solid(found, patch)
+        solid = self._solid(patch)
         # at its borders a real sensor reports any depth
         inner = cv2.erode(solid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         points = patch.points[inner if inner.any() else solid]
         top = self._top_height(points[:, 2], patch.band)
-        shape = footprint.bound(points[:, :2], 3.0 * float(np.median(patch.z[solid])) / intrinsics.fx)
-        return replace(self._detection(found, shape, top, len(points), 0.0), score=0.0)
+        shape = footprint.bound(points[:, :2], 3.0 * float(np.median(patch.z[solid])) / patch.intrinsics.fx)
+        return replace(self._detection(patch.found, shape, top, len(points), 0.0), score=0.0)
 
     def locate_on_plane(
         self, found: Detection2D, height: float, intrinsics: Intrinsics, T_base_camera: Array
@@ -253,8 +240,8 @@ class Localizer:
     def _valid(patch: Patch) -> Mask:
         return np.asarray(patch.mask & np.isfinite(patch.z))
 
-    def _on_object(self, found: Detection2D, patch: Patch) -> Mask:
-        valid = self._valid(patch)
+    def _on_object(self, patch: Patch) -> Mask:
+        found, valid = patch.found, self._valid(patch)
         count = int(np.count_nonzero(valid))
         if count < self.config.min_points:
             raise OpenArmError(
@@ -265,8 +252,9 @@ class Localizer:
         gate = np.abs(patch.z - np.median(patch.z[valid])) <= self.config.depth_gate
         return valid & gate
 
-    def _solid(self, found: Detection2D, patch: Patch) -> Mask:
+    def _solid(self, patch: Patch) -> Mask:
         """Points of the object above the table."""
+        found = patch.found
         share = float(np.count_nonzero(patch.robot & patch.coloured)) / found.area
         if share > _MOSTLY:
             raise OpenArmError(
@@ -274,7 +262,7 @@ class Localizer:
                 f"{found.label} at pixel {_pixel(found)} is to {share:.0%} the robot or what it holds; it does not"
                 " stand on the table",
             )
-        solid = self._on_object(found, patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
+        solid = self._on_object(patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
         count = int(np.count_nonzero(solid))
         if count < self.config.min_points:
             raise OpenArmError(
@@ -299,12 +287,13 @@ class Localizer:
         count, labels, stats, _ = cv2.connectedComponentsWithStats(level.astype(np.uint8), connectivity=4)
         return labels == 1 + int(np.argmax(stats[1:count, cv2.CC_STAT_AREA]))
 
-    def _edges(self, patch: Patch, face: Mask, flank: Mask, top: float, camera: Array) -> tuple[Array, float]:
+    def _edges(self, patch: Patch, face: Mask, flank: Mask, top: float) -> tuple[Array, float]:
         """Points (n, 2) on the edges of the top, base frame, m, and the share of its outline that is in view.
 
         An edge lies between the face and what is far from it, or what belongs to the `flank`.
         """
         h, w = face.shape
+        camera = patch.T_base_camera[:3, 3]
         found: list[Array] = []
         seen = hidden = 0
         margin = self.config.table_margin

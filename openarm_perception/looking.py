@@ -117,16 +117,26 @@ def make_pipeline(
     localizer: Localizer,
     policy: Policy = "score",
     label: str = "",
+    before: Pipeline | None = None,
 ) -> Pipeline:
     """The pipeline of a kind; the network is read only by those that use it.
+
+    Args:
+        kind: What finds objects.
+        colors: Finds and names colours.
+        network: Which network, and what counts as found.
+        localizer: Finds where objects are.
+        policy: Which comes first.
+        label: Only objects of this name; empty takes all.
+        before: The pipeline that it takes the place of, whose network is not read again where it is the same.
 
     Raises:
         OpenArmError: CONFIG_INVALID or INVALID_ARGUMENT, from the network.
     """
-    if kind == "network":
-        return NetworkPipeline(NetworkDetector(network), colors, localizer, policy, label)
-    if kind == "both":
-        return CheckedPipeline(NetworkDetector(network), colors, localizer, policy, label)
+    if kind in ("network", "both"):
+        loaded = before.network.changed(network) if isinstance(before, NetworkPipeline) else NetworkDetector(network)
+        made = NetworkPipeline if kind == "network" else CheckedPipeline
+        return made(loaded, colors, localizer, policy, label)
     if kind == "anything":
         return ClusterPipeline(colors, localizer, policy, label)
     return Pipeline(colors, localizer, policy, label)

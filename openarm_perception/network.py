@@ -8,6 +8,7 @@ cx, cy, width, height in input pixels and a score per class, 0 to 1. Boxes of th
 from __future__ import annotations
 
 import ast
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -26,6 +27,8 @@ Image = NDArray[np.uint8]
 
 #: Boxes that come this near to the border of the image may be cut by it, pixels.
 _BORDER = 2.0
+#: What the file is read with; the rest of the configuration says what to make of its boxes.
+_OF_THE_FILE = {"model", "names", "width", "height"}
 _LAYOUT = "expected the layout of YOLOv8: input (1, 3, h, w), output (1, 4 + classes, n)"
 
 
@@ -83,6 +86,19 @@ class NetworkDetector:
         self.names = self._find_names(classes)
         self._wanted: frozenset[int] = frozenset()
         self.set_classes(config.classes)
+
+    def changed(self, config: NetworkConfig) -> NetworkDetector:
+        """The same network with other numbers; the file is read only where the configuration asks for another one.
+
+        Raises:
+            OpenArmError: As the constructor; this detector is as it was.
+        """
+        if config.model_dump(include=_OF_THE_FILE) != self.config.model_dump(include=_OF_THE_FILE):
+            return NetworkDetector(config)
+        other = copy.copy(self)
+        other.config = config
+        other.set_classes(config.classes)
+        return other
 
     def set_classes(self, names: Sequence[str]) -> None:
         """Look only for classes of these names from now on; for all when there are none.

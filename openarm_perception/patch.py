@@ -29,6 +29,9 @@ _MARGIN = 4
 class Patch:
     """The surroundings of a detection: pixel rays and points, all (h, w, ...)."""
 
+    found: Detection2D
+    intrinsics: Intrinsics
+    T_base_camera: Array  # (4, 4)
     rays: Array  # directions in the base frame, of unit depth
     z: Array  # planar depth, m, NaN where invalid
     points: Array  # base frame, m
@@ -57,10 +60,11 @@ def cut(
         found: In the colour image that the depth is aligned with.
         depth: (h, w) uint16 millimetres or float32 metres, planar.
         intrinsics: Of both.
-        T_base_camera: (4, 4) optical frame in the base frame.
+        T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image.
         limits: Depths that count.
         top_band: Heights within this of the top are top where the depth is clean, m.
-        robot: (h, w) pixels of the robot; none without it.
+        robot: (h, w) pixels that show the robot or what it holds: no part of the object, but they may hide it; none
+            without it.
 
     Raises:
         OpenArmError: BAD_IMAGE, when image and intrinsics disagree.
@@ -82,7 +86,8 @@ def cut(
     coloured[v - v0 : v - v0 + h, u - u0 : u - u0 + w] = found.mask
     hidden = np.zeros(z.shape, np.bool_) if robot is None else robot[v0:v1, u0:u1]
     band = max(top_band, 3.0 * noise)
-    return Patch(rays, z, rays * z[..., None] + T_base_camera[:3, 3], coloured, hidden, band)
+    points = rays * z[..., None] + T_base_camera[:3, 3]
+    return Patch(found, intrinsics, T_base_camera, rays, z, points, coloured, hidden, band)
 
 
 def _denoise(z: Array) -> tuple[Array, float]:

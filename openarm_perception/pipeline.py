@@ -87,16 +87,18 @@ class Pipeline:
         refused: list[str] = []
         unmeasured: list[Detection3D] = []
         for detection in found:
+            patch = self.localizer.cut(detection, depth, intrinsics, T_base_camera, robot)
             try:
-                located.append(self.localizer.locate(detection, depth, intrinsics, T_base_camera, robot))
+                located.append(self.localizer.locate(patch))
             except OpenArmError as error:
                 refused.append(error.message)
                 with contextlib.suppress(OpenArmError):  # flat on the table, or the robot: it stands in nobody's way
-                    unmeasured.append(self.localizer.enclose(detection, depth, intrinsics, T_base_camera, robot))
+                    unmeasured.append(self.localizer.enclose(patch))
         for doubt in seen.doubts:
             refused.append(doubt.why)
+            patch = self.localizer.cut(doubt.found, depth, intrinsics, T_base_camera, robot)
             with contextlib.suppress(OpenArmError):
-                unmeasured.append(self.localizer.enclose(doubt.found, depth, intrinsics, T_base_camera, robot))
+                unmeasured.append(self.localizer.enclose(patch))
         return Perceived(found, tuple(located), tuple(refused), robot, tuple(unmeasured))
 
     def look(self, view: View) -> Seen:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -94,6 +95,34 @@ def test_b69_the_detector_is_switched_while_it_runs(ros, camera, model, tmp_path
     becomes(bench, ["red", "box"])
     assert change(bench, label="blue")[0].successful
     becomes(bench)
+
+
+def test_only_another_network_is_read_from_its_file(ros, camera, model) -> None:
+    """The file is taken away while the node runs: all else may change; the colour detector forgets the network."""
+    bench = Bench(ros, camera=camera, detector="network", **{"network.model": model})
+    becomes(bench, ["red", "box"])
+    Path(model).unlink()
+    for values in ({"label": "red"}, {"policy": "centre"}, {"network__threshold": 0.4}, {"network__max_overlap": 0.5}):
+        (answer,) = change(bench, **values)
+        assert answer.successful, answer.reason
+    assert change(bench, detector="both")[0].successful
+    becomes(bench, ["red", "box"])
+    assert change(bench, network__threshold=0.9)[0].successful
+    becomes(bench, ["red"])  # colour alone sees it now
+    assert change(bench, detector="color")[0].successful
+    (refused,) = change(bench, detector="network")
+    assert "there is no network" in refused.reason
+
+
+def test_while_colours_stand_in_for_a_network_the_rest_may_change(ros, camera, tmp_path) -> None:
+    path = tmp_path / "damaged.onnx"
+    path.write_bytes(b"no network")
+    bench = Bench(ros, camera=camera, detector="network", **{"network.model": str(path)})
+    assert change(bench, label="blue")[0].successful
+    becomes(bench)
+    bench.said("; by colour instead of network")
+    assert change(bench, label="red")[0].successful
+    becomes(bench, ["red", "box"])
 
 
 def test_n15_a_network_that_cannot_be_used_leaves_the_work_to_the_colours(ros, camera, tmp_path) -> None:

@@ -17,6 +17,7 @@ from openarm_common.resources import config_dir
 from openarm_perception.depth import DepthLimits
 from openarm_perception.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.localize import Localizer, LocalizerConfig
+from openarm_perception.patch import Patch
 
 SHAPES = [
     ("box", (0.04, 0.04, 0.04)),
@@ -45,7 +46,12 @@ def localizer(tabletop) -> Localizer:
 def locate(localizer: Localizer, detector: ColorDetector, view, label: str, depth=None):
     """The object of a label in a view."""
     found = {d.label: d for d in detector.detect(view.rgb)}
-    return localizer.locate(found[label], view.depth if depth is None else depth, view.intrinsics, view.T_base_camera)
+    return localizer.locate(patch_of(localizer, found[label], view, depth))
+
+
+def patch_of(localizer: Localizer, found, view, depth=None) -> Patch:
+    """The surroundings of a detection, with another depth image where one is given."""
+    return localizer.cut(found, view.depth if depth is None else depth, view.intrinsics, view.T_base_camera)
 
 
 def errors(thing, found) -> dict[str, float]:
@@ -150,7 +156,7 @@ def test_a62_the_median_is_at_least_five_times_steadier_than_a_pixel(tabletop, d
     median, single = [], []
     for _ in range(60):
         depth = (view.depth + rng.normal(0.0, 0.003, view.depth.shape)).astype(np.float32)
-        median.append(localizer.coarse(found, depth, view.intrinsics, view.T_base_camera)[2])
+        median.append(localizer.coarse(patch_of(localizer, found, view, depth))[2])
         ray = view.intrinsics.deproject((u, v), depth[v, u])
         single.append((view.T_base_camera[:3, :3] @ ray + view.T_base_camera[:3, 3])[2])
     assert np.std(single) > 5.0 * np.std(median)
@@ -165,7 +171,7 @@ def test_a62_holes_in_the_depth_do_not_count(tabletop, detector, localizer) -> N
     depth[np.random.default_rng(0).random(depth.shape) < 0.3] = 0
     u, v = (round(c) for c in found.centre)
     depth[v - 2 : v + 3, u - 2 : u + 3] = 0
-    point = localizer.coarse(found, depth, view.intrinsics, view.T_base_camera)
+    point = localizer.coarse(patch_of(localizer, found, view, depth))
     assert np.linalg.norm(point[:2] - thing.position[:2]) < 0.02
     assert 0.40 < point[2] < 0.451
 
@@ -176,7 +182,7 @@ def test_a31_the_given_intrinsics_decide(tabletop, detector, localizer) -> None:
     view = tabletop.render([thing])
     (found,) = detector.detect(view.rgb)
     wrong = replace(view.intrinsics, fx=1.1 * view.intrinsics.fx)
-    point = localizer.coarse(found, view.depth, wrong, view.T_base_camera)
+    point = localizer.coarse(localizer.cut(found, view.depth, wrong, view.T_base_camera))
     assert np.linalg.norm(point[:2] - thing.position[:2]) > 0.02
 
 
@@ -196,7 +202,7 @@ def test_b43_the_covariance_says_what_is_not_known(tabletop, detector, localizer
 def refusal(localizer: Localizer, found, view, depth=None) -> OpenArmError:
     """Why an object is not located."""
     with pytest.raises(OpenArmError) as caught:
-        localizer.locate(found, view.depth if depth is None else depth, view.intrinsics, view.T_base_camera)
+        localizer.locate(patch_of(localizer, found, view, depth))
     return caught.value
 
 

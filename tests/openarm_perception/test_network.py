@@ -144,3 +144,19 @@ def test_b28_images_of_another_kind_are_refused(tmp_path) -> None:
         with pytest.raises(OpenArmError, match=r"expected .h, w, 3. of uint8") as caught:
             network.detect(image)
         assert caught.value.code is Code.BAD_IMAGE
+
+
+def test_other_numbers_do_not_read_the_file_again(tmp_path) -> None:
+    """Thresholds and classes hold although the file is gone; another model needs its file, and the old one goes on."""
+    network = make(tmp_path, boxes((10, 20, 40, 60, 0, 0.9), (100, 58, 130, 88, 1, 0.6)))
+    network.path.unlink()
+    strict = network.changed(network.config.model_copy(update={"threshold": 0.7}))
+    balls = network.changed(network.config.model_copy(update={"classes": ("ball",)}))
+    assert [d.label for d in strict.detect(IMAGE)] == ["box"]
+    assert [d.label for d in balls.detect(IMAGE)] == ["ball"]
+    assert sorted(d.label for d in network.detect(IMAGE)) == ["ball", "box"]
+    with pytest.raises(OpenArmError, match="knows no 'pear'; classes: box, ball"):
+        network.changed(network.config.model_copy(update={"classes": ("pear",)}))
+    for read_with in ({"model": str(network.path.with_name("other.onnx"))}, {"width": 320}):
+        with pytest.raises(OpenArmError, match="there is no network"):
+            network.changed(network.config.model_copy(update=read_with))

@@ -57,3 +57,21 @@ def test_what_cannot_be_measured_is_still_in_the_way(tabletop, pipeline) -> None
     assert built_in.score == 0.0
     assert built_in.position[:2] == pytest.approx((0.27, 0.0), abs=0.006)
     assert built_in.size == pytest.approx((0.05, 0.05, 0.05), abs=0.008)
+
+
+def test_each_detection_is_cut_out_of_the_depth_image_once(tabletop, pipeline, monkeypatch) -> None:
+    """Also one that cannot be measured, of which the box around it is taken instead."""
+    things = [
+        tabletop.Thing(c, "box", (0.05, 0.05, 0.05), 0.27, y)
+        for c, y in (("red", -0.05), ("blue", 0.0), ("green", 0.05))
+    ]
+    cut, labels = pipeline.localizer.cut, []
+
+    def counted(found, *args):
+        labels.append(found.label)
+        return cut(found, *args)
+
+    monkeypatch.setattr(pipeline.localizer, "cut", counted)
+    perceived = run(pipeline, tabletop.render(things))
+    assert perceived.unmeasured
+    assert sorted(labels) == ["blue", "green", "red"]

@@ -16,7 +16,7 @@ from openarm_common.resources import config_dir
 from openarm_perception import plane
 from openarm_perception.depth import DepthLimits
 from openarm_perception.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.localize import Localizer, LocalizerConfig
+from openarm_perception.localize import Detection3D, Localizer, LocalizerConfig
 
 K = Intrinsics.from_fovy(640, 480, 60.0)
 FLAT = (0.0, 0.0, 1.0)
@@ -59,6 +59,11 @@ def blind(tabletop, height: float) -> Localizer:
     return Localizer(LocalizerConfig(heights=(f"red={height}",)), DepthLimits(near=0.07), tabletop.table_height)
 
 
+def without_depth(localizer: Localizer, found, seen) -> Detection3D:
+    """The object of a detection in a view whose depth image is empty."""
+    return localizer.locate(localizer.cut(found, np.zeros_like(seen.depth), seen.intrinsics, seen.T_base_camera))
+
+
 VIEWS = {  # position, target, right: from straight above to 30 degrees over the table, and rolled
     "above": ((0.30, 0.0, 1.0), (0.3001, 0.0, 0.4), (0.0, 1.0, 0.0)),
     "tilted": ((0.80, 0.1, 1.0), (0.3, 0.0, 0.42), (0.0, 1.0, 0.0)),
@@ -80,9 +85,7 @@ def test_b21_b31_b63_objects_of_known_height_are_within_five_millimetres_without
             thing = tabletop.Thing("red", kind, size, x, y, yaw)
             seen = tabletop.render([thing], T)
             (found,) = detector.detect(seen.rgb)
-            place = blind(tabletop, size[2]).locate(
-                found, np.zeros_like(seen.depth), seen.intrinsics, seen.T_base_camera
-            )
+            place = without_depth(blind(tabletop, size[2]), found, seen)
             assert not place.measured
             assert np.linalg.norm(place.position - thing.position) <= 0.005, (thing, place.position)
             assert np.abs(np.array(place.size) - (min(size[:2]), max(size[:2]), size[2])).max() <= 0.006
@@ -99,7 +102,7 @@ def test_b63_a_wrong_height_stays_within_the_stated_uncertainty(tabletop, detect
     (found,) = detector.detect(seen.rgb)
     config = LocalizerConfig(heights=("red=0.055",), height_std=0.005)
     localizer = Localizer(config, DepthLimits(near=0.07), tabletop.table_height)
-    place = localizer.locate(found, np.zeros_like(seen.depth), seen.intrinsics, seen.T_base_camera)
+    place = without_depth(localizer, found, seen)
     error = np.linalg.norm((place.position - thing.position)[:2])
     assert 0.0005 < error < 3.0 * np.sqrt(place.covariance[0, 0] + place.covariance[1, 1])
 
@@ -109,7 +112,7 @@ def test_without_depth_what_has_no_known_height_is_refused_as_before(tabletop, d
     seen = tabletop.render([thing])
     (found,) = detector.detect(seen.rgb)
     with pytest.raises(OpenArmError, match="pixels with a depth of"):
-        blind(tabletop, 0.05).locate(found, np.zeros_like(seen.depth), seen.intrinsics, seen.T_base_camera)
+        without_depth(blind(tabletop, 0.05), found, seen)
 
 
 @pytest.mark.parametrize("wrong", ["red", "red=tall", "red=3"])
