@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+import yaml
 
 from openarm_common.errors import Code, OpenArmError
 
@@ -128,3 +129,37 @@ def _limits(integer: re.Match[str]) -> tuple[int, int]:
 
 def _wrong(where: str, value: Any, expected: str) -> OpenArmError:
     return OpenArmError(Code.INVALID_ARGUMENT, f"{where} is {value!r}; expected {expected}")
+
+
+def fields_of(words: tuple[str, ...], name: str, kind: str) -> Any:
+    """Return what to fill in: YAML, after the type or without it.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for another type, for two mappings, or what is not YAML.
+    """
+    asked, fields = type_and_fields(words)
+    if asked and asked != kind:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{name} has the type {kind}, not {asked}")
+    return fields
+
+
+def type_and_fields(words: tuple[str, ...]) -> tuple[str, Any]:
+    """Split `TYPE FIELDS`, as ros2 takes them; each may be missing.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for two mappings, or what is not YAML.
+    """
+    asked = words[0] if words and re.fullmatch(r"\w+/\w+/\w+", words[0]) else ""
+    rest = words[1:] if asked else words
+    if len(rest) > 1:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, f"expected one YAML mapping, got {' '.join(rest)!r}; put it in quotes"
+        )
+    return asked, _parse(rest[0] if rest else "{}")
+
+
+def _parse(text: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{text!r} is not YAML: {error}") from error

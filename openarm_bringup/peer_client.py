@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -132,18 +132,47 @@ class Peer:
         """
         return ParametersOf(self, find("node", node, dict.fromkeys(self.nodes(), ""))[0])
 
-    def frames(self, seconds: float) -> dict[str, tuple[str, NDArray[np.float64], bool]]:
-        """Parent, pose in it and whether it is fixed, of each frame on /tf and /tf_static."""
-        edges: dict[str, tuple[str, NDArray[np.float64], bool]] = {}
+    def frames(self, seconds: float) -> Frames:
+        """What is told on /tf and /tf_static within a time."""
+        frames = Frames()
+        for topic, static, qos in (("/tf_static", True, QOS_STATIC_TF), ("/tf", False, QOS_TF)):
 
-        def add(message: TFMessage, static: bool) -> None:
-            for edge in message.transforms:
-                edges[edge.child_frame_id] = (edge.header.frame_id, transform_to_matrix(edge.transform), static)
+            def add(message: TFMessage, info: Mapping[str, Any], static: bool = static) -> None:
+                frames.add(message, info["publication_sequence_number"], static)
 
-        self.node.create_subscription(TFMessage, "/tf_static", lambda message: add(message, True), QOS_STATIC_TF)
-        self.node.create_subscription(TFMessage, "/tf", lambda message: add(message, False), QOS_TF)
+            self.node.create_subscription(TFMessage, topic, add, qos)
         self.spin_until(lambda: False, seconds)
-        return edges
+        return frames
+
+
+class Frames:
+    """The tree of frames as it is heard.
+
+    Attributes:
+        edges: Parent, pose in it and whether it is fixed, of each frame.
+        clashes: What is wrong with a frame that more than one tells of, by its name.
+    """
+
+    def __init__(self) -> None:
+        self.edges: dict[str, tuple[str, NDArray[np.float64], bool]] = {}
+        self.clashes: dict[str, str] = {}
+        self._last: dict[str, int] = {}
+
+    def add(self, message: TFMessage, number: int, static: bool) -> None:
+        """Take a message; `number` counts those of its publisher, so a frame that two tell of goes back in it."""
+        for edge in message.transforms:
+            name, parent = edge.child_frame_id, edge.header.frame_id
+            T = transform_to_matrix(edge.transform)
+            if name in self.edges:
+                before, T_before, was_static = self.edges[name]
+                if before != parent:
+                    self.clashes[name] = f"hangs below {before} and below {parent}"
+                elif was_static != static:
+                    self.clashes[name] = "is told on /tf and on /tf_static"
+                elif number <= self._last[name] and (not static or not np.array_equal(T, T_before)):
+                    self.clashes[name] = f"is told by two on {'/tf_static' if static else '/tf'}"
+            self.edges[name] = (parent, T, static)
+            self._last[name] = number
 
 
 class ParametersOf:

@@ -149,8 +149,7 @@ def hz(name: str, *, seconds: float = 5.0, domain: int | None = None) -> Outcome
 @topic.command
 def pub(
     name: str,
-    message: str = "{}",
-    *,
+    *message: str,
     type_: Annotated[str, Parameter(name="--type")] = "",
     rate: float = 0.0,
     count: Annotated[int, Parameter(name=["--count", "-n"])] = 1,
@@ -160,22 +159,25 @@ def pub(
 
     Args:
         name: Of the topic.
-        message: Its fields, such as "{name: [a], position: [0.1]}"; what is left out keeps its default.
+        message: Its fields, such as "{name: [a], position: [0.1]}"; what is left out keeps its default. As with ros2,
+            the type may stand before it.
         type_: Of the message, where nobody else has the topic.
         rate: Hz, with more than one.
         count: How many.
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.message_client import fill, interface
+    from openarm_bringup.message_client import fill, interface, type_and_fields
     from openarm_bringup.peer_client import Peer, find
     from openarm_common.node import QOS_COMMAND
 
     with Peer() as peer:
-        found, kind = (
-            (name if name.startswith("/") else f"/{name}", type_) if type_ else find("topic", name, peer.topics())
-        )
-        filled = fill(interface(kind)(), _parse(message))
+        asked, fields = type_and_fields(message)
+        if asked or type_:
+            found, kind = name if name.startswith("/") else f"/{name}", asked or type_
+        else:
+            found, kind = find("topic", name, peer.topics())
+        filled = fill(interface(kind)(), fields)
         publisher = peer.node.create_publisher(interface(kind), found, QOS_COMMAND)
         heard = peer.spin_until(publisher.get_subscription_count, 2.0)
         peer.spin_until(lambda: False, _SETTLE_S if heard else 0.0)
@@ -206,22 +208,22 @@ def service_list(
 
 
 @service.command
-def call(name: str, request: str = "{}", *, timeout: float = 30.0, domain: int | None = None) -> Outcome:
+def call(name: str, *request: str, timeout: float = 30.0, domain: int | None = None) -> Outcome:
     """Call a service; the request and the answer are YAML. The exit code follows the answer's `success`, if it has one.
 
     Args:
         name: Of the service.
-        request: Its fields, such as "{label: red}".
+        request: Its fields, such as "{label: red}"; as with ros2, the type may stand before it.
         timeout: Longest wait for the answer, s.
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.message_client import fill, interface, to_data
+    from openarm_bringup.message_client import fields_of, fill, interface, to_data
     from openarm_bringup.peer_client import Peer, find
 
     with Peer() as peer:
         found, kind = find("service", name, peer.services())
-        filled = fill(interface(kind).Request(), _parse(request))
+        filled = fill(interface(kind).Request(), fields_of(request, found, kind))
         client = peer.node.create_client(interface(kind), found)
         if not peer.spin_until(client.service_is_ready, 5.0):
             raise OpenArmError(Code.NOT_READY, f"{found} does not answer")
@@ -243,11 +245,10 @@ def action_list(*, domain: int | None = None) -> Outcome:
         return _listing(peer.actions(), "actions")
 
 
-@action.command
+@action.command(name=["send", "send_goal"])
 def send(
     name: str,
-    goal: str = "{}",
-    *,
+    *goal: str,
     feedback: Annotated[bool, Parameter(negative=())] = False,
     timeout: float = 300.0,
     domain: int | None = None,
@@ -256,13 +257,13 @@ def send(
 
     Args:
         name: Of the action.
-        goal: Its fields as YAML.
+        goal: Its fields as YAML; as with ros2, the type may stand before it.
         feedback: Print the feedback.
         timeout: Longest wait for the result, s.
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.message_client import fill, interface, to_data
+    from openarm_bringup.message_client import fields_of, fill, interface, to_data
     from openarm_bringup.peer_client import Peer, find
 
     def tell(message: Any) -> None:
@@ -272,7 +273,7 @@ def send(
 
     with Peer() as peer:
         found, kind = find("action", name, peer.actions())
-        filled = fill(interface(kind).Goal(), _parse(goal))
+        filled = fill(interface(kind).Goal(), fields_of(goal, found, kind))
         client = peer.action_client(interface(kind), found)
         handle = peer.result(client.send_goal_async(filled, feedback_callback=tell), 10.0, found)
         if not handle.accepted:
@@ -338,10 +339,3 @@ def _answered(answer: dict[str, Any], data: dict[str, Any]) -> Outcome:
             False, str(answer.get("message", "")), answer.get("code") or Code.INTERNAL, {**data, "answer": answer}, text
         )
     return Outcome(True, data={**data, "answer": answer}, text=text)
-
-
-def _parse(text: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{text!r} is not YAML: {error}") from error

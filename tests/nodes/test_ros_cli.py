@@ -86,7 +86,7 @@ def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsy
     while len(heard) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)  # the node takes them in a thread of its own
     assert heard == ["hello", "hello"]
-    alone = ros2.pub("/nobody", type_="std_msgs/msg/String")
+    alone = ros2.pub("/nobody", "std_msgs/msg/String")
     assert (alone.success, alone.code) == (False, Code.NOT_READY)
 
 
@@ -99,6 +99,11 @@ def test_services_and_actions_are_called_and_the_exit_code_follows_the_answer(he
     assert (refused.exit_code, refused.message) == (1, "only true is taken")
     assert ros2.action_list().data["actions"]["/pick"] == "openarm_interfaces/action/Pick"
     assert ros2.send("/pick", "{label: red}").data["answer"]["label"] == "red"
+    assert ros2.call("/pause", "openarm_interfaces/srv/SetPause", "{paused: true}").success, "as ros2 is called"
+    with pytest.raises(OpenArmError, match="/pause has the type openarm_interfaces/srv/SetPause, not std_srvs"):
+        ros2.call("/pause", "std_srvs/srv/Empty")
+    with pytest.raises(OpenArmError, match=r"expected one YAML mapping, got '\{paused: true\}'"):
+        ros2.call("/pause", "{paused:", "true}")
 
 
 def test_mistakes_are_met_with_what_was_perhaps_meant(heard: list[str]) -> None:
@@ -138,5 +143,15 @@ def test_b35_the_tree_of_frames_is_shown_and_drawn(heard: list[str], tmp_path: P
     assert tree.text.splitlines() == ["world", "  base", "    camera"]
     assert cv2.imread(str(out)).shape[0] > 60
     assert tf.echo("world", "camera").data["position"] == [1.5, 0.0, 0.0]
-    with pytest.raises(OpenArmError, match=r"ends in \.png"):
-        tf.tree(out=tmp_path / "tree.pdf")
+    with pytest.raises(OpenArmError, match=r"ends in \.png, \.svg or \.pdf"):
+        tf.tree(out=tmp_path / "tree.jpg")
+
+
+def test_a_frame_that_two_tell_of_is_named(ros, heard: list[str]) -> None:
+    second = ros.node.create_publisher(TFMessage, "/tf_static", QOS_STATIC_TF)
+    edge = TransformStamped(child_frame_id="camera")
+    edge.header.frame_id = "world"
+    second.publish(TFMessage(transforms=[edge]))
+    tree = tf.tree()
+    assert (tree.success, list(tree.data["clashes"])) == (False, ["camera"])
+    assert "camera hangs below" in tree.message
