@@ -34,6 +34,21 @@ def test_what_is_written_is_read_in_order(tmp_path: Path) -> None:
         assert next(bag.records(start_s=0.4)).t_ns == 1_400_000_000
 
 
+def test_who_is_behind_writes_plain_chunks_and_packs_again_later(tmp_path: Path) -> None:
+    sizes: list[int] = []
+    with BagWriter(tmp_path / "bag", {}) as bag:
+        bag.add_topic("/chatter", "std_msgs/msg/String", from_profile(QOS_COMMAND))
+        for t_ns, behind in enumerate((False, True, False)):
+            bag.hasten(behind)
+            bag.write("/chatter", t_ns, serialize_message(String(data=f"{t_ns}" * 2_000_000)))
+            sizes.append((tmp_path / "bag" / "bag.mcap").stat().st_size)
+    packed, plain, again = sizes[0], sizes[1] - sizes[0], sizes[2] - sizes[1]
+    assert packed < 50_000 > again
+    assert plain > 1_900_000
+    with open_bag(tmp_path / "bag") as bag:
+        assert [deserialize_message(r.data, String).data[0] for r in bag.records()] == ["0", "1", "2"]
+
+
 @pytest.mark.parametrize("lost", [1, 30, 700_000])
 def test_a_recording_that_was_cut_short_keeps_what_is_whole(tmp_path: Path, lost: int) -> None:
     """As SIGKILL or a full disk leave it: no end, no metadata."""
