@@ -8,6 +8,7 @@ cores that the nodes run.
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import cv2
@@ -37,6 +38,8 @@ from openarm_perception.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.localize import Detection3D, Localizer, LocalizerConfig
 from openarm_perception.pipeline import Pipeline
 
+#: A board is looked for twice a second in each camera: it is held still for as long, and the search takes longest.
+_BOARD_PERIOD_NS = 500_000_000
 _STREAMS = ("color/image_raw", "depth/image_raw", "depth/camera_info")
 
 
@@ -61,13 +64,20 @@ class _Found:
     boards: dict[str, list[float]] = field(default_factory=lambda: defaultdict[str, list[float]](list))
 
 
-def numbers_of(bag: Bag, *, scene: str = "demo", board: Board | None = None) -> dict[str, float]:
+def numbers_of(
+    bag: Bag,
+    *,
+    scene: str = "demo",
+    board: Board | None = None,
+    tell: Callable[[int, int], None] = lambda done, of: None,
+) -> dict[str, float]:
     """Run detection, localisation, map and board detection on a bag.
 
     Args:
         bag: Open; with colour and depth of a camera of the suite, /joint_states and /tf_static.
         scene: Whose table the objects stand on.
         board: Which calibration board to look for; None is that of the suite.
+        tell: Called with the number of frames done, and of all.
 
     Returns:
         By name: frames used and skipped, of each label how often it was found, where last (base frame), how far from
@@ -82,14 +92,19 @@ def numbers_of(bag: Bag, *, scene: str = "demo", board: Board | None = None) -> 
     table = load_scene(scene).table.top_z
     mapper = Mapper(description, GridConfig(), FilterConfig(), FieldConfig())
     found = _Found()
-    for shot in shots:
+    looked_ns: dict[str, int] = {}
+    for number, shot in enumerate(shots):
+        tell(number, len(shots))
         limits = DepthLimits(near=shot.camera.near, far=shot.camera.far)
         pipeline = Pipeline(detector, Localizer(LocalizerConfig(), limits, table))
         try:
             _work(shot, states, pipeline, mapper, found)
         except OpenArmError:
             found.skipped += 1
-        _look_for(board or CircleGrid(), shot, found)
+        if shot.t_ns - looked_ns.get(shot.camera.name, shot.t_ns - _BOARD_PERIOD_NS) >= _BOARD_PERIOD_NS:
+            looked_ns[shot.camera.name] = shot.t_ns
+            _look_for(board or CircleGrid(), shot, found)
+    tell(len(shots), len(shots))
     if not found.frames:
         raise OpenArmError(
             Code.NOTHING_DETECTED,

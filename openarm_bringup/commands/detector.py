@@ -180,14 +180,11 @@ def _told(page: Path, results: dict[str, Evaluation], extra: dict[str, Any], acc
 
 @contextmanager
 def _progress(bars: dict[str, int]) -> Iterator[Callable[[str], None]]:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from openarm_bringup.progress import progress
 
-    console = Console(stderr=True, highlight=False)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        tasks = {name: progress.add_task(name, total=count) for name, count in bars.items()}
-        yield lambda name: progress.advance(tasks[name])
+    with progress() as shown:
+        tasks = {name: shown.add_task(name, total=count) for name, count in bars.items()}
+        yield lambda name: shown.advance(tasks[name])
 
 
 def _print_row(row: dict[str, float]) -> None:

@@ -165,11 +165,13 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
     from openarm_bringup.bags import golden as stored
     from openarm_bringup.bags.bag import open_bag
     from openarm_bringup.bags.bag_client import numbers_of
+    from openarm_bringup.progress import progress
 
     path = golden or (bag if bag.is_dir() else bag.parent) / "golden.json"
     expected = {} if update and not path.exists() else stored.read(path)
-    with open_bag(bag) as opened:
-        numbers = numbers_of(opened, scene=scene)
+    with open_bag(bag) as opened, progress() as shown:
+        task = shown.add_task("frames", total=None)
+        numbers = numbers_of(opened, scene=scene, tell=lambda done, of: shown.update(task, completed=done, total=of))
     data: dict[str, Any] = {"bag": str(bag), "golden": str(path), "numbers": numbers}
     if update:
         stored.write(path, numbers, expected)
