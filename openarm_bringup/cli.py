@@ -10,11 +10,11 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cyclopts
-from cyclopts import App, Parameter
+from cyclopts import App, Group, Parameter
 
 from openarm_bringup.outcome import FOR_PEOPLE, Outcome, failure
 from openarm_bringup.supervision import runs
@@ -59,28 +59,26 @@ def build_app() -> App:
         version=_version,
         default_parameter=Parameter(negative_iterable=()),
     )
-    app.command(up.up)
-    app.command(view.view)
-    app.command(pick.pick)
-    app.command(order.order)
-    app.command(demo.demo)
-    app.command(record.record)
-    app.command(record.replay)
-    app.command(record.check)
-    app.command(campaign.campaign)
-    app.command(checks.test)
-    app.command(checks.lint)
-    app.command(doctor.doctor)
-    app.command(processes.ps)
-    app.command(processes.logs)
-    app.command(model.model)
-    app.command(graph.app)
-    for group in (ros2.topic, ros2.service, ros2.action, ros2.node, param.app, tf.app):
-        app.command(group)
-    app.command(grasp.app)
-    app.command(calibrate.app)
-    app.command(completion.completion_of(app))
-    app.command(detector.app)
+    groups: dict[str, tuple[App | Callable[..., Outcome], ...]] = {
+        "Run": (demo.demo, up.up, view.view, calibrate.app),
+        "Ask for grasps": (pick.pick, order.order, campaign.campaign),
+        "Look inside": (processes.ps, processes.logs, doctor.doctor, tf.app),
+        "Messages": (ros2.topic, ros2.service, ros2.action, ros2.node, param.app),
+        "Record and check": (record.record, record.replay, record.check),
+        "Models and graphs": (model.model, graph.app, grasp.app, detector.app),
+        "Develop": (checks.test, checks.lint, completion.completion_of(app)),
+    }
+    for number, (title, commands) in enumerate(groups.items()):
+        group = Group(title, sort_key=number)
+        for command in commands:
+            if isinstance(command, App):
+                command.group = group
+                app.command(command)
+            else:
+                app.command(command, group=group)
+    options = Group("Options", sort_key=len(groups))
+    for flag in ("--help", "--version"):
+        app[flag].group = options
     return app
 
 

@@ -88,12 +88,14 @@ def gather(graph: str) -> list[Finding]:
 def _table(findings: list[Finding]) -> str:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(box=None, pad_edge=False)
-    for title in ("", "what", "found", "what to do"):
-        table.add_column(title, overflow="fold")
+    table = Table(box=None, pad_edge=False, show_header=False)
+    for wrap in (False, False, True):
+        table.add_column(no_wrap=not wrap, overflow="fold")
     for finding in findings:
-        table.add_row(MARKS[finding.level], finding.name, finding.seen, finding.advice)
+        advice = f"\n→ {finding.advice}" if finding.advice else ""
+        table.add_row(MARKS[finding.level], finding.name, Text(finding.seen + advice))
     console = Console(highlight=False)
     with console.capture() as capture:
         console.print(table)

@@ -73,7 +73,7 @@ async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
         line = event.detail.partition("\n")[0]
         console.print(f"[dim]{event.seconds:6.1f} s[/dim]  {event.node:<22} ", end="")
         console.print(f"{event.state:<9}", style=style, end=" ")
-        console.print(line, markup=False)
+        console.print(line, markup=False, soft_wrap=True)
 
     data: dict[str, Any] = {"graph": graph.name, "run_dir": str(run_dir), "domain": domain_id(graph)}
     try:
@@ -82,7 +82,8 @@ async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
             data["ready_s"] = round(time.monotonic() - began, 2)
             console.print(
                 f"[bold green]{graph.name} is ready[/bold green] after {data['ready_s']:.1f} s: "
-                f"domain {data['domain']}, logs in {run_dir / 'logs'}; Ctrl-C stops it"
+                f"domain {data['domain']}, logs in {run_dir / 'logs'}; Ctrl-C stops it",
+                soft_wrap=True,
             )
             if viz_address:
                 text = f"Foxglove: open the connection {viz_address}\n  or {app_link(viz_address)}"
