@@ -10,12 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
 from openarm_bringup.campaign.campaign import Campaign, keep_row, read_rows, write_reports
+from openarm_bringup.campaign.gap import least_gap
 from openarm_bringup.campaign.options import CampaignOptions, Row
 from openarm_bringup.campaign.sets import make_task
 from openarm_bringup.campaign.tasks import Task
-from openarm_bringup.campaign.trial import crashed_row, row_of
-from openarm_bringup.judging.trial import Ask, run_trial
+from openarm_bringup.campaign.trial import add_gap, crashed_row, row_of
+from openarm_bringup.judging.trial import Ask, run_pair, run_trial
 from openarm_bringup.supervision import environment
 from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import in_thread, running_graph
@@ -26,8 +29,8 @@ if TYPE_CHECKING:
     from openarm_bringup.judging.observer_client import Observer
     from openarm_grasp.client import GraspClient
 
-#: Sets whose scenes are random scenes, which the bridge draws from the seed by itself.
-GRAPH_SETS = ("nominal",)
+#: Sets without faults on purpose, and in which what is asked for does not depend on what became of it before.
+GRAPH_SETS = ("nominal", "handover", "push", "pairs", "pairs_in_turn")
 
 
 def run_graph_campaign(
@@ -84,7 +87,8 @@ async def _run(campaign: Campaign, tasks: list[Task], on_row: Callable[[Row], No
 
             def work() -> None:
                 for task in tasks:
-                    row = {**_row(observer, client, task), "again": f"{options.command(task.seed)} --graph"}
+                    row = _row(observer, client, task, campaign.folder / "scenes")
+                    row["again"] = f"{options.command(task.seed)} --graph"
                     keep_row(campaign, row)
                     on_row(row)
 
@@ -102,16 +106,25 @@ async def _run(campaign: Campaign, tasks: list[Task], on_row: Callable[[Row], No
                 stop.cancel()
 
 
-def _row(observer: Observer, client: GraspClient, task: Task) -> Row:
+def _row(observer: Observer, client: GraspClient, task: Task, scenes: Path) -> Row:
     began = time.monotonic()
+    scenes.mkdir(exist_ok=True)
+    file = scenes / f"{task.scene.name}.yaml"
+    file.write_text(yaml.safe_dump(task.scene.model_dump(mode="json"), sort_keys=False), encoding="utf-8")
     try:
-        after_ns = observer.reset_world("random", task.seed)
-        trials = [
-            run_trial(
-                observer, client, task.scene, Ask(label, task.arm), seed=task.seed, after_ns=after_ns, moved=k > 0
-            )
-            for k, label in enumerate(task.labels)
-        ]
+        after_ns = observer.reset_world(str(file), task.seed)
+        if task.together:
+            trials = run_pair(observer, client, task.scene, task.labels, seed=task.seed, after_ns=after_ns)
+        else:
+            asks = [Ask(label, task.arm, task.place) for label in task.labels]
+            trials = [
+                run_trial(observer, client, task.scene, ask, seed=task.seed, after_ns=after_ns, moved=k > 0)
+                for k, ask in enumerate(asks)
+            ]
     except OpenArmError as error:
         return crashed_row(task, error)
-    return row_of(task, trials, time.monotonic() - began)
+    row = row_of(task, trials, time.monotonic() - began)
+    if task.together:
+        states, steps = observer.joints(), observer.steps()
+        add_gap(row, least_gap(states), (steps[-1].t_ns - steps[0].t_ns) * 1e-9)
+    return row

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_bringup.campaign import record
-from openarm_bringup.campaign.gap import LEAST_GAP, ArmGap
+from openarm_bringup.campaign.gap import LEAST_GAP, watch_gap
 from openarm_bringup.campaign.link import DirectLink
 from openarm_bringup.campaign.robot import SimRobot, SimulatedSenses
 from openarm_bringup.campaign.tasks import MISSES, PLAN_FAILS, Task
@@ -97,15 +97,13 @@ class Trials:
         began = time.monotonic()
         self.robot.pass_time(_SETTLE_S)
         self._begin_fault("")
-        gap = ArmGap(self.robot) if self._task.set_name.startswith("pairs") else None
+        gap = watch_gap(self.robot) if self._task.set_name.startswith("pairs") else None
         began_ns = self.robot.t_ns
         trials = self._both() if self._task.together else self._all_in_turn()
         row = row_of(self._task, trials, time.monotonic() - began)
         row["again"] = self._again
         if gap is not None:
-            row["arm_gap_mm"] = round(1e3 * gap.least, 1)
-            row["as_expected"] = bool(row["as_expected"] and gap.least >= LEAST_GAP)
-            row["sim_s"] = round((self.robot.t_ns - began_ns) * 1e-9, 2)
+            add_gap(row, gap.least, (self.robot.t_ns - began_ns) * 1e-9)
         row["planning_ms_median"] = round(1e3 * float(np.median(self.link.planning_s or [math.nan])), 1)
         if self._keep is not None and not row["as_expected"]:
             self._keep.write(row, [step.__dict__ for step in self.steps])
@@ -296,6 +294,13 @@ def row_of(task: Task, trials: list[Trial], wall_s: float) -> dict[str, Any]:
         "wall_s": round(wall_s, 2),
         "grasps": grasps,
     }
+
+
+def add_gap(row: dict[str, Any], least: float, sim_s: float) -> None:
+    """Say how near the arms came to each other, m, and how long both objects took together, s."""
+    row["arm_gap_mm"] = round(1e3 * least, 1)
+    row["as_expected"] = bool(row["as_expected"] and least >= LEAST_GAP)
+    row["sim_s"] = round(sim_s, 2)
 
 
 def crashed_row(task: Task, error: Exception) -> dict[str, Any]:

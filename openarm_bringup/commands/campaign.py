@@ -38,7 +38,7 @@ def campaign(
 
     Args:
         seeds: Such as 0-99 or 1,4,7-9.
-        set_: nominal, clutter, faults, endurance.
+        set_: nominal, clutter, faults, endurance, handover, push, pairs or pairs_in_turn.
         workers: Processes.
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.

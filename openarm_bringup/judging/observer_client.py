@@ -23,7 +23,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import Image, JointState
 
 from openarm_bringup.judging.film import Picture
 from openarm_bringup.judging.judge import Sample
@@ -79,6 +79,8 @@ class Observer:
         self._truth: Truth | None = None
         self._tracks: dict[str, list[Sample]] = {}
         self._steps: list[Step] = []
+        self._joints: list[tuple[int, dict[str, float]]] = []
+        self._joint_states: Subscription | None = None
         self._cameras: dict[str, Subscription] = {}
         self._frames: dict[str, Frame] = {}
         self._node.create_subscription(ObjectStateArray, "/sim/ground_truth/objects", self._on_truth, _RELIABLE)
@@ -125,11 +127,18 @@ class Observer:
         """Return the samples of an object since `forget`."""
         return list(self._tracks.get(name, []))
 
+    def joints(self) -> list[tuple[int, dict[str, float]]]:
+        """Return the joint states since `forget`: simulated time in ns, position by name; the first call begins."""
+        if self._joint_states is None:
+            self._joint_states = self._node.create_subscription(JointState, "/joint_states", self._on_joints, _RELIABLE)
+        return list(self._joints)
+
     def forget(self) -> None:
         """Begin new tracks and a new list of states."""
         with self._changed:
             self._tracks.clear()
             self._steps.clear()
+            self._joints.clear()
 
     def look(self, topic: str, on_frame: Callable[[int, Picture], None] | None = None) -> None:
         """Begin to receive a colour image topic; its newest frame is kept, `on_frame` gets every one."""
@@ -186,6 +195,13 @@ class Observer:
             self._truth = Truth(t_ns, samples, {state.name: state.label for state in message.objects})
             for name, sample in samples.items():
                 self._tracks.setdefault(name, []).append(sample)
+            self._changed.notify_all()
+
+    def _on_joints(self, message: JointState) -> None:
+        with self._changed:
+            self._joints.append(
+                (stamp_to_ns(message.header.stamp), dict(zip(message.name, message.position, strict=True)))
+            )
             self._changed.notify_all()
 
     def _on_status(self, message: GraspStatus) -> None:

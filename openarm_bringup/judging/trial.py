@@ -195,7 +195,7 @@ def run_trial(
     if before is not None:
         before()
     observer.forget()
-    observer.wait(lambda: observer.track(item.name) or None, SETTLE_TIMEOUT_S, f"ground truth of {item.name}")
+    _wait_track(observer, item.name)
     began = time.monotonic()
     result: GraspResult | OpenArmError
     try:
@@ -203,12 +203,70 @@ def run_trial(
     except OpenArmError as error:
         result = error
     wall_s = time.monotonic() - began
-    target_xy = _target(result, ask)
     _wait_rest(observer, item.name, rules)
     _wait_idle(observer)
-    claimed = not isinstance(result, OpenArmError) and result.success
-    verdict = judge(observer.track(item.name), target_xy, claimed=claimed, config=rules)
+    return _judged(observer, scene, item, result, ask, observer.steps(), wall_s, seed, rules)
+
+
+def run_pair(
+    observer: Observer,
+    client: GraspClient,
+    scene: Scene,
+    labels: Sequence[str],
+    *,
+    seed: int | None = None,
+    after_ns: int = 0,
+    rules: JudgeConfig | None = None,
+) -> list[Trial]:
+    """As `run_trial`, for two objects that are asked for at once; joint states are kept by the observer meanwhile."""
+    rules = rules or JudgeConfig()
+    first, second = items = [choose_target(scene, label) for label in labels]
+    wait_scene(observer, scene, after_ns, rules)
+    observer.forget()
+    observer.wait(lambda: observer.joints() or None, SETTLE_TIMEOUT_S, "/joint_states")
+    for item in items:
+        _wait_track(observer, item.name)
+    began = time.monotonic()
+    results: Sequence[GraspResult | OpenArmError]
+    try:
+        both = client.pick_two(first.label, second.label)
+        results = both.answers or 2 * [OpenArmError(both.code, both.message)]
+    except OpenArmError as error:
+        results = 2 * [error]
+    wall_s = 0.5 * (time.monotonic() - began)
+    for item in items:
+        _wait_rest(observer, item.name, rules)
+    _wait_idle(observer)
     steps = observer.steps()
+    return [
+        _judged(
+            observer,
+            scene,
+            item,
+            result,
+            Ask(item.label),
+            [step for step in steps if step.label == item.label],
+            wall_s,
+            seed,
+            rules,
+        )
+        for item, result in zip(items, results, strict=True)
+    ]
+
+
+def _judged(
+    observer: Observer,
+    scene: Scene,
+    item: SceneObject,
+    result: GraspResult | OpenArmError,
+    ask: Ask,
+    steps: Sequence[Step],
+    wall_s: float,
+    seed: int | None,
+    rules: JudgeConfig,
+) -> Trial:
+    claimed = not isinstance(result, OpenArmError) and result.success
+    verdict = judge(observer.track(item.name), _target(result, ask), claimed=claimed, config=rules)
     return Trial(
         seed=seed,
         scene=scene.name,
@@ -224,6 +282,7 @@ def run_trial(
         states=durations(steps),
         sim_s=(steps[-1].t_ns - steps[0].t_ns) * 1e-9 if steps else 0.0,
         wall_s=wall_s,
+        route="" if isinstance(result, OpenArmError) else result.route,
     )
 
 
@@ -234,6 +293,10 @@ def _target(result: GraspResult | OpenArmError, ask: Ask) -> tuple[float, float]
     if isinstance(result, OpenArmError) or not any(result.place_position):
         return (math.nan, math.nan)
     return (result.place_position[0], result.place_position[1])
+
+
+def _wait_track(observer: Observer, name: str) -> None:
+    observer.wait(lambda: observer.track(name) or None, SETTLE_TIMEOUT_S, f"ground truth of {name}")
 
 
 def _wait_idle(observer: Observer) -> None:

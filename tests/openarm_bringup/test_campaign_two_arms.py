@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from openarm_bringup.campaign.gap import LEAST_GAP, ArmGap
+from openarm_bringup.campaign.gap import LEAST_GAP, Gap, least_gap, watch_gap
 from openarm_bringup.campaign.planner import arms_behind
 from openarm_bringup.campaign.robot import SimRobot, SimulatedSenses
 from openarm_bringup.campaign.sets import make_task
@@ -55,14 +55,39 @@ def test_a65_two_objects_are_grasped_at_once_and_the_arms_keep_apart() -> None:
 
 def test_the_judge_of_the_gap_measures_what_mujoco_measures_pair_by_pair() -> None:
     robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
-    gap = ArmGap(robot)
+    gap = watch_gap(robot)
     model, data = robot.world.model, robot.world.data
-    left, right = gap._sides
+    left, right = gap.sides
     pairs = [mujoco.mj_geomDistance(model, data, int(i), int(j), 2.0, None) for i in left for j in right]
     assert min(len(left), len(right)) > 8
-    assert gap.distance() == pytest.approx(min(pairs), abs=1e-9)
+    assert gap.distance(data) == pytest.approx(min(pairs), abs=1e-9)
     robot.pass_time(0.05)
     assert gap.least == pytest.approx(min(pairs), abs=0.01)
+
+
+def test_the_gap_of_joint_states_is_that_of_the_simulation_which_they_come_from() -> None:
+    robot, table = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False)), Table()
+    home = robot.states.latest()[1]
+    arms = arms_behind(table.top_z, table.centre, table.extents)
+
+    def over(arm: str, y: float) -> dict[str, float]:
+        target = np.eye(4)
+        target[:3, :3] = np.diag([1.0, -1.0, -1.0])
+        target[:3, 3] = (0.27, y, 0.60)
+        start = np.array([home[joint] for joint in arms[arm].names])
+        found = arms[arm].inverse.position_solutions(target, 0.05, start)[0].q
+        return dict(zip(arms[arm].names, found.tolist(), strict=True))
+
+    gap = Gap(robot.world.model)
+    states: list[tuple[int, dict[str, float]]] = []
+    distances: list[float] = []
+    for k, y in enumerate((-0.20, -0.10, -0.15)):
+        moved = over("left", 0.05) | over("right", y)
+        robot.world.reset(moved)
+        states.append((k * 10**9, home | moved))
+        distances.append(gap.distance(robot.world.data))
+    assert distances[1] < distances[2] < distances[0]
+    assert least_gap(states) == pytest.approx(distances[1], abs=1e-9)
 
 
 def test_an_arm_under_way_leaves_room_or_makes_the_other_rest() -> None:
