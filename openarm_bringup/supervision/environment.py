@@ -18,6 +18,8 @@ from openarm_common.resources import config_dir
 
 #: The variable that names the Fast DDS profile of a process.
 PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+#: Of one message through shared memory, MiB; a cloud of 640x480 points takes 3.7 MB.
+_LARGEST_MIB = 4
 #: Reaches of discovery that go beyond this machine.
 ACROSS_MACHINES = ("subnet", "system_default")
 
@@ -67,13 +69,16 @@ def network_profile() -> Path:
 
 
 def write_profile(spec: NodeSpec, path: Path) -> Path:
-    """Write config/fastdds.xml with the segment size of one node, and return where."""
-    text = (config_dir() / "fastdds.xml").read_text(encoding="utf-8")
-    sized, count = re.subn(r"(?<=<segment_size>)\d+(?=</segment_size>)", str(spec.segment_mib * 2**20), text)
-    if count != 1:
-        raise OpenArmError(
-            Code.CONFIG_INVALID, f"{config_dir() / 'fastdds.xml'}: expected one <segment_size>, found {count}"
-        )
+    """Write config/fastdds.xml with the segment size of one node, and return where.
+
+    No message may be larger than the segment: Fast DDS would leave shared memory aside for all of them.
+    """
+    file = config_dir() / "fastdds.xml"
+    sized, largest = file.read_text(encoding="utf-8"), min(spec.segment_mib, _LARGEST_MIB)
+    for tag, mib in (("segment_size", spec.segment_mib), ("maxMessageSize", largest)):
+        sized, count = re.subn(rf"(?<=<{tag}>)\d+(?=</{tag}>)", str(mib * 2**20), sized)
+        if count != 1:
+            raise OpenArmError(Code.CONFIG_INVALID, f"{file}: expected one <{tag}>, found {count}")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(sized, encoding="utf-8")
     return path

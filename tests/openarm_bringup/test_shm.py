@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup.supervision.environment import node_arguments, node_environment
+from openarm_bringup.supervision.environment import node_arguments, node_environment, write_profile
 from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_bringup.supervision.shm import fields_of, mapped_by, names_of, ports_of, shm_need_mib, sweep
 
@@ -91,6 +91,15 @@ def test_only_publishers_of_large_messages_get_the_large_segment(graph: Graph, t
     assert "ROS_LOCALHOST_ONLY" not in eye
     assert arm["MODE"] == "slow"
     assert shm_need_mib(graph) == pytest.approx(8 + 5 + 2.2 + 0.65 + 0.65)
+
+
+def test_no_message_may_be_larger_than_its_segment(tmp_path: Path) -> None:
+    """Fast DDS takes no shared memory at all then, and images are lost on the way through sockets."""
+    for segment, largest in ((2, 2), (4, 4), (24, 4)):
+        spec = NodeSpec(module="toy.eye", large_messages=True, segment_mib=segment)
+        profile = write_profile(spec, tmp_path / f"{segment}.xml").read_text()
+        sizes = [int(found) // 2**20 for found in re.findall(r"<(?:segment_size|maxMessageSize)>(\d+)", profile)]
+        assert sizes == [segment, largest]
 
 
 def test_command_line_of_a_node_carries_name_remaps_and_parameters(graph: Graph, tmp_path: Path) -> None:
