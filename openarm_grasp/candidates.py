@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ways to take hold of an upright box: top-down and leaning grasps across its faces, in order of preference.
 
+What is round is taken hold of from any side.
+
 All poses are of the tool centre point (TCP) in the base frame. The tool's z axis is the approach direction (out of the
 fingers) and its y axis the opening axis; orientations are built from those two directions, never from Euler angles. The
 opening axis is always horizontal, so both fingers close at one height and the object is not tipped.
@@ -57,7 +59,8 @@ class GraspCandidate:
     """One way to take hold of the object.
 
     Attributes:
-        id: Names edge, flip, tilt and lean, for example "red/x+/tilt15/lean-" or "red/x+/tilt0".
+        id: Names edge (of what is round, the direction in degrees), flip, tilt and lean, for example
+            "red/x+/tilt15/lean-", "red/x+/tilt0" or "red/30+/tilt0".
         T_base_tcp: (4, 4) pose of the TCP at the grasp.
         approach_offset: (3,) from the grasp to the pre-grasp, base frame, m.
         retreat_offset: (3,) from the grasp to the end of the lift, base frame, m.
@@ -94,7 +97,7 @@ def tcp_height(height: float, tilt: float, hand: HandConfig) -> float:
 
 
 def graspable_edges(target: Detection, limits: ApproachConfig) -> list[tuple[str, Array, float]]:
-    """Footprint directions across which the hand fits.
+    """Footprint directions across which the hand fits: both edges of a box, all around what is round.
 
     Returns:
         Name, horizontal unit direction (3,) in the base frame, and width in m of each.
@@ -103,6 +106,9 @@ def graspable_edges(target: Detection, limits: ApproachConfig) -> list[tuple[str
         OpenArmError: TOO_WIDE, with the widths and the limit, when there is none.
     """
     edges = [(name, target.T_base_object[:3, axis], float(target.size[axis])) for axis, name in enumerate("xy")]
+    if target.round:
+        turns = np.arange(round(180.0 / limits.round_step_deg)) * limits.round_step_deg
+        edges = [(f"{turn:g}", se3.rot_z(radians(turn))[:, 0], float(target.size[:2].mean())) for turn in turns]
     fitting = [edge for edge in edges if edge[2] <= limits.max_width + limits.width_noise]
     if not fitting:
         raise OpenArmError(
@@ -174,6 +180,11 @@ def _candidate(
         score=sum(parts.values()),
         parts=parts,
     )
+
+
+def hold_of(candidate: GraspCandidate) -> str:
+    """The hold of a grasp, whatever its tilt: label and edge."""
+    return "/".join(candidate.id.split("/")[:2])
 
 
 def _outward(p_base: Array, heading: Array, shoulder_xy: Sequence[float]) -> float:

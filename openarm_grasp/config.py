@@ -22,6 +22,9 @@ class ApproachConfig(Config):
     tilts_deg: tuple[float, ...] = Field(
         default=(0.0, 15.0, 30.0, 45.0), description="leans of the hand from vertical, deg"
     )
+    round_step_deg: float = Field(
+        default=30.0, gt=0.0, le=90.0, description="turns of the hand around what is round that are tried, deg"
+    )
     max_width: float = Field(default=0.070, gt=0.0, le=0.080, description="widest object side that is grasped, m")
     width_noise: float = Field(
         default=0.002, ge=0.0, le=0.005, description="error of a measured width allowed beyond it, m"
@@ -178,7 +181,14 @@ class HandOverConfig(Config):
     x: tuple[float, float] = Field(default=(0.20, 0.32), description="ends of the strip, base frame, m")
     abs_y: float = Field(default=0.03, gt=0.0, le=0.2, description="half of its width, m")
     step: float = Field(default=0.03, gt=0.0, le=0.2, description="grid of spots, m")
-    tries: int = Field(default=6, ge=1, le=50, description="spots and turns that the other arm is asked about")
+    tries: int = Field(default=9, ge=1, le=50, description="spots and turns that the other arm is asked about")
+    margin: float = Field(
+        default=0.005, ge=0.0, le=0.02, description="the other arm must cope with an object so far off its spot, m"
+    )
+    margin_deg: float = Field(default=5.0, ge=0.0, le=15.0, description="and turned by so much, deg")
+    rounds: int = Field(
+        default=3, ge=1, le=5, description="times that the object is brought to the middle until the other arm takes it"
+    )
 
     @model_validator(mode="after")
     def _ascends(self) -> Self:

@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 
 _CHOSEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 _OFFERED = ColorRGBA(r=0.4, g=0.5, b=0.9, a=0.35)
+#: Shapes that are round seen from above when they stand; one that lies is seldom as long as wide.
+_ROUND, _AS_LONG_AS_WIDE = frozenset({"cylinder", "can", "sphere"}), 0.001
 
 
 # --- requests and answers
@@ -124,8 +126,10 @@ def frame_from_msg(message: Detection3DArray) -> Frame:
         if not item.results:
             continue
         best = max(item.results, key=lambda r: r.hypothesis.score)
-        T = pose_to_matrix(item.bbox.center)
-        found.append(Detection(best.hypothesis.class_id, best.hypothesis.score, T, xyz(item.bbox.size)))
+        T, size = pose_to_matrix(item.bbox.center), xyz(item.bbox.size)
+        names = {r.hypothesis.class_id for r in item.results}
+        around = bool(names & _ROUND) and abs(float(size[0] - size[1])) < _AS_LONG_AS_WIDE
+        found.append(Detection(best.hypothesis.class_id, best.hypothesis.score, T, size, around))
     return Frame(stamp_to_ns(message.header.stamp), tuple(found))
 
 

@@ -2,13 +2,15 @@
 """Hand-over through the middle: one arm sets the object down where both reach, the other takes it from there.
 
 The way is planned before anything moves: the giver's grasp and a place in the middle, and from that place the taker's
-grasp and the place that was asked for. Base frame, m, rad.
+grasp and the place that was asked for. An object is seldom set down exactly where it was meant, so the taker must be
+able to go on from around that place, too. Base frame, m, rad.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +81,7 @@ async def plan_hand_over(
     """Find a way through the middle.
 
     The giver says where and how it can set the object down; what the taker cannot use is left out, and it is asked
-    again.
+    again. A place from which the taker could go on, but not from all around it, is the last resort.
 
     Args:
         rehearsal: To plan with.
@@ -115,6 +117,7 @@ async def _between(
 ) -> HandOver:
     giver, taker = arms
     useless: list[PlaceTarget] = []
+    best: tuple[int, HandOver] | None = None
     fault = ""
     for _ in range(config.tries):
         try:
@@ -123,17 +126,32 @@ async def _between(
             if error.code not in NO_WAY or not fault:
                 raise
             break
+        found = HandOver(giver, taker, way.position[:2], seen.target.yaw + way.yaw_offset)
         there = standing_at(seen.target, way.position, way.yaw_offset)
+        copes = 0
         try:
-            await rehearsal.pick_and_place(taker, there, seen.others, (place,), yaw=place_yaw)
+            for stands in (there, *_around(there, config)):
+                await rehearsal.pick_and_place(taker, stands, seen.others, (place,), yaw=place_yaw)
+                copes += 1
         except OpenArmError as error:
             if error.code not in NO_WAY:
                 raise
             fault = error.message
             useless.append(way)
+            if copes and (best is None or copes > best[0]):
+                best = (copes, found)
             continue
-        return HandOver(giver, taker, way.position[:2], seen.target.yaw + way.yaw_offset)
+        return found
+    if best is not None:
+        return best[1]
     raise OpenArmError(Code.NO_PLAN, f"the {taker} arm could not go on from {len(useless)} places: {fault}")
+
+
+def _around(there: Detection, config: HandOverConfig) -> tuple[Detection, ...]:
+    """The object as it may stand instead: a little off to each side, and turned."""
+    off, turn = config.margin, radians(config.margin_deg)
+    ways = ((off, 0.0, turn), (-off, 0.0, -turn), (0.0, off, -turn), (0.0, -off, turn)) if off or turn else ()
+    return tuple(standing_at(there, there.p_base[:2] + np.array([dx, dy]), by) for dx, dy, by in ways)
 
 
 def _steps(low: float, high: float, step: float) -> Array:

@@ -18,7 +18,7 @@ from openarm_grasp.judge_end import offer_places, place, reset
 from openarm_grasp.judge_near import Judgement, fail, move_to_grasp, move_to_pregrasp
 from openarm_grasp.memory import Kept, Memory, Surroundings
 from openarm_grasp.observation import Detection, Sighting, find, labels_in_view, on_table
-from openarm_grasp.place import check_position
+from openarm_grasp.place import check_position, other_grasps
 from openarm_grasp.routing import arm_order, out_of_reach
 from openarm_grasp.states import Event, State
 
@@ -143,12 +143,12 @@ def _next_arm(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
     if m.grasp_plan is not None:
         m.place_refused = True
         reason = f"it could grasp, but not place: {reason.removeprefix(f'{m.arm} arm: ')}"
-        # Held by other faces or turned by half, the object may stand where it is wanted.
-        hold = "/".join(m.need_candidate().id.split("/")[:2])
-        others = tuple(c for c in m.offered if not c.id.startswith(f"{hold}/"))
+        # Held by other faces or leaning otherwise, it may come to stand where it is wanted.
+        target = m.need_sighting().target
+        others = other_grasps(m.offered, m.need_candidate(), outcome.code, target, m.request.place_yaw)
         if others:
             m.offered, m.candidate, m.grasp_plan, m.place_target = others, None, None, None
-            return Event.MORE, f"{reason}; trying another hold"
+            return Event.MORE, f"{reason}; trying another grasp"
     m.refusals[m.arm] = Verdict(outcome.code, reason)
     m.candidate = m.grasp_plan = m.place_target = None
     m.arms = m.arms[1:]

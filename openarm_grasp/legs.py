@@ -12,16 +12,19 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.effects import GraspOutcome, GraspRequest
-from openarm_grasp.handover import plan_hand_over
+from openarm_grasp.handover import HandOver, plan_hand_over
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Known
 from openarm_grasp.performer import Link, Performer, run_request
 from openarm_grasp.push import Pusher
 from openarm_grasp.rehearsal import NO_WAY, Rehearsal
 from openarm_grasp.routing import ARMS
+
+Array = NDArray[np.float64]
 
 _STOPS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
 
@@ -98,17 +101,40 @@ class _Task:
             x, y, _ = seen.target.p_base
             found = replace(outcome, code=Code.OK, message=f"can be done from ({x:.3f}, {y:.3f}) m: {way}")
             return self._whole(replace(found, arm=way.taker), "hand_over")
-        x, y = (float(v) for v in way.spot)
-        brought = await self._part(
-            replace(asked, arm=way.giver, place=(x, y), place_yaw=way.yaw, why=f"hand-over, 1 of 2: {way}")
-        )
-        if not brought.success:
-            return self._whole(replace(brought, message=f"on the way to the middle: {brought.message}"), "")
-        taken = await self._part(replace(asked, arm=way.taker, why=f"hand-over, 2 of 2: {way}"))
-        if taken.success:
-            text = f"{taken.message}; the {way.giver} arm had brought it to the middle, ({x:.3f}, {y:.3f}) m"
-            return self._whole(replace(taken, message=text), "hand_over")
-        return self._whole(replace(self._left_behind(taken, f"before the {way.taker} arm came,"), arm=way.taker), "")
+        return await self._handed_over(way, place)
+
+    async def _handed_over(self, way: HandOver, place: Array) -> GraspOutcome:
+        """From hand to hand; when the taker is refused after all, anew from where the object then stands."""
+        asked, most = self._request, self._machine.around.config.hand_over.rounds
+        number = 0
+        while True:
+            number += 1
+            x, y = (float(v) for v in way.spot)
+            brought = await self._part(
+                replace(asked, arm=way.giver, place=(x, y), place_yaw=way.yaw, why=f"hand-over, 1 of 2: {way}")
+            )
+            if not brought.success:
+                brought = replace(brought, message=f"on the way to the middle: {brought.message}")
+                return self._whole(self._left_behind(brought, "then") if number > 1 else brought, "")
+            taken = await self._part(replace(asked, arm=way.taker, why=f"hand-over, 2 of 2: {way}"))
+            if taken.success:
+                text = f"{taken.message}; the {way.giver} arm had brought it to the middle, ({x:.3f}, {y:.3f}) m"
+                return self._whole(replace(taken, message=text + _again(number)), "hand_over")
+            taken = replace(taken, arm=way.taker)
+            known = self._machine.known
+            if number == most or known is None or taken.kind != "REFUSED" or taken.code not in NO_WAY:
+                break
+            self._note(f"{taken.message}; looking for another way from where it stands now")
+            try:
+                way = await plan_hand_over(
+                    self._rehearsal, self._machine.around, known.sighting, place, asked.place_yaw
+                )
+            except OpenArmError as error:
+                if error.code not in (*NO_WAY, Code.PLACE_FAILED):
+                    raise
+                taken = replace(taken, message=f"{taken.message}; {error.message}")
+                break
+        return self._whole(self._left_behind(taken, f"brought to the middle{_again(number)}"), "")
 
     async def _pushed(self, outcome: GraspOutcome) -> GraspOutcome:
         """No arm can grasp it where it stands."""
@@ -171,3 +197,7 @@ class _Task:
         duration = (self._link.now_ns - self._began_ns) * 1e-9
         done = outcome.success
         return replace(outcome, attempts=self._attempts, duration=duration, route=route if done else "")
+
+
+def _again(number: int) -> str:
+    return "" if number == 1 else f", at try number {number}"

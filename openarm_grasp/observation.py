@@ -9,7 +9,7 @@ the same box.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -34,12 +34,14 @@ class Detection:
             target.
         T_base_object: (4, 4) pose of the box centre, yaw only.
         size: (3,) full edges, m.
+        round: It is a circle seen from above: its yaw says nothing, and a hand may come from any side.
     """
 
     label: str
     score: float
     T_base_object: Array
     size: Array
+    round: bool = False
 
     @property
     def p_base(self) -> Array:
@@ -102,7 +104,7 @@ def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Fr
     moved: list[Frame] = []
     for frame in frames:
         T = lookup(frame.t_ns)
-        found = (Detection(d.label, d.score, T @ d.T_base_object, d.size) for d in frame.detections)
+        found = (replace(d, T_base_object=T @ d.T_base_object) for d in frame.detections)
         moved.append(Frame(frame.t_ns, tuple(found)))
     return tuple(moved)
 
@@ -231,7 +233,8 @@ def average(track: Sequence[Detection]) -> Detection:
     yaw = reference.yaw + float(np.mean(yaws))
     p = np.mean([d.p_base for d in track], axis=0)
     score = float(np.mean([d.score for d in track]))
-    return Detection(reference.label, score, se3.make(se3.rot_z(yaw), p), np.mean(sizes, axis=0))
+    around = 2 * sum(d.round for d in track) > len(track)
+    return Detection(reference.label, score, se3.make(se3.rot_z(yaw), p), np.mean(sizes, axis=0), around)
 
 
 def on_table(d: Detection, table_z: float, *, reach: float = 0.03) -> Detection:
@@ -256,7 +259,7 @@ def on_table(d: Detection, table_z: float, *, reach: float = 0.03) -> Detection:
         )
     T = d.T_base_object.copy()
     T[2, 3] = table_z + height / 2.0
-    return Detection(d.label, d.score, T, np.array([d.size[0], d.size[1], height]))
+    return replace(d, T_base_object=T, size=np.array([d.size[0], d.size[1], height]))
 
 
 def _others(frames: Sequence[Frame], target: Detection, match_radius: float) -> tuple[Detection, ...]:

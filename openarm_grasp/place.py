@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.candidates import UP, GraspCandidate
+from openarm_grasp.candidates import UP, GraspCandidate, hold_of
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence import SQUARE_WITHIN
 from openarm_grasp.observation import Detection
@@ -70,7 +70,7 @@ def place_targets(
         yaw: Of the object's x axis about the base z when it stands there, rad; None: any.
     """
     T_object_tcp = se3.inverse(target.T_base_object) @ candidate.T_base_tcp
-    yaws = yaw_offsets(config.place.yaw_step_deg) if yaw is None else turns_to(target, yaw)
+    yaws = yaw_offsets(config.place.yaw_step_deg) if yaw is None or target.round else turns_to(target, yaw)
     # Small turns of every spot come first: a hopeless spot must not use up the planner's patience. Turns of one spot
     # score alike, so that the planner takes the one that is near.
     n = len(spots)
@@ -99,6 +99,45 @@ def place_targets(
     return tuple(found)
 
 
+def other_grasps(
+    offered: Sequence[GraspCandidate], failed: GraspCandidate, code: Code, target: Detection, yaw: float | None
+) -> tuple[GraspCandidate, ...]:
+    """What to try when a grasp can be planned, but nowhere to put the object with it.
+
+    Hands that stand alike at the place have its fate: where turns are free, those whose approach leans alike; else
+    those that differ by a turn after which the object looks the same. A search that found no path says nothing about
+    them: it began elsewhere.
+
+    Args:
+        offered: Grasps that were offered to the planner.
+        failed: The one that it chose.
+        code: Why the place was refused.
+        target: The object as it stands.
+        yaw: How it is wanted, rad; None: any.
+    """
+    if code is Code.NO_PLAN:
+        return tuple(c for c in offered if hold_of(c) != hold_of(failed))
+    step = 0.0 if yaw is None or target.round else symmetry(target)
+    return tuple(c for c in offered if not _stands_alike(c, failed, step))
+
+
+def _stands_alike(a: GraspCandidate, b: GraspCandidate, step: float) -> bool:
+    """Whether two hands differ by a turn about the vertical, of whole steps (rad; 0: of any angle)."""
+    R_a, R_b = a.T_base_tcp[:3, :3], b.T_base_tcp[:3, :3]
+    if not np.allclose(R_a[2], R_b[2], atol=1e-6):
+        return False
+    if step == 0.0:
+        return True
+    (ax, ay), (bx, by) = R_a[:2, 1], R_b[:2, 1]
+    steps = np.arctan2(ax * by - ay * bx, ax * bx + ay * by) / step
+    return abs(steps - round(steps)) < 1e-6
+
+
+def symmetry(target: Detection) -> float:
+    """Turn after which a box looks the same, rad: half of one, a quarter for a square."""
+    return np.pi / 2.0 if abs(float(target.size[0] - target.size[1])) < SQUARE_WITHIN else np.pi
+
+
 def _failed(used: Sequence[PlaceTarget], spot: Array, yaw: float, *, any_turn: bool) -> bool:
     return any(
         np.linalg.norm(t.position[:2] - spot[:2]) < _SAME_SPOT and (any_turn or abs(t.yaw_offset - yaw) < 1e-6)
@@ -120,7 +159,7 @@ def yaw_offsets(step_deg: float) -> tuple[float, ...]:
 
 def turns_to(target: Detection, yaw: float) -> tuple[float, ...]:
     """Turns that give a box a yaw, rad, smallest first; it looks the same after half a turn, a square one a quarter."""
-    step = np.pi / 2.0 if abs(float(target.size[0] - target.size[1])) < SQUARE_WITHIN else np.pi
+    step = symmetry(target)
     first = (yaw - target.yaw) % step
     turns = [(first + k * step + np.pi) % (2.0 * np.pi) - np.pi for k in range(round(2.0 * np.pi / step))]
     return tuple(sorted((float(turn) for turn in turns), key=abs))

@@ -19,7 +19,7 @@ from openarm_grasp.effects import PlanGrasp, Planned, PlanPlace
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.observation import Detection
 from openarm_grasp.performer import Link
-from openarm_grasp.place import PlaceTarget, place_targets
+from openarm_grasp.place import PlaceTarget, other_grasps, place_targets
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,11 @@ class Rehearsal:
         self._around = around
 
     async def pick(
-        self, arm: str, target: Detection, others: Sequence[Detection], without: frozenset[str] = frozenset()
+        self,
+        arm: str,
+        target: Detection,
+        others: Sequence[Detection],
+        offered: Sequence[GraspCandidate] | None = None,
     ) -> Pick:
         """Plan a grasp of an object that stands there.
 
@@ -56,20 +60,21 @@ class Rehearsal:
             arm: Whose.
             target: The object.
             others: What else stands on the table.
-            without: Holds (label and edge) that are of no use.
+            offered: The grasps to choose from; every one when not given.
 
         Raises:
             OpenArmError: One of `NO_WAY`; what the link raises.
         """
         config = self._around.config
-        offered = propose(target, config, shoulder_xy=self._around.shoulders.get(arm, (0.0, 0.0)))
-        offered = tuple(c for c in offered if hold_of(c) not in without)
-        if not offered:
-            raise OpenArmError(Code.UNREACHABLE, f"no other way to hold {target.label!r} is left")
+        offered = self._offered(arm, target, others) if offered is None else tuple(offered)
         self._link.check()
         effect = PlanGrasp(arm, offered, obstacle_boxes(others, config), target_box(target, config))
         plan = await self._link.plan(effect)
         return Pick(offered[plan.chosen], plan)
+
+    def _offered(self, arm: str, target: Detection, others: Sequence[Detection]) -> tuple[GraspCandidate, ...]:
+        shoulder = self._around.shoulders.get(arm, (0.0, 0.0))
+        return propose(target, self._around.config, shoulder_xy=shoulder, others=others)
 
     async def place(
         self, arm: str, pick: Pick, target: Detection, others: Sequence[Detection], ways: Sequence[PlaceTarget]
@@ -96,7 +101,7 @@ class Rehearsal:
         yaw: float | None = None,
         used: Sequence[PlaceTarget] = (),
     ) -> PlaceTarget:
-        """Plan a grasp, and how it ends on one of the spots; other holds are tried when one cannot be put down.
+        """Plan a grasp, and how it ends on one of the spots; others are tried when one cannot be put down.
 
         Args:
             arm: Whose.
@@ -109,38 +114,35 @@ class Rehearsal:
         Raises:
             OpenArmError: As `pick`.
         """
-        useless: frozenset[str] = frozenset()
+        left = self._offered(arm, target, others)
         refused: OpenArmError | None = None
         while True:
             try:
-                pick = await self.pick(arm, target, others, useless)
+                pick = await self.pick(arm, target, others, left)
             except OpenArmError as error:
                 if refused is None or error.code not in NO_WAY:
                     raise
                 raise refused from error
             offered = place_targets(target, pick.candidate, spots, self._around.config, yaw=yaw)
-            ways = [way for way in offered if not any(_same(way, other) for other in used)]
+            ways = [way for way in offered if not any(_same(way, other, any_turn=target.round) for other in used)]
             try:
                 if not ways:
                     raise OpenArmError(Code.UNREACHABLE, "no other way to put it down is left")
                 return await self.place(arm, pick, target, others, ways)
             except OpenArmError as error:
-                if error.code not in NO_WAY:
+                left = other_grasps(left, pick.candidate, error.code, target, yaw)
+                if error.code not in NO_WAY or not left:
                     raise
                 refused = error
-                useless |= {hold_of(pick.candidate)}
-
-
-def hold_of(candidate: GraspCandidate) -> str:
-    """The hold of a grasp, whatever its tilt: label and edge."""
-    return "/".join(candidate.id.split("/")[:2])
 
 
 def standing_at(target: Detection, xy: Sequence[float] | Array, turn: float = 0.0) -> Detection:
-    """The object as it would stand elsewhere, turned by `turn` about the vertical."""
+    """The object as it would be seen elsewhere, turned by `turn` about the vertical; what is round looks the same."""
     p = np.array([xy[0], xy[1], target.p_base[2]])
+    turn = 0.0 if target.round else turn
     return replace(target, T_base_object=se3.make(se3.rot_z(turn) @ target.T_base_object[:3, :3], p))
 
 
-def _same(a: PlaceTarget, b: PlaceTarget) -> bool:
-    return bool(np.linalg.norm(a.position[:2] - b.position[:2]) < 1e-6) and abs(a.yaw_offset - b.yaw_offset) < 1e-6
+def _same(a: PlaceTarget, b: PlaceTarget, *, any_turn: bool) -> bool:
+    there = float(np.linalg.norm(a.position[:2] - b.position[:2])) < 1e-6
+    return there and (any_turn or abs(a.yaw_offset - b.yaw_offset) < 1e-6)

@@ -210,7 +210,7 @@ class SimRobot:
         except OpenArmError:
             return None  # as the detector: the frame is skipped, the next may do
         seen = (d for d in perceived.boxes if not self.missed or self._rng.random() >= self.missed)
-        found = (Detection(d.label, d.score, d.T_base_object, np.array(d.size)) for d in seen)
+        found = (Detection(d.label, d.score, d.T_base_object, np.array(d.size), d.method == "circle") for d in seen)
         return Frame(stamp_ns, tuple(found))
 
     def _robot_in(self, view: DepthView, stamp_ns: int) -> Mask | None:

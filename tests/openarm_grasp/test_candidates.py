@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -129,6 +131,31 @@ def test_a_square_box_offers_both_edges_flips_tilts_and_leans():
     found = propose(box(size=(0.05, 0.05, 0.05)), CONFIG)
     assert len(found) == 2 * 2 * (1 + 3 * 2)
     assert len({c.id for c in found}) == len(found)
+
+
+def can(x=0.26, y=-0.2, yaw=0.0, width=0.06) -> Detection:
+    return replace(box(x, y, yaw, (width, width, 0.08)), round=True)
+
+
+@given(st.floats(-np.pi, np.pi))
+def test_b43_what_is_round_is_taken_from_any_side(yaw):
+    """Whatever yaw the camera gave it: a hand stands across every 30 degrees."""
+    found = propose(can(yaw=yaw), CONFIG)
+    assert len({c.id for c in found}) == len(found) == 6 * 2 * (1 + 3 * 2)
+    across = {round(np.degrees(np.arctan2(*c.T_base_tcp[[1, 0], 1]))) % 360 for c in found if c.tilt == 0.0}
+    assert across == set(range(0, 360, 30))
+    assert {c.width for c in found} == {0.06}
+
+
+def test_b43_the_steps_around_what_is_round_are_a_parameter():
+    config = GraspConfig.model_validate({"approach": {"round_step_deg": 45.0, "tilts_deg": [0.0]}})
+    assert [c.id for c in propose(can(), config)] == [f"red/{a}{f}/tilt0" for a in (0, 45, 90, 135) for f in "+-"]
+
+
+def test_something_round_and_too_wide_is_refused():
+    with pytest.raises(OpenArmError, match="80 mm × 80 mm") as error:
+        propose(can(width=0.08), CONFIG)
+    assert error.value.code is Code.TOO_WIDE
 
 
 def test_tilts_are_tried_in_order():

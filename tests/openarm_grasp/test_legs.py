@@ -178,6 +178,78 @@ def test_p12_a_taker_that_fails_leaves_a_partial_result_that_says_where_the_obje
     assert abs(y) <= two.world.machine.around.config.hand_over.abs_y
 
 
+@pytest.mark.parametrize(("margin", "spot_y"), [(0.0, -0.03), (0.005, 0.0)])
+def test_p12_the_taker_must_cope_with_an_object_that_stands_a_little_off(robot, margin, spot_y) -> None:
+    """The nearest spot is within the taker's reach by 2 mm: too little, once a margin is asked for."""
+    two = robot(0.25, -0.30, hand_over={"margin": margin, "margin_deg": 0.0, "tries": 50})
+    two._reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= -0.032
+    outcome = two.ask(place=(0.25, 0.30), dry_run=True)
+    assert (outcome.code, outcome.route) == (Code.OK, "hand_over")
+    assert f"{spot_y:.3f}) m, and the left arm from there" in outcome.message.replace("-0.000", "0.000")
+
+
+def test_p12_a_spot_without_margin_is_better_than_none(robot) -> None:
+    two = robot(0.25, -0.30, hand_over={"abs_y": 0.001, "tries": 50})
+    two._reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= 0.0
+    outcome = two.ask(place=(0.25, 0.30), dry_run=True)
+    assert (outcome.code, outcome.route) == (Code.OK, "hand_over")
+    assert "0.001) m, and the left arm" in outcome.message
+
+
+def lifts(two: TwoArms) -> list[str]:
+    return [effect.arm for effect in two.world.done(fx.Execute) if effect.trajectory == "lift"]
+
+
+def shy_taker(two: TwoArms, times: int) -> None:
+    """The left arm cannot grasp the object where it truly stands, so many times; the plan ahead did not know."""
+
+    def reaches(arm: str, p: np.ndarray) -> bool:
+        if arm == "right":
+            return float(p[1]) <= OVER
+        red, brought = two.world.objects.get("red"), len(lifts(two))
+        there = red is not None and float(np.linalg.norm(red.p_base[:2] - p[:2])) < 0.02
+        return float(p[1]) >= -OVER and not (there and 0 < brought <= times)
+
+    two._reaches = reaches
+
+
+def test_p12_a_taker_that_is_refused_after_all_gets_the_object_elsewhere(robot) -> None:
+    two = robot(0.25, -0.30)
+    shy_taker(two, 1)
+    outcome = two.ask(place=(0.25, 0.30))
+    assert (outcome.code, outcome.route, outcome.arm) == (Code.OK, "hand_over", "left")
+    assert lifts(two) == ["right", "right", "left"]
+    assert outcome.message.endswith("m, at try number 2")
+    assert any("looking for another way from where it stands now" in note for note in two.notes)
+
+
+def test_p12_it_is_brought_to_the_middle_as_often_as_the_parameter_says(robot) -> None:
+    two = robot(0.25, -0.30, hand_over={"rounds": 2})
+    shy_taker(two, 9)
+    outcome = two.ask(place=(0.25, 0.30))
+    assert (outcome.kind, outcome.code, outcome.route) == ("PARTIAL", Code.UNREACHABLE, "")
+    assert lifts(two) == ["right", "right"]
+    x, y, _ = two.world.objects["red"].p_base
+    assert f"at try number 2 'red' was seen at ({x:.3f}, {y:.3f}) m" in outcome.message
+
+
+def test_p12_without_another_way_the_answer_says_both(robot) -> None:
+    """From the middle the right arm cannot lift it again."""
+    two = robot(0.25, -0.30)
+    shy_taker(two, 9)
+    reaches = two._reaches
+
+    def holds_on(arm: str, p: np.ndarray) -> bool:
+        stands = "red" in two.world.objects and bool(lifts(two))
+        return reaches(arm, p) and not (arm == "right" and stands and abs(p[1]) < 0.04)
+
+    two._reaches = holds_on
+    outcome = two.ask(place=(0.25, 0.30))
+    assert (outcome.kind, outcome.code) == ("PARTIAL", Code.UNREACHABLE)
+    assert "no hand-over through the middle" in outcome.message
+    assert "'red' was seen at" in outcome.message
+
+
 def test_p12_a_giver_that_fails_never_calls_the_taker(robot) -> None:
     two = robot(0.25, -0.30)
     two.world.fail(lambda e: isinstance(e, fx.Execute) and e.trajectory == "approach", Code.EXECUTION_FAILED)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -31,6 +33,14 @@ def test_agreeing_frames_are_averaged_and_others_kept():
     assert sighting.target.p_base[0] == pytest.approx(0.261)
     assert [d.label for d in sighting.others] == ["blue"]
     assert sighting.t_ns == 200_000_000
+
+
+@pytest.mark.parametrize(("looks", "expected"), [((True, True, False), True), ((True, False, False), False)])
+def test_most_frames_say_whether_it_is_round(looks, expected):
+    sequence = frames(*((replace(seen(), round=look),) for look in looks))
+    target = look(in_base(sequence, lambda t_ns: se3.make(p=(0.1, 0.0, 0.0)))).target
+    assert target.p_base[0] == pytest.approx(0.36)
+    assert (target.round, on_table(target, 0.4).round) == (expected, expected)
 
 
 def test_unknown_label_is_refused_with_what_is_in_view():

@@ -92,7 +92,7 @@ def test_a_yaw_that_one_hold_cannot_give_is_given_by_another() -> None:
     bench = Bench(BOX)
     outcome = bench.ask("blue", place=(0.30, -0.30), place_yaw=1.2)
     assert outcome.success, outcome.message
-    assert any("trying another hold" in step.reason for step in bench.trials.steps)
+    assert any("trying another grasp" in step.reason for step in bench.trials.steps)
     off = (bench.yaw("blue_box") - 1.2 + math.pi / 2.0) % math.pi - math.pi / 2.0
     assert abs(off) < math.radians(15.0)
 

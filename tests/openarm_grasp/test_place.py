@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,10 +12,10 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.candidates import propose
+from openarm_grasp.candidates import GraspCandidate, propose
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.observation import Detection
-from openarm_grasp.place import check_position, free_spots, place_targets, yaw_offsets
+from openarm_grasp.place import check_position, free_spots, other_grasps, place_targets, yaw_offsets
 
 CONFIG = GraspConfig()
 TABLE_X, TABLE_Y = (0.11, 0.81), (-0.60, 0.60)
@@ -53,6 +55,45 @@ def test_small_turns_of_every_spot_come_before_large_turns_of_the_first():
     assert ids[0] == "spot0/yaw+0"
     assert set(ids[:6]) == {f"spot{i}/yaw{y}" for i in (0, 1) for y in ("+0", "+30", "-30")}
     assert len(ids) == 24
+
+
+def hands_there(target: Detection, candidate: GraspCandidate, yaw: float | None) -> set[tuple[float, ...]]:
+    """How a hand may stand at a place."""
+    ways = place_targets(target, candidate, [np.array([0.2, -0.3])], CONFIG, yaw=yaw)
+    return {tuple(np.round(way.T_base_tcp[:3].ravel(), 6) + 0.0) for way in ways}
+
+
+@given(st.sampled_from([box(), box(size=(0.05, 0.05, 0.05)), replace(box(size=(0.05, 0.05, 0.05)), round=True)]),
+       st.sampled_from([None, 0.8]), st.integers(0, 27))  # fmt: skip
+def test_grasps_with_which_the_hand_could_not_stand_otherwise_are_left_out(target, yaw, which):
+    offered = propose(target, CONFIG)
+    failed = offered[which]
+    left = other_grasps(offered, failed, Code.UNREACHABLE, target, yaw)
+    there = hands_there(target, failed, yaw)
+    for candidate in offered:
+        assert (candidate in left) == (hands_there(target, candidate, yaw) != there)
+
+
+@pytest.mark.parametrize(("target", "yaw", "rounds"), [(box(), None, 7), (box(), 0.8, 14)])
+def test_every_way_to_stand_there_is_tried_once(target, yaw, rounds):
+    left = propose(target, CONFIG)
+    for _ in range(rounds):
+        assert left
+        left = other_grasps(left, left[0], Code.IN_COLLISION, target, yaw)
+    assert not left
+
+
+def test_a_search_that_failed_says_nothing_about_other_holds():
+    offered = propose(box(), CONFIG)
+    left = other_grasps(offered, offered[0], Code.NO_PLAN, box(), None)
+    assert len(left) == 21
+    assert not any(c.id.startswith("red/x+/") for c in left)
+
+
+def test_what_is_round_looks_the_same_at_any_yaw():
+    target = replace(box(size=(0.05, 0.05, 0.05)), round=True)
+    ways = place_targets(target, propose(target, CONFIG)[0], [np.array([0.2, -0.3])], CONFIG, yaw=0.8)
+    assert len(ways) == 12
 
 
 def test_scores_follow_the_order():
