@@ -10,6 +10,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from openarm_common.cameras import CameraConfig
@@ -39,12 +40,14 @@ class Source(ABC, Generic[MessageT]):
         used_t_ns: Its stamp.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, node: Node, name: str) -> None:
         self.name = name
         self.used = self.refused = self.late = 0
         self.fault = ""
         self.used_at_ns = self.used_t_ns = 0
         self._waiting: deque[MessageT] = deque(maxlen=_KEPT)
+        self._node = node
+        self._inputs: list[Subscription] = []
 
     def take(self, states: RobotStateBuffer, *, filtering: bool) -> Frame | None:
         """The newest frame whose joints and transforms are known at its stamp; None when there is none.
@@ -72,6 +75,17 @@ class Source(ABC, Generic[MessageT]):
             self.late += 1
         return None
 
+    def listen(self, on: bool) -> None:
+        """Listen, or stop; a camera that nobody listens to draws nothing."""
+        if on and not self._inputs:
+            self._inputs = self._subscribe(self._node)
+        elif not on:
+            for subscription in self._inputs:
+                self._node.destroy_subscription(subscription)
+            self._inputs.clear()
+            self._waiting.clear()
+            self.fault = ""
+
     @property
     def waiting(self) -> int:
         """Frames that wait for an update."""
@@ -91,6 +105,10 @@ class Source(ABC, Generic[MessageT]):
     def _scan(self, message: MessageT, T_base_frame: np.ndarray) -> DepthScan | CloudScan:
         """The scan of a message; OpenArmError where it does not fit."""
 
+    @abstractmethod
+    def _subscribe(self, node: Node) -> list[Subscription]:
+        """Begin to listen."""
+
     def _keep(self, message: MessageT) -> None:
         self._waiting.append(message)
 
@@ -99,11 +117,17 @@ class DepthSource(Source[Image]):
     """Depth images of one camera, in its optical frame."""
 
     def __init__(self, node: Node, camera: CameraConfig, depth_topic: str, info_topic: str) -> None:
-        super().__init__(camera.name)
+        super().__init__(node, camera.name)
         self._camera = camera
+        self._topics = [topic.format(camera=camera.name) for topic in (depth_topic, info_topic)]
         self._info: CameraInfo | None = None
-        node.create_subscription(Image, depth_topic.format(camera=camera.name), self._keep, QOS_NEWEST)
-        node.create_subscription(CameraInfo, info_topic.format(camera=camera.name), self._on_info, QOS_NEWEST)
+
+    def _subscribe(self, node: Node) -> list[Subscription]:
+        depth, info = self._topics
+        return [
+            node.create_subscription(Image, depth, self._keep, QOS_NEWEST),
+            node.create_subscription(CameraInfo, info, self._on_info, QOS_NEWEST),
+        ]
 
     def _on_info(self, message: CameraInfo) -> None:
         self._info = message
@@ -128,8 +152,10 @@ class CloudSource(Source[PointCloud2]):
     """Clouds in any known frame, whose origin is taken for that of the rays."""
 
     def __init__(self, node: Node, topic: str) -> None:
-        super().__init__(topic)
-        node.create_subscription(PointCloud2, topic, self._keep, QOS_NEWEST)
+        super().__init__(node, topic)
+
+    def _subscribe(self, node: Node) -> list[Subscription]:
+        return [node.create_subscription(PointCloud2, self.name, self._keep, QOS_NEWEST)]
 
     def _scan(self, message: PointCloud2, T_base_frame: np.ndarray) -> CloudScan:
         points = points_from_cloud(message).reshape(-1, 3)

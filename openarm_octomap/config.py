@@ -105,6 +105,7 @@ class OctomapNodeConfig(Config):
     map_file: str = Field(default="", description=".bt or .ot to start from; empty: nothing is known")
     coarse_depths: tuple[int, ...] = Field(default=(15, 14, 13), description="further depths that services answer")
     publish_full: bool = Field(default=True, description="publish octomap_full too")
+    autostart: bool = Field(default=True, description="active from the start; false: a lifecycle manager activates it")
     grid: GridConfig = GridConfig()
     filter: FilterConfig = FilterConfig()
     field: FieldConfig = FieldConfig()

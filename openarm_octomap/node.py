@@ -20,7 +20,8 @@ from openarm_common.distance_field import CameraMoment, DistanceFieldWriter, fie
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.held import HeldBox
 from openarm_common.housings import with_housings
-from openarm_common.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
+from openarm_common.managed_node import ManagedNode
+from openarm_common.node import BASE_FRAME, QOS_LATCHED, run
 from openarm_common.tf import RobotStateListener
 from openarm_octomap.camera_client import CloudSource, DepthSource, Source
 from openarm_octomap.config import OctomapNodeConfig
@@ -29,8 +30,8 @@ from openarm_octomap.mapper import Frame, Mapper, Report
 from openarm_octomap.service_executor import MapServices
 
 
-class OctomapNode(BaseNode[OctomapNodeConfig]):
-    """Keeps the map, publishes it, answers what it knows."""
+class OctomapNode(ManagedNode[OctomapNodeConfig]):
+    """Keeps the map, publishes it, answers what it knows; looks at the cameras while its state is active."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("octomap", OctomapNodeConfig, **kwargs)
@@ -43,7 +44,7 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
         self._sources: list[Source[Image] | Source[PointCloud2]] = [*self._cameras]
         if config.cloud_topic:
             self._sources.append(CloudSource(self, config.cloud_topic))
-        self._states = RobotStateListener(self, self.description)
+        self._states = RobotStateListener(self, self.description, joints=False)
         self._held: tuple[HeldBox, ...] = ()
         self._t_ns = 0
         self._busy = False
@@ -56,16 +57,39 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
         self._publisher = MapPublisher(self, full=config.publish_full)
         self.create_subscription(MarkerArray, config.held_topic, self._on_held, QOS_LATCHED)
         MapServices(self, self._mapper, config.coarse_depths, lambda: self._t_ns, self._show)
-        self.create_timer(config.period, self._on_timer, clock=self.wall_clock)
+        self._timer = self.create_timer(config.period, self._on_timer, clock=self.wall_clock)
+        self._timer.cancel()
         self.create_timer(1.0, self._report, clock=self.wall_clock)
         if config.map_file:
             self._show()
+        if config.autostart:
+            self.autostart()
 
     def close(self) -> None:
         """Wait for a running update, then take the distance field away."""
         super().close()
         if self._field is not None:
             self._field.close()
+
+    # --- lifecycle
+    def begin(self) -> None:
+        """Listen to cameras and joints, and update."""
+        self._states.enable(True)
+        for source in self._sources:
+            source.listen(True)
+        self._timer.reset()
+
+    def rest(self) -> None:
+        """Leave the map as it is: who asks how old it is will hear it."""
+        self._timer.cancel()
+        for source in self._sources:
+            source.listen(False)
+        self._states.enable(False)
+
+    def forget(self) -> None:
+        """Everything becomes unknown."""
+        self._mapper.reset()
+        self._show()
 
     @property
     def idle(self) -> bool:
@@ -129,6 +153,9 @@ class OctomapNode(BaseNode[OctomapNodeConfig]):
 
     # --- health
     def _report(self) -> None:
+        if not self.active:
+            self.diagnose(True, "rests: /octomap/change_state activates it", updates=self._updates)
+            return
         limit = self.config.stale_after
         faults = [self._fault] if self._fault else []
         values: dict[str, object] = {"updates": self._updates, "overruns": self._overruns}

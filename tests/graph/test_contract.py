@@ -31,6 +31,11 @@ UNTOLD = re.compile(
     r"/_action/|^/rosout$|^/parameter_events$|^/joint_commands$|/joint_trajectory$|^/cloud_in$"
     r"|^/spectator/color/camera_info$"
 )
+#: Services that every node has, or every managed node.
+STANDARD = (
+    r"/_action/|/(describe|get|list|set)_parameter|get_type_description"
+    r"|/get_available_(states|transitions)$|/get_transition_graph$"
+)
 
 pytestmark = pytest.mark.graph
 
@@ -119,7 +124,7 @@ def _services(node: Node) -> dict[str, tuple[str, str]]:
         services = node.get_service_names_and_types_by_node(offering, namespace)
         actions = get_action_server_names_and_types_by_node(node, offering, namespace)
         for name, kinds in services + actions:
-            if not re.search(r"/_action/|/(describe|get|list|set)_parameter|get_type_description", name):
+            if not re.search(STANDARD, name):
                 found[name] = (kinds[0], offering)
     return found
 
