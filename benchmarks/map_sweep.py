@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the robot, or what it holds, gets into the map while an arm sweeps before the cameras.
 
-    python -m benchmarks.map_sweep [--seconds S] [--seed N] [--json PATH]
+    python -m benchmarks.map_sweep [--seconds S] [--seed N] [--noise] [--json PATH]
 
 Starts the graph `sim`, asks for the red cube to be picked and kept, then moves the arm among random postures; each
 request says what the hand holds. Every octree that is published meanwhile is held against the simulator's truth: above
 the table, an occupied cell that is not within two cells of an object on the table is a part of the robot, of the held
 cube, or a trace of them.
+
+With --noise depth is as noisy as a D435's, flying pixels at the edges of the arm among it.
 
     sweep_ghost_cells   of all octrees together
     sweep_maps          octrees looked at
@@ -150,9 +152,10 @@ def sweep(seconds: float, seed: int) -> dict[str, float]:
         }
 
 
-async def run(seconds: float, seed: int) -> dict[str, float]:
+async def run(seconds: float, seed: int, *, noise: bool) -> dict[str, float]:
     """The graph, and the sweep beside it."""
-    graph = load_graph("sim", overrides={"domain": reserve_domain()})
+    sets = (f"mujoco_bridge.depth_noise.enabled={str(noise).lower()}",)
+    graph = load_graph("sim", overrides={"domain": reserve_domain()}, sets=sets)
     os.environ |= {"ROS_DOMAIN_ID": str(graph.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     result: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -167,9 +170,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=30.0, help="of the sweep, wall clock")
     parser.add_argument("--seed", type=int, default=0, help="of the postures")
+    parser.add_argument("--noise", action="store_true", help="depth as noisy as a D435's")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    result = asyncio.run(run(args.seconds, args.seed))
+    result = asyncio.run(run(args.seconds, args.seed, noise=args.noise))
     n = int(result["maps"])
     rows = [
         Row("sweep_ghost_cells", result["ghosts"], "", "lower", 0.0, n=n),
