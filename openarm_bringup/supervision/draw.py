@@ -21,23 +21,20 @@ def mermaid(graph: Graph) -> str:
     """Return the data flow as a Mermaid flowchart."""
     lines = ["flowchart LR"]
     lines += [f'  {name}["{name}"]' for name in graph.nodes]
-    lines += [f"  {giver} -- {'<br/>'.join(names)} --> {taker}" for giver, taker, names in edges(graph)]
+    lines += [f'  {giver} -- "{"<br/>".join(names)}" --> {taker}' for giver, taker, names in edges(graph)]
     return "\n".join(lines)
 
 
 def text(graph: Graph) -> str:
-    """Return the nodes in the order of their start, with what each needs, offers and uses."""
+    """Return the nodes in the order of their start, and whom each gives what it offers."""
+    width = max(map(len, graph.nodes))
     lines = [f"{graph.name}: {graph.description}".rstrip(": ")]
-    for level in graph.levels():
-        for name in level:
-            spec = graph.nodes[name]
-            lines.append(f"  {name}  ({spec.module or ' '.join(spec.command)})")
-            for title, names in (
-                ("needs", spec.needs),
-                ("ready", tuple(str(condition) for condition in spec.ready)),
-                ("offers", spec.offers),
-                ("uses", spec.uses),
-            ):
-                if names:
-                    lines.append(f"      {title} {', '.join(names)}")
+    for name in (name for level in graph.levels() for name in level):
+        spec = graph.nodes[name]
+        lines.append(f"  {name:<{width}}  {spec.module or ' '.join(spec.command)}")
+        if spec.needs:
+            lines.append(f"      after {', '.join(spec.needs)}")
+        for offer in spec.offers:
+            takers = [taker for taker, use in graph.nodes.items() if offer in use.uses and taker != name]
+            lines.append(f"      {offer}" + (f" → {', '.join(takers)}" if takers else ""))
     return "\n".join(lines)

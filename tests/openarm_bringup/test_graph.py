@@ -148,8 +148,9 @@ def test_parameter_file_comes_before_inline_parameters(tmp_path: Path) -> None:
 
 def test_drawings_show_who_gives_what_to_whom(tmp_path: Path) -> None:
     graph = load_graph(write(tmp_path, BASE))
-    assert "bridge -- /joint_states --> arm" in mermaid(graph)
-    assert "needs bridge" in text(graph)
+    assert 'bridge -- "/joint_states" --> arm' in mermaid(graph)
+    assert "/joint_states → arm" in text(graph)
+    assert "after bridge, arm" in text(graph)
 
 
 def test_n18_a_lockstep_gives_its_nodes_their_parameters_and_never_restarts_them(tmp_path: Path) -> None:
