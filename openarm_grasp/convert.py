@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -12,7 +12,7 @@ from control_msgs.action import GripperCommand, ParallelGripperCommand
 from geometry_msgs.msg import Point
 from numpy.typing import NDArray
 from openarm_interfaces.action import MoveArm, Pick, PickTwo, PlanApproach
-from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspStatus, PickAnswer, PickRequest
+from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspOption, GraspStatus, PickAnswer, PickRequest
 from openarm_interfaces.srv import ComputeIK, Grasp
 from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA
@@ -23,15 +23,26 @@ from openarm_common.convert import matrix_to_pose, ns_to_stamp, point, pose_to_m
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import BASE_FRAME
 from openarm_grasp.candidates import Box, GraspCandidate
-from openarm_grasp.effects import GoHome, GraspOutcome, GraspRequest, MoveLinear, PlanGrasp, Planned, PlanPlace
+from openarm_grasp.effects import (
+    GoHome,
+    GraspOutcome,
+    GraspRequest,
+    MoveLinear,
+    PlanGrasp,
+    Planned,
+    PlanPlace,
+)
+from openarm_grasp.evidence import Verdict
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.observation import Detection, Frame
+from openarm_grasp.options import NoWayError, Option
 from openarm_grasp.pair import PairOutcome
 from openarm_grasp.place import PlaceTarget
 
 Array = NDArray[np.float64]
 
 _CHOSEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
+_REFUSED = ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.35)
 _OFFERED = ColorRGBA(r=0.4, g=0.5, b=0.9, a=0.35)
 #: Shapes that are round seen from above when they stand; one that lies is seldom as long as wide.
 _ROUND, _AS_LONG_AS_WIDE = frozenset({"cylinder", "can", "sphere"}), 0.001
@@ -79,6 +90,35 @@ def fill_answer(answer: Grasp.Response | Pick.Result | PickAnswer, outcome: Gras
     answer.place_position = point(outcome.place_position)
     answer.duration = outcome.duration
     answer.route = outcome.route
+    if not isinstance(answer, PickAnswer):
+        answer.options = [option_to_msg(option) for option in outcome.options]
+
+
+def option_to_msg(option: Option) -> GraspOption:
+    """How one way to grasp fared."""
+    return GraspOption(
+        id=option.id,
+        arm=option.arm,
+        score=option.score,
+        parts=list(option.parts),
+        values=list(option.parts.values()),
+        limit_margin=option.limit_margin,
+        code=str(option.code),
+        message=option.message,
+    )
+
+
+def option_from_msg(message: GraspOption) -> Option:
+    """The same, of an answer."""
+    return Option(
+        message.id,
+        message.arm,
+        message.score,
+        dict(zip(message.parts, message.values, strict=True)),
+        message.limit_margin,
+        message.code,
+        message.message,
+    )
 
 
 def pair_result(outcome: PairOutcome) -> PickTwo.Result:
@@ -149,6 +189,7 @@ def _grasp_goal(effect: PlanGrasp, velocity_scale: float) -> PlanApproach.Goal:
         arm=effect.arm,
         targets=_targets(effect.candidates),
         obstacles=[box_to_msg(box) for box in (*effect.obstacles, effect.target)],
+        gone=[box_to_msg(box) for box in effect.gone],
         touchable=[effect.target.id],
         attached_after_approach=True,
         velocity_scale=velocity_scale,
@@ -193,11 +234,20 @@ def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
     Raises:
         OpenArmError: With the planner's code, when it found no plan; INTERNAL, when it chose what was not offered.
     """
+    refusals = {r.id: Verdict(code_from_text(r.code, Code.NO_PLAN), r.message) for r in result.refusals}
     if not result.success:
-        raise OpenArmError(code_from_text(result.code, Code.NO_PLAN), result.message or "no plan")
+        raise NoWayError(code_from_text(result.code, Code.NO_PLAN), result.message or "no plan", refusals)
     if not 0 <= result.chosen < offered:
         raise OpenArmError(Code.INTERNAL, f"the planner chose target {result.chosen} of {offered}")
-    return Planned(result.chosen, result.transfer, result.approach, result.retreat, result.planning_time)
+    return Planned(
+        result.chosen,
+        result.transfer,
+        result.approach,
+        result.retreat,
+        result.planning_time,
+        refusals,
+        tuple(result.limit_margins),
+    )
 
 
 def gripper_goal(
@@ -265,13 +315,15 @@ def code_from_text(text: str, otherwise: Code) -> Code:
 
 
 # --- pictures
-def candidate_markers(candidates: Sequence[GraspCandidate], chosen: str, t_ns: int) -> MarkerArray:
-    """An arrow along the approach of each candidate and a bar along its opening axis; the chosen one is green."""
+def candidate_markers(
+    candidates: Sequence[GraspCandidate], chosen: str, refused: Collection[str], t_ns: int
+) -> MarkerArray:
+    """An arrow along each approach and a bar along its opening axis: the chosen one green, what was refused red."""
     markers = [Marker(action=Marker.DELETEALL)]
     for i, c in enumerate(candidates):
         tip = c.T_base_tcp[:3, 3]
         half = 0.5 * c.width * c.T_base_tcp[:3, 1]
-        color = _CHOSEN if c.id == chosen else _OFFERED
+        color = _CHOSEN if c.id == chosen else _REFUSED if c.id in refused else _OFFERED
         shaft = _points(tip + c.approach_offset, tip)
         arrow = Marker(ns="approach", id=i, type=Marker.ARROW, color=color, points=shaft)
         arrow.scale = vector((0.004, 0.008, 0.012))

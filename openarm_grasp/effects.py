@@ -9,7 +9,7 @@ executed.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias, TypeVar
 
 import numpy as np
@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from openarm_common.errors import Code
 from openarm_grasp.candidates import Box, GraspCandidate
-from openarm_grasp.evidence import Evidence
+from openarm_grasp.evidence import Evidence, Verdict
 from openarm_grasp.observation import Frame
+from openarm_grasp.options import Option
 from openarm_grasp.place import PlaceTarget
 
 Array = NDArray[np.float64]
@@ -94,12 +95,17 @@ class ToBase:
 
 @dataclass(frozen=True)
 class PlanGrasp:
-    """Choose and plan one of the candidates with one arm; result `Planned`."""
+    """Choose and plan one of the candidates with one arm; result `Planned`.
+
+    Attributes:
+        gone: Where the object will not stand any more then: the map still shows it there.
+    """
 
     arm: str
     candidates: tuple[GraspCandidate, ...]
     obstacles: tuple[Box, ...]
     target: Box
+    gone: tuple[Box, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -219,13 +225,26 @@ class Frames:
 
 @dataclass(frozen=True)
 class Planned:
-    """A plan: which of the offered ways was chosen, and its three trajectories."""
+    """A plan: which of the offered ways was chosen, and its three trajectories.
+
+    Attributes:
+        chosen: Index of the way.
+        transfer: Free path to the beginning of the approach.
+        approach: Straight line to where it grasps or lets go.
+        retreat: Straight line away.
+        planning_time: s of wall clock.
+        refusals: Why others were refused, by id.
+        limit_margins: Of each way, how near it comes to a joint limit, rad; NaN: refused or not looked at. Empty when
+            the planner does not say.
+    """
 
     chosen: int
     transfer: Trajectory
     approach: Trajectory
     retreat: Trajectory
     planning_time: float = 0.0
+    refusals: Mapping[str, Verdict] = field(default_factory=dict[str, Verdict])
+    limit_margins: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -248,12 +267,14 @@ class Outcome:
         message: The failure in a sentence.
         results: Of the effects that have one, in order, up to the failing one.
         done: How many effects of the recipe were carried out.
+        refusals: Why the planner refused each way, where that is what failed.
     """
 
     code: Code = Code.OK
     message: str = ""
     results: tuple[Result, ...] = ()
     done: int = 0
+    refusals: Mapping[str, Verdict] = field(default_factory=dict[str, Verdict])
 
     @property
     def ok(self) -> bool:
@@ -287,6 +308,7 @@ class GraspOutcome:
         held: The object is in the hand.
         moved: It stands elsewhere than before, and not where it was asked for; the message says where.
         route: How it came to its place: "direct", "hand_over" or "push"; "" when it did not.
+        options: Ways to grasp that were weighed for the newest plan, by arm, the preferred first.
     """
 
     code: Code
@@ -299,6 +321,7 @@ class GraspOutcome:
     held: bool = False
     moved: bool = False
     route: str = ""
+    options: tuple[Option, ...] = ()
 
     @property
     def kind(self) -> str:

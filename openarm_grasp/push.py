@@ -124,7 +124,7 @@ class Pusher:
         fault: OpenArmError | None = None
         for arm in arm_order("auto", float(end[1]), self._config.approach.overlap_half_width):
             try:
-                await self._rehearsal.pick(arm, standing_at(seen.target, end), seen.others)
+                await self._rehearsal.pick(arm, standing_at(seen.target, end), seen.others, now=seen.target)
             except OpenArmError as error:
                 if error.code not in NO_WAY:
                     raise

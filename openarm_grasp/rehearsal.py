@@ -53,6 +53,7 @@ class Rehearsal:
         target: Detection,
         others: Sequence[Detection],
         offered: Sequence[GraspCandidate] | None = None,
+        now: Detection | None = None,
     ) -> Pick:
         """Plan a grasp of an object that stands there.
 
@@ -61,6 +62,7 @@ class Rehearsal:
             target: The object.
             others: What else stands on the table.
             offered: The grasps to choose from; every one when not given.
+            now: The object where it stands until then, when that is elsewhere.
 
         Raises:
             OpenArmError: One of `NO_WAY`; what the link raises.
@@ -68,7 +70,8 @@ class Rehearsal:
         config = self._around.config
         offered = self._offered(arm, target, others) if offered is None else tuple(offered)
         self._link.check()
-        effect = PlanGrasp(arm, offered, obstacle_boxes(others, config), target_box(target, config))
+        gone = () if now is None else (target_box(now, config),)
+        effect = PlanGrasp(arm, offered, obstacle_boxes(others, config), target_box(target, config), gone)
         plan = await self._link.plan(effect)
         return Pick(offered[plan.chosen], plan)
 

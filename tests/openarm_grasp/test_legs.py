@@ -301,6 +301,25 @@ def test_n13_a65_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(ro
     assert closed.position == 0.0
 
 
+def test_n13_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_object_now(robot) -> None:
+    two = robot(0.46, 0.02)
+    two.far = 0.44
+    plan, ahead = two.plan, list[fx.PlanGrasp]()
+
+    async def noted(effect: fx.PlanGrasp | fx.PlanPlace) -> fx.Planned:
+        if isinstance(effect, fx.PlanGrasp) and not two.pushed:
+            p = effect.target.T_frame_box[:2, 3]
+            ahead.extend([effect] if np.hypot(*(p - (0.46, 0.02))) > 0.05 else [])
+        return await plan(effect)
+
+    two.plan = noted
+    assert two.ask().route == "push"
+    assert ahead
+    for effect in ahead:
+        (gone,) = effect.gone
+        assert gone.T_frame_box[:2, 3] == pytest.approx((0.46, 0.02), abs=1e-6)
+
+
 def test_n13_a_push_that_the_object_does_not_follow_is_repeated_three_times_and_told(robot) -> None:
     two = robot(0.46, 0.02)
     two.far, two.follows = 0.44, 0.1

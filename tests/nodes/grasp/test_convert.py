@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the motion node is asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from openarm_common import se3
+from openarm_common.convert import pose_to_matrix
+from openarm_grasp import convert
+from openarm_grasp.candidates import Box, held_box, propose, target_box
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.effects import PlanGrasp, PlanPlace
+from openarm_grasp.observation import Detection
+
+
+def test_a_plan_of_what_comes_later_names_where_the_object_will_not_stand_any_more() -> None:
+    config = GraspConfig()
+    target = Detection("red", 1.0, se3.make(p=(0.30, -0.20, 0.425)), np.full(3, 0.05))
+    ways = propose(target, config)
+    box, gone = target_box(target, config), Box("red", se3.make(p=(0.40, -0.20, 0.425)), (0.06, 0.06, 0.05))
+    grasp = convert.plan_goal(PlanGrasp("right", ways, (), box, (gone,)), 0.0)
+    place = convert.plan_goal(PlanPlace("right", (), (), held_box(target, ways[0], config), gone=(gone,)), 0.0)
+    for goal in (grasp, place):
+        (told,) = goal.gone
+        np.testing.assert_allclose(pose_to_matrix(told.pose), gone.T_frame_box)
+        assert (told.size.x, told.size.y, told.size.z) == gone.size
+    assert list(convert.plan_goal(PlanGrasp("right", ways, (), box), 0.0).gone) == []
