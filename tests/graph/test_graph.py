@@ -18,9 +18,10 @@ from openarm_interfaces.srv import Grasp
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
+from openarm_bringup.campaign.gap import LEAST_GAP, least_gap
 from openarm_bringup.judging.judge import JudgeConfig, judge
 from openarm_bringup.judging.observer_client import Observer
-from openarm_bringup.judging.trial import wait_scene
+from openarm_bringup.judging.trial import run_pair, wait_scene
 from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.shm import ports_of, unused
 from openarm_common.errors import Code
@@ -131,6 +132,21 @@ def test_a01_b06_grasp_by_service_lifts_and_places_and_a_second_one_is_refused_a
     states = [step.state for step in observer.steps()]
     for state in ("DETECT", "TRANSFORM", "PLAN", "MOVE_TO_GRASP", "CLOSE_GRIPPER", "LIFT", "PLACE", "RESET", "IDLE"):
         assert state in states
+
+
+def test_a65_two_objects_are_picked_at_once_and_the_arms_keep_20_mm_apart(
+    observer: Observer, client: GraspClient
+) -> None:
+    scene = load_scene("demo")
+    after_ns = observer.reset_world("demo", 0)
+    red, blue = run_pair(observer, client, scene, ("red", "blue"), after_ns=after_ns)
+    for trial, arm in ((red, "right"), (blue, "left")):
+        assert trial.outcome == "placed", trial.message
+        assert trial.arm == arm
+    assert least_gap(observer.joints()) >= LEAST_GAP
+    began = {step.label: step.t_ns for step in observer.steps() if step.state == "MOVE_TO_PREGRASP"}
+    ended = {step.label: step.t_ns for step in observer.steps() if step.state == "RESET"}
+    assert max(began.values()) < min(ended.values())
 
 
 def test_bridge_killed_during_a_grasp_is_a_named_code_and_the_graph_comes_back(
