@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import os
 import re
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import rclpy
@@ -22,7 +20,7 @@ from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 
 from openarm_bringup.bags.bag import Bag, Record, message_class
-from openarm_bringup.supervision.environment import write_profile
+from openarm_bringup.supervision.environment import profiled, write_profile
 from openarm_bringup.supervision.graph import NodeSpec
 from openarm_common.convert import ns_to_stamp
 from openarm_common.errors import Code, OpenArmError
@@ -61,7 +59,7 @@ class Player:
         spec = NodeSpec(module="openarm_bringup", large_messages=True, segment_mib=24)
         profile = write_profile(spec, Path(self._folder.name) / "fastdds.xml")
         self._context = Context()
-        with _variable("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile)):  # read when the participant is made
+        with profiled(profile):
             rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             self._node = rclpy.create_node("openarm_player", context=self._context, use_global_arguments=False)
         self._publishers: dict[str, Publisher] = {}
@@ -210,20 +208,6 @@ class Player:
             pass  # the context was shut down by the end of the process
         finally:
             executor.remove_node(self._node)
-
-
-@contextmanager
-def _variable(name: str, value: str) -> Iterator[None]:
-    """Set a variable of the environment; what is started later gets the one from before."""
-    before = os.environ.get(name)
-    os.environ[name] = value
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = before
 
 
 def to_profile(qos: Qos | None) -> QoSProfile:

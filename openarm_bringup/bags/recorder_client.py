@@ -7,6 +7,7 @@ counted as lost, and so is what never came: the numbers of the publishers tell.
 
 from __future__ import annotations
 
+import os
 import queue
 import re
 import shutil
@@ -27,8 +28,10 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 
 from openarm_bringup.bags.bag import BagWriter, message_class
 from openarm_bringup.bags.losses import Arrivals
+from openarm_bringup.supervision.environment import PROFILE, profiled
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import offered_qos
+from openarm_common.resources import config_dir
 
 #: What the profiles record: regular expressions of whole topic names.
 PROFILES: Mapping[str, tuple[str, ...]] = {
@@ -120,8 +123,10 @@ class Recorder:
         self._topics: set[str] = set()
         self._readers: list[tuple[Subscription, Take]] = []
         self._context = Context()
-        rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("openarm_recorder", context=self._context, use_global_arguments=False)
+        profile = os.environ.get(PROFILE) or config_dir() / "fastdds_recorder.xml"  # a user's own comes first
+        with profiled(Path(profile)):
+            rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+            self._node = rclpy.create_node("openarm_recorder", context=self._context, use_global_arguments=False)
         self._end = threading.Event()
         self._changed = threading.Condition()
         self._threads = [

@@ -6,7 +6,8 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,20 @@ def write_profile(spec: NodeSpec, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(sized, encoding="utf-8")
     return path
+
+
+@contextmanager
+def profiled(profile: Path) -> Iterator[None]:
+    """Let the participants that are made inside have a Fast DDS profile; those that come later get what was there."""
+    before = os.environ.get(PROFILE)
+    os.environ[PROFILE] = str(profile)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[PROFILE]
+        else:
+            os.environ[PROFILE] = before
 
 
 def node_arguments(graph: Graph, name: str, run_dir: Path) -> list[str]:
