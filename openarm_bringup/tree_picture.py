@@ -122,7 +122,8 @@ def png(layout: Layout) -> bytes:
         colour = (_INK if fixed else _MOVES)[::-1]
         size = cv2.getFontScaleFromHeight(cv2.FONT_HERSHEY_SIMPLEX, round(0.72 * _TEXT * _SCALE), _SCALE - 1)
         cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, _SCALE, cv2.LINE_AA)
-    return cv2.imencode(".png", picture)[1].tobytes()
+    small = [cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT]
+    return cv2.imencode(".png", picture, small)[1].tobytes()
 
 
 def svg(layout: Layout) -> bytes:
