@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.options import Option
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class GraspResult:
         duration: s of robot time.
         route: "direct"; "hand_over": by way of the middle, with both arms; "push": pushed into reach; "" when it was
             not placed.
+        options: Ways to grasp that were weighed for the newest plan, by arm, the preferred first; of one object only.
     """
 
     success: bool
@@ -38,6 +40,7 @@ class GraspResult:
     place_position: tuple[float, float, float]
     duration: float
     route: str = ""
+    options: tuple[Option, ...] = ()
 
     def raise_for_code(self) -> Self:
         """Return the result of a success.

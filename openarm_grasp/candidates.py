@@ -105,11 +105,7 @@ def graspable_edges(target: Detection, limits: ApproachConfig) -> list[tuple[str
     Raises:
         OpenArmError: TOO_WIDE, with the widths and the limit, when there is none.
     """
-    edges = [(name, target.T_base_object[:3, axis], float(target.size[axis])) for axis, name in enumerate("xy")]
-    if target.round:
-        turns = np.arange(round(180.0 / limits.round_step_deg)) * limits.round_step_deg
-        edges = [(f"{turn:g}", se3.rot_z(radians(turn))[:, 0], float(target.size[:2].mean())) for turn in turns]
-    fitting = [edge for edge in edges if edge[2] <= limits.max_width + limits.width_noise]
+    fitting = [edge for edge in _edges(target, limits) if _fits(edge[2], limits)]
     if not fitting:
         raise OpenArmError(
             Code.TOO_WIDE,
@@ -117,6 +113,22 @@ def graspable_edges(target: Detection, limits: ApproachConfig) -> list[tuple[str
             f" the hand grasps sides up to {limits.max_width * 1e3:.0f} mm",
         )
     return fitting
+
+
+def wide_edges(target: Detection, limits: ApproachConfig) -> list[tuple[str, float]]:
+    """Name and width, m, of the edges across which the hand does not fit."""
+    return [(name, width) for name, _, width in _edges(target, limits) if not _fits(width, limits)]
+
+
+def _edges(target: Detection, limits: ApproachConfig) -> list[tuple[str, Array, float]]:
+    if target.round:
+        turns = np.arange(round(180.0 / limits.round_step_deg)) * limits.round_step_deg
+        return [(f"{turn:g}", se3.rot_z(radians(turn))[:, 0], float(target.size[:2].mean())) for turn in turns]
+    return [(name, target.T_base_object[:3, axis], float(target.size[axis])) for axis, name in enumerate("xy")]
+
+
+def _fits(width: float, limits: ApproachConfig) -> bool:
+    return width <= limits.max_width + limits.width_noise
 
 
 def propose(

@@ -24,6 +24,7 @@ from rclpy.task import Future
 from openarm_common.convert import point, xyz
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.answers import GraspResult, PairResult, Wanted
+from openarm_grasp.convert import option_from_msg
 
 OnFeedback = Callable[[GraspStatus], None]
 #: How often a waiting call looks up, so that Ctrl-C is noticed.
@@ -285,4 +286,5 @@ def _result(message: Pick.Result | PickAnswer) -> GraspResult:
         place_position=(x, y, z),
         duration=message.duration,
         route=message.route,
+        options=() if isinstance(message, PickAnswer) else tuple(map(option_from_msg, message.options)),
     )

@@ -18,6 +18,7 @@ from openarm_grasp.judge_end import offer_places, place, reset
 from openarm_grasp.judge_near import Judgement, fail, move_to_grasp, move_to_pregrasp
 from openarm_grasp.memory import Kept, Memory, Surroundings
 from openarm_grasp.observation import Detection, Sighting, find, labels_in_view, on_table
+from openarm_grasp.options import not_placeable, options_of, planned
 from openarm_grasp.place import check_position, other_grasps
 from openarm_grasp.routing import arm_order, out_of_reach
 from openarm_grasp.states import Event, State
@@ -77,6 +78,7 @@ def transform(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> J
         m.height = float(target.size[2])
     if m.request.place is not None:
         check_position(m.request.place, target, others, table.x, table.y)
+    m.options = {}
     m.arms = arm_order(m.request.arm, float(target.p_base[1]), around.config.approach.overlap_half_width)
     _offer_grasps(m, around)
     x, y, z = target.p_base
@@ -118,9 +120,12 @@ def plan(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgem
     if m.probed:
         return _no_plan(m, outcome, around)
     if not outcome.ok:
+        if m.grasp_plan is None:
+            m.options = planned(m.options, m.arm, m.offered, -1, outcome.refusals, ())
         return _next_arm(m, outcome, around)
     done = outcome.last(Planned)
     if m.grasp_plan is None:
+        m.options = planned(m.options, m.arm, m.offered, done.chosen, done.refusals, done.limit_margins)
         m.grasp_plan, m.candidate = done, m.offered[done.chosen]
         chosen = f"grasp {m.candidate.id} with the {m.arm} arm"
         # Also without a wish for the place: no free spot is a reason not to lift.
@@ -145,7 +150,10 @@ def _next_arm(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
         reason = f"it could grasp, but not place: {reason.removeprefix(f'{m.arm} arm: ')}"
         # Held by other faces or leaning otherwise, it may come to stand where it is wanted.
         target = m.need_sighting().target
-        others = other_grasps(m.offered, m.need_candidate(), outcome.code, target, m.request.place_yaw)
+        failed = m.need_candidate()
+        others = other_grasps(m.offered, failed, outcome.code, target, m.request.place_yaw)
+        dropped = [c for c in m.offered if c not in others]
+        m.options = not_placeable(m.options, m.arm, dropped, failed, Verdict(outcome.code, reason))
         if others:
             m.offered, m.candidate, m.grasp_plan, m.place_target = others, None, None, None
             return Event.MORE, f"{reason}; trying another grasp"
@@ -178,6 +186,7 @@ def _offer_grasps(m: Memory, around: Surroundings) -> None:
     m.arm = m.arms[0]
     s, shoulder = m.need_sighting(), around.shoulders.get(m.arm, (0.0, 0.0))
     m.offered = propose(s.target, around.config, shoulder_xy=shoulder, used=m.used, others=s.others)
+    m.options |= options_of(m.arm, m.offered, s.target, around.config.approach)
 
 
 # --- grasping

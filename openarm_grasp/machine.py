@@ -173,6 +173,7 @@ class GraspMachine:
             place_position=(x, y, z),
             duration=(t_ns - m.started_ns) * 1e-9,
             held=m.hand.holding,
+            options=tuple(m.options.values()),
         )
         self.known = Known(m.sighting, dict(m.refusals), m.place_refused) if m.sighting is not None else None
         if m.hand.holding and m.sighting is not None and m.candidate is not None:

@@ -17,6 +17,7 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames, GraspRequest, Planned
 from openarm_grasp.evidence import Verdict
 from openarm_grasp.observation import Detection, Sighting
+from openarm_grasp.options import Options
 from openarm_grasp.place import PlaceTarget
 
 ValueT = TypeVar("ValueT")
@@ -129,6 +130,7 @@ class Memory:
         residual: Direction (2,) and how far along it the camera saw the object from where the hand put it.
         kept: What an earlier request left in the hand, to be placed by this one.
         height: Of the object when it was first seen, m; None before that.
+        options: How the ways to grasp fared that were weighed for the newest detection.
         moved_from: The object as it stood when the hand was last about to go down.
     """
 
@@ -158,6 +160,7 @@ class Memory:
     residual: tuple[NDArray[np.float64], float] | None = None
     kept: Kept | None = None
     height: float | None = None
+    options: Options = field(default_factory=Options)
     moved_from: Detection | None = None
 
     @property

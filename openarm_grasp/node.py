@@ -162,7 +162,8 @@ class GraspNode(BaseNode[GraspConfig]):
         memory = machine.memory
         if memory is not None and machine.state in (State.PLAN, State.MOVE_TO_PREGRASP):
             chosen = memory.candidate.id if memory.candidate else ""
-            self._marker_topic.publish(convert.candidate_markers(memory.offered, chosen, t_ns))
+            refused = {o.id for o in memory.options.values() if o.arm == memory.arm and o.code not in ("", Code.OK)}
+            self._marker_topic.publish(convert.candidate_markers(memory.offered, chosen, refused, t_ns))
 
     def _tell_of_others(self, idle: GraspMachine, t_ns: int) -> None:
         """The newest status is not that of one which has ended while the other is at work."""

@@ -37,6 +37,7 @@ from openarm_grasp.evidence import Evidence
 from openarm_grasp.hand import SPEED_WINDOW_NS, HandReader
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.observation import in_base
+from openarm_grasp.options import NoWayError
 from openarm_grasp.routing import ARMS
 
 Array = NDArray[np.float64]
@@ -181,7 +182,8 @@ class Performer:
                 self._link.check()
                 result = await self._one(effect)
             except OpenArmError as error:
-                return Outcome(error.code, error.message, tuple(results), done)
+                refusals = error.refusals if isinstance(error, NoWayError) else {}
+                return Outcome(error.code, error.message, tuple(results), done, refusals)
             if result is not None:
                 results.append(result)
         return Outcome(Code.OK, "", tuple(results), len(recipe))

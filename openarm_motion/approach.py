@@ -51,6 +51,8 @@ class ApproachPlan:
         refusals: Why others were not chosen.
         held_after: Boxes that the arm holds at the end, tool frame.
         certificates: What the three parts were looked at with, in their order.
+        limit_margins: Of each target, how near its best configuration (of the chosen one: that which was planned) comes
+            to a joint limit on both lines, rad; NaN for those that were refused or not looked at.
     """
 
     chosen: int
@@ -60,6 +62,7 @@ class ApproachPlan:
     refusals: tuple[Refused, ...]
     held_after: tuple[Box, ...]
     certificates: tuple[Certificate, Certificate, Certificate]
+    limit_margins: tuple[float, ...]
 
 
 class ApproachFailedError(PlanFailedError):
@@ -76,6 +79,7 @@ class _Candidate:
     approach: Line
     retreat: Line
     cost: float
+    margin: float
 
 
 def plan_approach(
@@ -147,6 +151,7 @@ class _Checks:
             gripper=before,
             known=now.known,
         )
+        self._margins = np.full(len(request.targets), np.nan)
         self._carried = [box for box in request.obstacles if box.id in request.touchable]
         if request.attached_after:
             rest = [box for box in request.obstacles if box.id not in request.touchable]
@@ -202,7 +207,9 @@ class _Checks:
                 continue
             held = self.held_after(pose)
             proof = (free.certificate, to, away)
-            return ApproachPlan(best.target, free.trajectory, approach, retreat, tuple(refusals), held, proof)
+            self._margins[best.target] = best.margin
+            margins = tuple(self._margins.tolist())
+            return ApproachPlan(best.target, free.trajectory, approach, retreat, tuple(refusals), held, proof, margins)
         return None
 
     def candidates(self, index: int) -> tuple[list[_Candidate], Refused | None]:
@@ -225,10 +232,12 @@ class _Checks:
                 faults.append(error)
                 continue
             travel = segment_time(self._now.start, approach.q[0], limits)
-            kept.append(_Candidate(index, approach, retreat, self._cost(solution, travel)))
+            closest = arm.kinematics.margin(np.vstack([approach.q, retreat.q]))
+            kept.append(_Candidate(index, approach, retreat, self._cost(solution, travel), closest))
             if len(kept) == planning.keep:
                 break
         if kept:
+            self._margins[index] = min(kept, key=lambda c: c.cost).margin
             return kept, None
         worst = min(faults, key=_far)
         text = f"{target.id}: {worst.message} ({len(faults)} configurations tried)"

@@ -136,6 +136,7 @@ class MotionNode(BaseNode[MotionConfig]):
             result.approach = convert.trajectory_msg(plan.approach)
             result.retreat = convert.trajectory_msg(plan.retreat)
             result.refusals = convert.refusals_msg(plan.refusals)
+            result.limit_margins = list(plan.limit_margins)
             self._preview.show({goal.arm: (plan.transfer, plan.approach, plan.retreat)})
             self._held.expect(goal.arm, (plan.transfer, plan.approach), request.attached)
             self._held.expect(goal.arm, (plan.retreat,), plan.held_after)

@@ -21,9 +21,11 @@ from openarm_common.robot_state import RobotStateBuffer
 from openarm_grasp import effects
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames, GoHome, Planned
+from openarm_grasp.evidence import Verdict
+from openarm_grasp.options import NoWayError
 from openarm_grasp.performer import check_deadline
 from openarm_motion import moves
-from openarm_motion.approach import plan_approach
+from openarm_motion.approach import ApproachFailedError, Refused, plan_approach
 from openarm_motion.arm import Arm, Situation
 from openarm_motion.checks import check_trajectory
 from openarm_motion.collision import Box
@@ -210,12 +212,22 @@ class DirectLink:
                 self.plans_to_fail -= 1
                 raise OpenArmError(Code.NO_PLAN, f"{arm.name} arm: no path, on purpose")
             plan = plan_approach(arm, now, request)
+        except ApproachFailedError as error:
+            raise NoWayError(error.code, error.message, _verdicts(error.refusals)) from error
         finally:
             self.planning_s.append(time.perf_counter() - began)
             await self.pass_time(PLANNING_S)
         self._held.expect(arm.name, (plan.transfer, plan.approach), request.attached)
         self._held.expect(arm.name, (plan.retreat,), plan.held_after)
-        return Planned(plan.chosen, plan.transfer, plan.approach, plan.retreat, self.planning_s[-1])
+        return Planned(
+            plan.chosen,
+            plan.transfer,
+            plan.approach,
+            plan.retreat,
+            self.planning_s[-1],
+            _verdicts(plan.refusals),
+            plan.limit_margins,
+        )
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
         """How far the arm's TCP stays from a point, in any orientation."""
@@ -322,3 +334,7 @@ class DirectLink:
             follower.cancel()
             raise
         return ends[0].stalled or ends[0].reached_goal
+
+
+def _verdicts(refusals: Sequence[Refused]) -> dict[str, Verdict]:
+    return {refused.id: Verdict(refused.code, refused.message) for refused in refusals}

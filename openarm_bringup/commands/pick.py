@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from cyclopts import Parameter
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from openarm_interfaces.msg import GraspStatus
 
     from openarm_grasp.answers import GraspResult, PairResult
+    from openarm_grasp.options import Option
 
 
 Arm = Literal["auto", "left", "right"]
@@ -94,7 +96,10 @@ def pick(
         except KeyboardInterrupt:
             asked = {"labels": labels} if second else {"label": label}
             return Outcome(False, "cancelled by Ctrl-C; the robot holds where it is", Code.CANCELLED, asked)
-    return Outcome(result.success, result.message, result.code, {**_told(result), "dry_run": dry_run})
+    if not dry_run:
+        return Outcome(result.success, result.message, result.code, {**_told(result), "dry_run": False})
+    data = {**_told(result), "dry_run": True, "options": [_fared(option) for option in result.options]}
+    return Outcome(result.success, result.message, result.code, data, _weighed(result.options))
 
 
 def _each(name: str, given: list[T] | None, labels: Sequence[str]) -> Sequence[T | None]:
@@ -127,6 +132,38 @@ class _Steps:
         line = f"{stamp - self._first_s:7.2f} s  {who}[cyan]{status.state:<18}[/cyan]"
         self._console.print(line, end=" ")
         self._console.print(status.reason, markup=False)
+
+
+def _fared(option: Option) -> dict[str, Any]:
+    margin = option.limit_margin
+    return {**asdict(option), "code": str(option.code), "limit_margin": None if math.isnan(margin) else margin}
+
+
+def _weighed(options: Sequence[Option]) -> str:
+    """Every way to grasp that was weighed: what its score is made of, and why it was not chosen."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    if not options:
+        return ""
+    parts = list(dict.fromkeys(name for option in options for name in option.parts))
+    table = Table(box=None, pad_edge=False)
+    table.add_column("way to grasp", no_wrap=True)
+    table.add_column("arm", no_wrap=True)
+    for name in ("score", *parts, "margin"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("")
+    for option in options:
+        values = (f"{option.parts[name]:+.2f}" if name in option.parts else "" for name in parts)
+        margin = "" if math.isnan(option.limit_margin) else f"{math.degrees(option.limit_margin):.0f}°"
+        score = f"{option.score:+.2f}" if option.parts else ""
+        code = f"{option.code}: " if option.code not in ("", Code.OK) else ""
+        table.add_row(option.id, option.arm, score, *values, margin, escape(f"{code}{option.message}"))
+    console = Console(width=160, color_system=None)
+    with console.capture() as shown:
+        console.print(table)
+    return f"{shown.get().rstrip()}\n(margin: to the nearest joint limit, on the way down and up again)\n"
 
 
 def _told(result: GraspResult) -> dict[str, Any]:

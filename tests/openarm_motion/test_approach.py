@@ -181,6 +181,18 @@ def test_the_higher_score_is_chosen_where_it_can_be_reached(right: Arm, home: di
         assert plan.refusals[0].id == "leaning"
 
 
+def test_limit_margins_are_those_of_both_lines(right: Arm, home: dict[str, float]) -> None:
+    ways = (grasp("far", 0.60, -0.22, 0.05, 0.0, score=0.9), grasp("near", 0.26, -0.22, 0.05, 0.0, score=0.5))
+    worse = grasp("worse", 0.26, -0.22, 0.05, 1.0, score=0.1)
+    plan = plan_approach(right, right.situation(home), ApproachRequest((*ways, worse)))
+    assert plan.chosen == 1
+    refused, chosen, not_needed = plan.limit_margins
+    assert np.isnan(refused)
+    assert np.isnan(not_needed)
+    lines = np.vstack([plan.approach.q, plan.retreat.q])
+    assert chosen == pytest.approx(right.kinematics.margin(lines), abs=1e-3)
+
+
 def test_refusals_say_why(right: Arm, home: dict[str, float]) -> None:
     far = grasp("far", 0.60, -0.22, 0.05, 0.0)
     buried = grasp("buried", 0.26, -0.22, 0.05, 0.0)

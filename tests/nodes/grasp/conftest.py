@@ -6,6 +6,7 @@ The fakes speak the real interfaces. Robot time runs five times as fast as the w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from control_msgs.action import ParallelGripperCommand
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, Pick, PickTwo, PlanApproach
-from openarm_interfaces.msg import GraspStatus
+from openarm_interfaces.msg import GraspStatus, Refusal
 from openarm_interfaces.srv import ComputeIK, Grasp
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -131,6 +132,9 @@ class FakeGraph(Node):
         self.log.append(f"plan {request.arm}")
         if self.unreachable:
             result.code, result.message = "UNREACHABLE", f"{request.arm} arm: too far"
+            result.refusals = [
+                Refusal(id=way.id, code="UNREACHABLE", message=f"{way.id}: too far for it") for way in request.targets
+            ]
             goal.abort()
             return result
         target = request.targets[0]
@@ -143,6 +147,7 @@ class FakeGraph(Node):
         result.approach = self._trajectory(request.arm, q)
         result.retreat = self._trajectory(request.arm, self._reach(request.arm, end, q))
         result.success, result.code, result.chosen = True, "OK", 0
+        result.limit_margins = [0.25] + [math.nan] * (len(request.targets) - 1)
         goal.succeed()
         return result
 

@@ -111,6 +111,8 @@ def test_out_of_reach_names_the_nearest_arm_distance(bench):
     assert "right arm gets within 250 mm" in answer.message
     assert "too far" in answer.message
     assert "execute" not in bench.world.log
+    assert len(answer.options) == 28
+    assert {(o.arm, o.code, o.message) for o in answer.options} == {("right", "UNREACHABLE", "too far for it")}
 
 
 def test_an_unknown_arm_and_a_place_off_the_table_are_refused(bench):
@@ -128,6 +130,11 @@ def test_a_dry_run_moves_nothing(bench):
     answer = bench.ask(dry_run=True)
     assert answer.success, answer.message
     assert bench.world.log == ["plan right", "plan right"]
+    chosen, *others = answer.options
+    assert (chosen.arm, chosen.code, chosen.limit_margin) == ("right", "OK", 0.25)
+    assert chosen.score == pytest.approx(sum(chosen.values))
+    assert chosen.parts == ["tilt", "width", "side", "room", "used"]
+    assert {(o.code, o.message) for o in others} == {("", "not needed: another was chosen")}
     bench.until(lambda: bench.markers, what="markers of the candidates")
     assert len(bench.markers[-1].markers) > 20
 

@@ -183,6 +183,9 @@ def test_a_grasp_is_planned_executed_and_shown_as_attached_b47(bench) -> None:
     plan = bench.run(bench.plan_client, approach_goal(bench, attached_after_approach=True))
     assert (plan.success, plan.code, plan.chosen) == (True, "OK", 1), plan.message
     assert [(r.id, r.code) for r in plan.refusals] == [("far", "UNREACHABLE")]
+    far, near = plan.limit_margins
+    assert np.isnan(far)
+    assert 0.05 <= near < 1.6  # the limit margin of the planner, and less than half of the narrowest joint's range
     assert plan.planning_time < 3.0
     for part, held in ((plan.transfer, []), (plan.approach, []), (plan.retreat, ["right/cube"])):
         result = bench.run(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=part))
