@@ -105,6 +105,8 @@ def test_what_comes_while_the_recorder_is_held_up_is_not_lost(tmp_path: Path) ->
             for stream in streams:
                 stream.publish(String(data=str(i)))
         process.send_signal(signal.SIGCONT)
+        last.publish(String())  # behind all of them in the queue
+        assert last.wait_for_all_acked(Duration(seconds=10))
         process.send_signal(signal.SIGINT)
         out, _ = process.communicate(timeout=20.0)
     finally:
@@ -113,4 +115,4 @@ def test_what_comes_while_the_recorder_is_held_up_is_not_lost(tmp_path: Path) ->
         node.destroy_node()
         context.try_shutdown()
     told = json.loads(out)
-    assert (told["messages"], told["lost"]) == (1201, 0), told["message"]
+    assert (told["messages"], told["lost"]) == (1202, 0), told["message"]
