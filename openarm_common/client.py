@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
@@ -90,7 +91,7 @@ class BackgroundNode:
             name: Of the action.
             goal: To send.
             timeout: Longest wait for the end, s of wall clock; then, and at any exception, the goal is cancelled.
-            on_feedback: Called with each feedback, in the background thread.
+            on_feedback: Called with each feedback, in the background thread; what it raises is raised here.
             stop: When it is set the goal is cancelled, and its result waited for.
 
         Raises:
@@ -99,14 +100,17 @@ class BackgroundNode:
         client: ActionClient = self._client(name, lambda: ActionClient(self._node, kind, name))
         if not client.wait_for_server(timeout_sec=self._timeout):
             raise OpenArmError(Code.NOT_READY, f"no action {name} within {self._timeout:g} s: {_UP}")
-        deliver = None if on_feedback is None else (lambda message: on_feedback(message.feedback))
+        trouble: list[Exception] = []
+        deliver = None if on_feedback is None else _guarded(on_feedback, trouble)
         there = client.server_is_ready
-        handle = self._wait(self._begin(client.send_goal_async, goal, deliver), self._timeout, name, there)
+        sent = self._begin(client.send_goal_async, goal, deliver)
+        handle = self._wait(sent, self._timeout, name, there)
         if not handle.accepted:
             raise OpenArmError(Code.BUSY, f"{name} refused the goal")
         try:
             ended = self._begin(handle.get_result_async)
-            answer = self._wait(ended, timeout, name, there, stop, lambda: self._begin(handle.cancel_goal_async))
+            cancel = partial(self._begin, handle.cancel_goal_async)
+            answer = self._wait(ended, timeout, name, there, stop, cancel, trouble)
         except BaseException:
             # Whatever keeps the caller from waiting (a deadline, Ctrl-C): nobody would see the robot go on.
             _event(self._begin(handle.cancel_goal_async)).wait(2.0)
@@ -139,6 +143,7 @@ class BackgroundNode:
         there: Callable[[], bool],
         stop: threading.Event | None = None,
         cancel: Callable[[], object] = lambda: None,
+        trouble: Sequence[Exception] = (),
     ) -> Any:
         done = _event(future)
         deadline = time.monotonic() + timeout
@@ -147,6 +152,8 @@ class BackgroundNode:
             missed = 0 if there() else missed + 1
             if missed > _GONE:
                 raise OpenArmError(Code.NOT_READY, f"the server of {name} is gone")
+            if trouble:
+                raise trouble[0]
             if not self._thread.is_alive():
                 raise OpenArmError(Code.NOT_READY, f"the client was closed while waiting for {name}")
             if time.monotonic() > deadline:
@@ -162,6 +169,18 @@ class BackgroundNode:
             self._executor.spin()
         except ExternalShutdownException:
             self._node.get_logger().debug("the context was shut down")
+
+
+def _guarded(on_feedback: Callable[[Any], None], trouble: list[Exception]) -> Callable[[Any], None]:
+    """A callback that files what it raises: raised in the background it would stop the thread."""
+
+    def deliver(message: Any) -> None:
+        try:
+            on_feedback(message.feedback)
+        except Exception as error:
+            trouble.append(error)
+
+    return deliver
 
 
 def _event(future: Future) -> threading.Event:

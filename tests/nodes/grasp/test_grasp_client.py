@@ -88,6 +88,26 @@ def test_the_client_can_cancel_from_its_feedback(bench):
     assert results[0].code is Code.CANCELLED
 
 
+def test_what_the_feedback_raises_reaches_the_caller_and_the_grasp_is_cancelled(bench):
+    errors: list[Exception] = []
+
+    def fail(_: object) -> None:
+        raise ValueError("a fault in the user's code")
+
+    def script() -> None:
+        with GraspClient() as grasp:
+            try:
+                grasp.pick("red", on_feedback=fail)
+            except ValueError as error:
+                errors.append(error)
+
+    thread = Thread(target=script)
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), 20.0, "the script ends")
+    thread.join()
+    assert "user's code" in str(errors[0])
+
+
 def test_the_client_notices_that_the_node_is_gone(bench):
     bench.world.during = lambda what: Future()
     errors: list[OpenArmError] = []
