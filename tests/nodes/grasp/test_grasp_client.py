@@ -88,7 +88,7 @@ def test_the_client_can_cancel_from_its_feedback(bench):
     assert results[0].code is Code.CANCELLED
 
 
-def test_what_the_feedback_raises_reaches_the_caller_and_the_grasp_is_cancelled(bench):
+def test_what_the_feedback_raises_reaches_the_caller(bench):
     errors: list[Exception] = []
 
     def fail(_: object) -> None:
