@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from itertools import groupby
 from threading import Thread
 
@@ -128,6 +129,26 @@ def test_a_limit_of_time_ends_both_with_their_hands_closed(bench) -> None:
     assert [answer.code for answer in result.answers] == ["TIMEOUT", "TIMEOUT"]
     assert result.duration == pytest.approx(20.0, abs=5.0)
     assert bench.world.hands == {"right": "red", "left": "blue"}
+
+
+def test_a_cancel_while_both_are_looked_at_moves_nothing(bench) -> None:
+    handle, result = bench.ros.send_goal(bench.two, goal("red", "blue"))
+    bench.until(lambda: "looking at both" in bench.status[-1].reason, what="the look")
+    assert bench.ros.result(handle.cancel_goal_async()).goals_canceling
+    end = bench.ros.result(result, 5.0)
+    assert (end.status, end.result.code) == (GoalStatus.STATUS_CANCELED, "CANCELLED")
+    assert bench.world.asked == []
+    assert bench.ask("red").success
+
+
+def test_a_robot_that_goes_silent_ends_both_within_two_seconds(bench) -> None:
+    _, result = at_once(bench)
+    bench.world.silent = True
+    began = time.monotonic()
+    end: PickTwo.Result = bench.ros.result(result, 5.0).result
+    assert time.monotonic() - began < 2.0
+    assert end.code == "ROBOT_LOST"
+    assert [answer.code for answer in end.answers] == ["ROBOT_LOST", "ROBOT_LOST"]
 
 
 def test_a_dry_run_of_two_moves_nothing(bench) -> None:
