@@ -14,7 +14,7 @@ from tf2_msgs.msg import TFMessage
 from openarm_common.convert import stamp_to_ns, transform_to_matrix
 from openarm_common.description import RobotDescription
 from openarm_common.lockstep_node import LockstepNode
-from openarm_common.node import QOS_COMMAND, QOS_STATIC_TF
+from openarm_common.node import QOS_STATIC_TF, reliable
 from openarm_common.robot_state import RobotStateBuffer
 
 
@@ -26,13 +26,18 @@ class RobotStateListener:
         description: The robot.
         joints: Whether to listen to /joint_states from the start; a 100 Hz subscription costs 5 to 10 % of a core, so a
             node that needs it only now and then passes False and calls `enable`.
+        depth: Joint states that wait while the node is busy. Who acts on the newest wants few; who asks for the one of
+            an image's stamp wants those of the time that an image takes.
     """
 
-    def __init__(self, node: LockstepNode, description: RobotDescription, *, joints: bool = True) -> None:
+    def __init__(
+        self, node: LockstepNode, description: RobotDescription, *, joints: bool = True, depth: int = 10
+    ) -> None:
         self.buffer = RobotStateBuffer(description)
         self.efforts: dict[str, float] = {}
         self.velocities: dict[str, float] = {}
         self._node = node
+        self._depth = depth
         self._received_at: float | None = None
         self._joints: Subscription | None = None
         node.create_subscription(TFMessage, "/tf_static", self._on_static, QOS_STATIC_TF)
@@ -45,7 +50,9 @@ class RobotStateListener:
         if on and self._joints is None:
             self.buffer.clear()
             self._received_at = None
-            self._joints = self._node.create_subscription(JointState, "/joint_states", self._on_joints, QOS_COMMAND)
+            self._joints = self._node.create_subscription(
+                JointState, "/joint_states", self._on_joints, reliable(self._depth)
+            )
         elif not on and self._joints is not None:
             self._node.destroy_subscription(self._joints)
             self._joints = None

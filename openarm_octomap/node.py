@@ -44,7 +44,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         self._sources: list[Source[Image] | Source[PointCloud2]] = [*self._cameras]
         if config.cloud_topic:
             self._sources.append(CloudSource(self, config.cloud_topic))
-        self._states = RobotStateListener(self, self.description, joints=False)
+        self._states = RobotStateListener(self, self.description, joints=False, depth=100)
         self._held: tuple[HeldBox, ...] = ()
         self._t_ns = 0
         self._busy = False

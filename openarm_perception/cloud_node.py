@@ -159,7 +159,7 @@ class CloudNode(BaseNode[CloudNodeConfig]):
         #: Where the robot is; None when it is left in the clouds.
         self.states: RobotStateListener | None = None
         if self.config.self_filter.enabled:
-            self.states = RobotStateListener(self, self.description, joints=False)
+            self.states = RobotStateListener(self, self.description, joints=False, depth=100)
         self.retry = self.create_timer(0.01, self._try_waiting, clock=self.wall_clock)
         self.retry.cancel()
         self._cameras = {name: _Camera(self, name) for name in self.config.cameras}

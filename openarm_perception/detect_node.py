@@ -62,7 +62,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._localizer = Localizer(config.localizer, limits, config.table_top_z())
         self._pipeline = self._first_pipeline()
         self.accept_changes(self._take)
-        self._poses = RobotStateListener(self, self.description, joints=False)
+        self._poses = RobotStateListener(self, self.description, joints=False, depth=100)
         self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(tuple(self._topics()), self._on_frame)
         self._inputs: list[Subscription] = []
         self._waiting: Frame | None = None
