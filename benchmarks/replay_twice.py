@@ -6,9 +6,9 @@
 Starts the graph `sim`, asks it for a grasp, and records both cameras meanwhile (60 s; --bag takes a recording instead).
 Then, twice each: `openarm check`, in a process of its own, and `openarm replay` into the graph `replay`, whose
 detections, clouds and map are listened to. What carries the same stamp in both replays is compared byte by byte. Which
-frames a node takes is a matter of its pace: those of one replay alone are counted, and so are the cells of the map, which
-takes two frames a second. Exit code 1 when anything was lost, or differs that has the same stamp. Run it on an idle
-machine, or with a rate at which the nodes keep up.
+frames a node takes is a matter of its pace: those of one replay alone are counted, and so are the cells of the map,
+which takes two frames a second. Exit code 1 when anything was lost, or differs that has the same stamp. Run it on an
+idle machine, or with a rate at which the nodes keep up.
 
     recorded, recorded_lost     messages in the bag, and published but not in the bag
     check_numbers, check_differ numbers of `openarm check`, and how many of them differ between two runs
