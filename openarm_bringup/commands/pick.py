@@ -155,7 +155,7 @@ def _weighed(options: Sequence[Option]) -> str:
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("")
     for option in options:
-        values = (f"{option.parts[name]:+.2f}" if name in option.parts else "" for name in parts)
+        values = (f"{option.parts[name]:+z.2f}" if name in option.parts else "" for name in parts)
         margin = "" if math.isnan(option.limit_margin) else f"{math.degrees(option.limit_margin):.0f}°"
         score = f"{option.score:+.2f}" if option.parts else ""
         code = f"{option.code}: " if option.code not in ("", Code.OK) else ""
@@ -163,7 +163,8 @@ def _weighed(options: Sequence[Option]) -> str:
     console = Console(width=160, color_system=None)
     with console.capture() as shown:
         console.print(table)
-    return f"{shown.get().rstrip()}\n(margin: to the nearest joint limit, on the way down and up again)\n"
+    lines = (line.rstrip() for line in shown.get().splitlines())
+    return "\n".join(lines) + "\n(margin: to the nearest joint limit, on the way down and up again)\n"
 
 
 def _told(result: GraspResult) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from openarm_common.errors import Code
 from openarm_grasp.options import Option
 
 OPTIONS = (
-    Option("red/x+/tilt0", "left", 0.05, {"tilt": 0.0, "width": 0.05}, 0.5, Code.OK, "chosen"),
+    Option("red/x+/tilt0", "left", 0.05, {"tilt": -0.0, "width": 0.05}, 0.5, Code.OK, "chosen"),
     Option(
         "red/x-/tilt0", "left", 0.05, {"tilt": 0.0, "width": 0.05}, code="IN_COLLISION", message="[hand] meets blue"
     ),
