@@ -67,6 +67,10 @@ class RobotStateBuffer:
         """Return the joint states from one stamp to another, both included, oldest first."""
         return [state for state in self._states if start_ns <= state[0] <= end_ns]
 
+    def settled(self, t_ns: int) -> bool:
+        """Whether no state that is still to come changes the joints at a stamp: there is one at it, or after it."""
+        return bool(self._states) and self._states[-1][0] >= t_ns
+
     def joints_at(self, t_ns: int) -> dict[str, float]:
         """Joint positions at a stamp, rad or m by joint name.
 

@@ -86,7 +86,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._picture = self.create_publisher(Image, "/detection_image", QOS_SENSOR)
         self._mask = self.create_publisher(Image, "/detection_mask", QOS_SENSOR)
         self._markers = self.create_publisher(MarkerArray, "/detection_markers", reliable(5))
-        self._retry = self.create_timer(0.02, self._try_waiting, clock=self.wall_clock)
+        self._retry = self.create_timer(0.01, self._try_waiting, clock=self.wall_clock)
         self._retry.cancel()
         self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
         self.diagnose(True, "idle: nobody listens", **self._counts)
@@ -210,6 +210,9 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         if frame is None:
             self._retry.cancel()
             return
+        if self._to_come(frame):
+            self._retry.reset()
+            return
         try:
             T_base_camera = self._poses.buffer.lookup(BASE_FRAME, self._optical_frame, frame.t_ns)
             joints = self._posture(frame)
@@ -246,6 +249,11 @@ class DetectNode(BaseNode[DetectNodeConfig]):
                 raise
             self._uncut = error.message
             return None
+
+    def _to_come(self, frame: Frame) -> bool:
+        """Whether the joint state after the stamp is on its way: between two the posture is exact, however they come."""
+        heard = self._poses.age_s() <= _FRESH
+        return heard and not self._poses.buffer.settled(frame.t_ns) and self.monotonic() < frame.deadline
 
     def _starting(self) -> bool:
         """Whether the first joint states may still be on their way."""

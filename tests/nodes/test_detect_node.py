@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from openarm_interfaces.srv import MeasureTable
@@ -237,6 +239,21 @@ def test_b14_b32_b61_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) 
         bench.camera.joints.publish(arm(t + offset * MS, q))
     ros.spin_until(lambda: bench.watch.got, 5.0, "the detection of the frame that waited")
     assert stamp_to_ns(bench.watch.got[0].header.stamp) == t
+    (found,) = bench.watch.got[0].detections
+    np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.0015)
+
+
+def test_b61_a_joint_state_just_before_the_image_is_not_enough_while_the_next_is_to_come(ros) -> None:
+    """Which of the two came first must not decide: taking the nearer one, the arm moving, would be 15 mm off."""
+    bench = on_arm(ros, transform_wait=5.0)
+    bench.pump(lambda: bench.node.waiting_ns, "a frame waits")
+    t = bench.node.waiting_ns
+    bench.camera.joints.publish(arm(t - 3 * MS, 0.47))
+    looks_again = time.monotonic() + 0.3
+    ros.spin_until(lambda: bench.watch.got or time.monotonic() > looks_again, 5.0, "time to look again")
+    assert not bench.watch.got
+    bench.camera.joints.publish(arm(t + 12 * MS, 0.62))
+    ros.spin_until(lambda: bench.watch.got, 5.0, "the detection of the frame that waited")
     (found,) = bench.watch.got[0].detections
     np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.0015)
 

@@ -97,3 +97,10 @@ def test_a_loop_of_static_edges_ends(buffer: RobotStateBuffer) -> None:
     buffer.set_static("a", "b", np.eye(4))
     with pytest.raises(OpenArmError, match="not connected"):
         buffer.lookup("base", "a", 0)
+
+
+def test_a_stamp_is_settled_when_a_state_at_it_or_after_it_is_there(buffer: RobotStateBuffer) -> None:
+    assert not buffer.settled(0)
+    buffer.add_joint_state(10, ["a"], [0.0])
+    assert buffer.settled(10)
+    assert not buffer.settled(11)
