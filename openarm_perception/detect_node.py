@@ -251,7 +251,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             return None
 
     def _to_come(self, frame: Frame) -> bool:
-        """Whether the joint state after the stamp is on its way: between two the posture is exact, however they come."""
+        """Whether the joint state after the stamp is on its way: between two the posture is exact."""
         heard = self._poses.age_s() <= _FRESH
         return heard and not self._poses.buffer.settled(frame.t_ns) and self.monotonic() < frame.deadline
 
