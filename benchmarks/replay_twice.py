@@ -5,15 +5,15 @@
 
 Starts the graph `sim`, asks it for a grasp, and records both cameras meanwhile (60 s; --bag takes a recording instead).
 Then, twice each: `openarm check`, in a process of its own, and `openarm replay` into the graph `replay`, whose
-detections, clouds and map are listened to. What carries the same stamp in both replays is compared byte by byte. Which
-frames a node takes is a matter of its pace: those of one replay alone are counted, and so are the cells of the map,
-which takes two frames a second. Exit code 1 when anything was lost, or differs that has the same stamp. Run it on an
-idle machine, or with a rate at which the nodes keep up.
+detections, clouds and map are listened to. What carries the same stamp in both replays is compared, every field and
+every point. Which frames a node takes is a matter of its pace: those of one replay alone are counted, and so are the
+cells of the map, which takes two frames a second. Exit code 1 when anything was lost, or differs that has the same
+stamp. Run it on an idle machine, or with a rate at which the nodes keep up.
 
     recorded, recorded_lost     messages in the bag, and published but not in the bag
     check_numbers, check_differ numbers of `openarm check`, and how many of them differ between two runs
     NAME_twice, NAME_once       messages of a topic with a stamp in both replays, and in only one
-    NAME_differ                 of those in both, how many differ in any byte
+    NAME_differ                 of those in both, how many differ in anything
     map_cells, map_cells_differ occupied and free cells at the end, and how many differ between two replays
 """
 
@@ -58,6 +58,7 @@ def listen(path: Path) -> None:
     import rclpy
     from octomap_msgs.msg import Octomap
     from rclpy.executors import ExternalShutdownException
+    from rclpy.serialization import deserialize_message
     from sensor_msgs.msg import PointCloud2
     from vision_msgs.msg import Detection3DArray
 
@@ -73,7 +74,9 @@ def listen(path: Path) -> None:
 
         def on_message(raw: bytes) -> None:  # a header comes first: its stamp follows four bytes of encapsulation
             sec, nanosec = np.frombuffer(raw, np.uint32, count=2, offset=4).tolist()
-            digests[sec * 1_000_000_000 + nanosec] = hashlib.sha256(raw).hexdigest()
+            # the bytes between fields are whatever was in memory: of small messages every field is compared instead
+            content = raw if kind is PointCloud2 else repr(deserialize_message(raw, kind)).encode()
+            digests[sec * 1_000_000_000 + nanosec] = hashlib.sha256(content).hexdigest()
 
         node.create_subscription(kind, topic, on_message, qos, raw=True)
 
