@@ -132,13 +132,10 @@ def find(*words: str, domain: int | None = None, timeout: float = 20.0) -> Outco
         timeout: Longest wait for a detection, s.
     """
     from openarm_bringup.commands.pick import meet_graph
-    from openarm_bringup.detector.things_client import DetectionListener
-    from openarm_perception.attributes import parse, resolve
+    from openarm_bringup.detector import things_client
 
     meet_graph(domain)
-    with DetectionListener() as listener:
-        things = listener.next(timeout)
-    thing = resolve(parse(" ".join(words), [t.label for t in things]), things)
+    (thing,) = things_client.find([" ".join(words)], timeout)
     x, y, z = (round(float(value), 4) for value in thing.position)
     message = f"{thing.label} {thing.kind} at x {x} y {y} z {z} m"
     return Outcome(True, message, data={"label": thing.label, "kind": thing.kind, "position": [x, y, z]})

@@ -46,7 +46,8 @@ def pick(
     each other's way. Where something is said of two objects, it is said of each: `--arm left --arm right`.
 
     Args:
-        label: What to pick, such as red; without one, what is seen best.
+        label: What to pick: a label such as red, or words such as "red cube left of the can"; without one, what is seen
+            best.
         second: Another object, at the same time.
         arm: Which arm: auto when not given.
         at: x y near which the object stands, base frame, m: which of several alike.
@@ -64,6 +65,7 @@ def pick(
     if second and phase != "all":
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--phase {phase} is of one object; two are picked and placed")
     meet_graph(domain)
+    labels, spots = _meant(labels, spots)
     from openarm_grasp.answers import Wanted
     from openarm_grasp.client import GraspClient
 
@@ -100,6 +102,23 @@ def pick(
         return Outcome(result.success, result.message, result.code, {**_told(result), "dry_run": False})
     data = {**_told(result), "dry_run": True, "options": [_fared(option) for option in result.options]}
     return Outcome(result.success, result.message, result.code, data, _weighed(result.options))
+
+
+def _meant(
+    labels: Sequence[str], spots: Sequence[tuple[float, float] | None]
+) -> tuple[Sequence[str], Sequence[tuple[float, float] | None]]:
+    """Labels and places of what is asked for; who asks in several words means one object of those in view."""
+    worded = [i for i, label in enumerate(labels) if " " in label.strip()]
+    if not worded:
+        return labels, spots
+    from openarm_bringup.detector import things_client
+
+    names, places = list(labels), list(spots)
+    for i, thing in zip(worded, things_client.find([labels[i] for i in worded]), strict=True):
+        if places[i] is not None:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{labels[i]!r} says where it stands; leave --at out")
+        names[i], places[i] = thing.label, (float(thing.position[0]), float(thing.position[1]))
+    return names, places
 
 
 def _each(name: str, given: list[T] | None, labels: Sequence[str]) -> Sequence[T | None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import queue
 import time
+from collections.abc import Sequence
 
 from vision_msgs.msg import Detection3D, Detection3DArray
 
@@ -12,7 +13,7 @@ from openarm_common.client import BackgroundNode
 from openarm_common.convert import xyz
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import reliable
-from openarm_perception.attributes import Thing
+from openarm_perception.attributes import Thing, parse, resolve
 
 
 class DetectionListener(BackgroundNode):
@@ -41,6 +42,18 @@ class DetectionListener(BackgroundNode):
                 Code.TIMEOUT, f"no answer of the detector within {timeout:g} s; is the graph up, and its camera?"
             )
         return found
+
+
+def find(requests: Sequence[str], timeout: float = 20.0) -> list[Thing]:
+    """The objects that requests in words mean, such as "red cube left of the can", as the detector sees them now.
+
+    Raises:
+        OpenArmError: TIMEOUT, when the detector says nothing; as `parse` and `resolve`.
+    """
+    with DetectionListener() as listener:
+        seen = listener.next(timeout)
+    labels = [thing.label for thing in seen]
+    return [resolve(parse(request, labels), seen) for request in requests]
 
 
 def things(message: Detection3DArray) -> list[Thing]:

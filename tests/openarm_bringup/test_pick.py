@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm pick --dry-run`: what is printed of the ways to grasp."""
+"""`openarm pick`: requests in words, and what a dry run prints of the ways to grasp."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+
+import pytest
 
 from openarm_bringup.commands import pick
-from openarm_common.errors import Code
+from openarm_bringup.detector import things_client
+from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.options import Option
+from openarm_perception.attributes import Thing
 
 OPTIONS = (
     Option("red/x+/tilt0", "left", 0.05, {"tilt": -0.0, "width": 0.05}, 0.5, Code.OK, "chosen"),
@@ -25,6 +30,22 @@ def test_each_way_to_grasp_has_a_line_with_parts_margin_and_reason() -> None:
     assert refused.endswith("IN_COLLISION: [hand] meets blue")
     assert wide.split() == ["red/y", "left", "TOO_WIDE:", "90", "mm", "wide"]
     assert pick._weighed(()) == ""
+
+
+def test_words_mean_the_object_that_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def find(requests: Sequence[str]) -> list[Thing]:
+        asked.extend(requests)
+        return [Thing("red", "box", (0.3, -0.2, 0.42), (0.05, 0.05, 0.05), 0.9)]
+
+    monkeypatch.setattr(things_client, "find", find)
+    labels, spots = pick._meant(("blue", "red cube left of the can"), ((0.1, 0.2), None))
+    assert (labels, spots) == (["blue", "red"], [(0.1, 0.2), (0.3, -0.2)])
+    assert asked == ["red cube left of the can"]
+    assert pick._meant(("blue",), (None,)) == (("blue",), (None,))
+    with pytest.raises(OpenArmError, match="leave --at out"):
+        pick._meant(("red cube",), ((0.3, -0.2),))
 
 
 def test_json_has_no_number_for_a_margin_that_is_not_known() -> None:
