@@ -12,24 +12,21 @@ import resource
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
-from rclpy.context import Context
-from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import Image
-from std_msgs.msg import String
 
 from openarm_bringup.bags.bag import open_bag
-from openarm_bringup.supervision.environment import profiled, write_profile
+from openarm_bringup.supervision.environment import PROFILE, write_profile
 from openarm_bringup.supervision.graph import NodeSpec
 from openarm_common.convert import array_to_image
-from openarm_common.node import QOS_COMMAND, QOS_SENSOR
+from openarm_common.domain import release_domain, reserve_domain
+from openarm_common.node import QOS_COMMAND
+from tests.nodes import streams
 
 TOPIC = "/overhead/color/image_raw"
 
@@ -79,40 +76,42 @@ def test_what_was_recorded_can_be_read(
         assert all(len(record.data) > noise.nbytes for record in bag.records())
 
 
+@pytest.fixture
+def fresh_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A domain in which nobody was killed: Fast DDS would go on with the port that it left, whatever its size."""
+    domain = reserve_domain()
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    yield
+    release_domain(domain)
+
+
+@pytest.mark.usefixtures("fresh_domain")
 def test_what_comes_while_the_recorder_is_held_up_is_not_lost(tmp_path: Path) -> None:
     """As on a busy machine: a second of a graph, twice what Fast DDS keeps for a process by itself."""
-    topics = [f"/stream_{i}" for i in range(8)]
     command = [sys.executable, "-m", "openarm_bringup.cli", "record", "bag", "--topics", "/stream_.*", "--json"]
     env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    context = Context()
     spec = NodeSpec(module="bridge", large_messages=True, segment_mib=8)
-    with profiled(write_profile(spec, tmp_path / "fastdds.xml")):
-        rclpy.init(context=context)
-        node = rclpy.create_node("streams", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    streams = [node.create_publisher(String, topic, QOS_SENSOR) for topic in topics]
-    last = node.create_publisher(String, "/stream_last", QOS_COMMAND)  # met last, and that is acknowledged
-    process = subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True)
-    try:
-        deadline = time.monotonic() + 30.0
-        while not all(stream.get_subscription_count() for stream in (*streams, last)):
-            assert time.monotonic() < deadline, "the recorder subscribes"
-            rclpy.spin_once(node, executor=executor, timeout_sec=0.05)
-        last.publish(String())
-        assert last.wait_for_all_acked(Duration(seconds=10))
-        process.send_signal(signal.SIGSTOP)
-        for i in range(150):
-            for stream in streams:
-                stream.publish(String(data=str(i)))
-        process.send_signal(signal.SIGCONT)
-        last.publish(String())  # behind all of them in the queue
-        assert last.wait_for_all_acked(Duration(seconds=10))
-        process.send_signal(signal.SIGINT)
-        out, _ = process.communicate(timeout=20.0)
-    finally:
-        process.kill()
-        process.communicate()
-        node.destroy_node()
-        context.try_shutdown()
+    profile = {PROFILE: str(write_profile(spec, tmp_path / "fastdds.xml"))}
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with (
+        subprocess.Popen([sys.executable, streams.__file__], env={**env, **profile}, **pipes) as sender,
+        subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, text=True) as recorder,
+    ):
+        try:
+            assert sender.stdin is not None
+            assert sender.stdout is not None
+            assert sender.stdout.readline() == "met\n"
+            recorder.send_signal(signal.SIGSTOP)
+            print(file=sender.stdin, flush=True)
+            assert sender.stdout.readline() == "sent\n"
+            recorder.send_signal(signal.SIGCONT)
+            print(file=sender.stdin, flush=True)
+            assert sender.stdout.readline() == "taken\n"
+            recorder.send_signal(signal.SIGINT)
+            out, _ = recorder.communicate(timeout=20.0)
+        finally:
+            recorder.kill()
+            sender.kill()
     told = json.loads(out)
-    assert (told["messages"], told["lost"]) == (1202, 0), told["message"]
+    sent = streams.STREAMS * streams.ROUNDS + 2
+    assert (told["messages"], told["lost"]) == (sent, 0), told["message"]
