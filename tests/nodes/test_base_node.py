@@ -128,7 +128,9 @@ def test_p34_a_signal_ends_the_process_in_order_with_exit_code_0(stop: signal.Si
 
 
 def test_a_signal_lets_the_node_bring_to_rest_what_it_moves_while_the_graph_is_there() -> None:
-    spins = "timer = self.create_timer(0.01, lambda: (timer.cancel(), print('ready', flush=True)), clock=self.steady_clock)"
+    spins = (
+        "timer = self.create_timer(0.01, lambda: (timer.cancel(), print('ready', flush=True)), clock=self.steady_clock)"
+    )
     script = _SCRIPT.replace('print("ready", flush=True)', spins).replace(
         "    def close(self):",
         """\
