@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.observation import Detection, Frame
 from openarm_grasp.states import State
+from tests.openarm_grasp.two_arms import TwoArms
 
 Fault = Callable[[fx.Effect], OpenArmError | None]
 
@@ -181,3 +183,11 @@ def worlds() -> Callable[..., World]:
 def world() -> World:
     """A red cube on the right, a blue one on the left."""
     return World(standing("red", 0.26, -0.2), standing("blue", 0.26, 0.2))
+
+
+@pytest.fixture
+def robot(worlds: Callable[..., Any], box: Callable[..., Any]) -> Callable[..., TwoArms]:
+    def make(x: float, y: float, *others: tuple[str, float, float], **config: Any) -> TwoArms:
+        return TwoArms(worlds(box("red", x, y), *(box(*other) for other in others), **config))
+
+    return make
