@@ -6,25 +6,29 @@
 set -eu
 
 root=$(cd "$(dirname -- "$0")/.." && pwd)
+for tool in python uv; do
+    [ -x "$root/.venv/bin/$tool" ] || {
+        echo "colcon_check: no $root/.venv/bin/$tool; run ./openarm doctor once, which sets .venv up" >&2
+        exit 2
+    }
+done
 work=${1:-$(mktemp -d "${TMPDIR:-/tmp}/openarm-colcon-XXXXXX")}
 mkdir -p "$work"
 work=$(cd "$work" && pwd)
 env=$work/env
-uv=$root/.venv/bin/uv
-[ -x "$uv" ] || uv=uv
 say() { printf '== %s\n' "$*"; }
 
+uv=$root/.venv/bin/uv
 unset PYTHONPATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 say "environment in $env"
-python=$root/.venv/bin/python
-[ -x "$python" ] || python=python3
-[ -x "$env/bin/python" ] || "$uv" venv --quiet --no-python-downloads --python "$python" "$env"
+[ -x "$env/bin/python" ] || "$uv" venv --quiet --no-python-downloads --python "$root/.venv/bin/python" "$env"
 for lock in requirements.lock requirements-build.lock; do
     "$uv" pip install --quiet --python "$env" --require-hashes -r "$root/$lock"
 done
 "$uv" pip install --quiet --python "$env" colcon-common-extensions
-PATH=$env/bin:$PATH
+# CMake takes what lies beside any bin of PATH for installed: with that of .venv, its tf2_msgs instead of the one built here.
+PATH=$env/bin:/usr/local/bin:/usr/bin:/bin
 export PATH
 
 say "copy of the tree in $work/ws/src"
