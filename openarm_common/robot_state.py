@@ -110,14 +110,27 @@ class RobotStateBuffer:
         T_root_source = self._in_root(source, t_ns)
         return se3.inverse(T_root_target) @ T_root_source
 
+    def moves(self, frame: str) -> bool:
+        """Whether a moving joint lies between the base and a frame.
+
+        Raises:
+            OpenArmError: NO_TRANSFORM, as `lookup`.
+        """
+        link, _ = self._carrier(frame)
+        return any(joint.type != "fixed" for joint in self._description.chain(link))
+
     def _in_root(self, frame: str, t_ns: int) -> Array:
+        link, T_link_frame = self._carrier(frame)
+        q = self.joints_at(t_ns) if self.moves(link) else {}
+        return self._description.link_pose(link, q) @ T_link_frame
+
+    def _carrier(self, frame: str) -> tuple[str, Array]:
+        """The link that a frame is fixed to, and T_link_frame."""
         T = np.eye(4)
         name = frame
         for _ in range(len(self._static) + 1):
             if name in self._description.links:
-                moving = [j for j in self._description.chain(name) if j.type != "fixed"]
-                q = self.joints_at(t_ns) if moving else {}
-                return self._description.link_pose(name, q) @ T
+                return name, T
             if name not in self._static:
                 break
             name, T_parent = self._static[name]

@@ -9,21 +9,21 @@ from collections import deque
 from typing import Generic, TypeVar
 
 import numpy as np
-from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from openarm_common.cameras import CameraConfig
 from openarm_common.convert import image_to_array, intrinsics_from_info, points_from_cloud, stamp_to_ns
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import BASE_FRAME, QOS_NEWEST
-from openarm_common.robot_state import RobotStateBuffer
+from openarm_common.lockstep_node import LockstepNode
+from openarm_common.node import QOS_NEWEST
+from openarm_common.tf import RobotStateListener
 from openarm_octomap.grid import CloudScan, DepthScan
 from openarm_octomap.mapper import Frame
 
 MessageT = TypeVar("MessageT", Image, PointCloud2)
 
-#: Frames kept: the newest may be ahead of the joint states, by 0.1 s on a busy machine.
+#: Frames kept, of which the newest may be ahead of the joint states, on a busy machine by 0.1 s.
 _KEPT = 5
 
 
@@ -40,33 +40,34 @@ class Source(ABC, Generic[MessageT]):
         used_t_ns: Its stamp.
     """
 
-    def __init__(self, node: Node, name: str) -> None:
+    def __init__(self, node: LockstepNode, name: str) -> None:
         self.name = name
         self.used = self.refused = self.late = 0
         self.fault = ""
         self.used_at_ns = self.used_t_ns = 0
-        self._waiting: deque[MessageT] = deque(maxlen=_KEPT)
+        self._waiting: deque[tuple[MessageT, float]] = deque(maxlen=_KEPT)
         self._node = node
         self._inputs: list[Subscription] = []
 
-    def take(self, states: RobotStateBuffer, *, filtering: bool) -> Frame | None:
+    def take(self, states: RobotStateListener, *, filtering: bool) -> Frame | None:
         """The newest frame whose joints and transforms are known at its stamp; None when there is none.
 
         What can't be used is counted, and named in `fault`.
         """
         for i in range(len(self._waiting) - 1, -1, -1):
-            message = self._waiting[i]
+            message, since = self._waiting[i]
             t_ns = stamp_to_ns(message.header.stamp)
             try:
-                T_base_frame = states.lookup(BASE_FRAME, message.header.frame_id, t_ns)
-                joints = states.joints_at(t_ns) if filtering else None
+                posture = states.posture(message.header.frame_id, t_ns, since, joints=filtering)
             except OpenArmError as error:
                 self.fault = f"{self.name}: {error.message}"
+                continue
+            if posture is None:
                 continue
             for _ in range(i + 1):
                 self._waiting.popleft()
             try:
-                return Frame(self.name, t_ns, self._scan(message, T_base_frame), joints)
+                return Frame(self.name, t_ns, self._scan(message, posture.T_base_frame), posture.joints)
             except OpenArmError as error:
                 self.refused += 1
                 self.fault = f"{self.name}: {error.message}"
@@ -106,23 +107,23 @@ class Source(ABC, Generic[MessageT]):
         """The scan of a message; OpenArmError where it does not fit."""
 
     @abstractmethod
-    def _subscribe(self, node: Node) -> list[Subscription]:
+    def _subscribe(self, node: LockstepNode) -> list[Subscription]:
         """Begin to listen."""
 
     def _keep(self, message: MessageT) -> None:
-        self._waiting.append(message)
+        self._waiting.append((message, self._node.monotonic()))
 
 
 class DepthSource(Source[Image]):
     """Depth images of one camera, in its optical frame."""
 
-    def __init__(self, node: Node, camera: CameraConfig, depth_topic: str, info_topic: str) -> None:
+    def __init__(self, node: LockstepNode, camera: CameraConfig, depth_topic: str, info_topic: str) -> None:
         super().__init__(node, camera.name)
         self._camera = camera
         self._topics = [topic.format(camera=camera.name) for topic in (depth_topic, info_topic)]
         self._info: CameraInfo | None = None
 
-    def _subscribe(self, node: Node) -> list[Subscription]:
+    def _subscribe(self, node: LockstepNode) -> list[Subscription]:
         depth, info = self._topics
         return [
             node.create_subscription(Image, depth, self._keep, QOS_NEWEST),
@@ -151,10 +152,10 @@ class DepthSource(Source[Image]):
 class CloudSource(Source[PointCloud2]):
     """Clouds in any known frame, whose origin is taken for that of the rays."""
 
-    def __init__(self, node: Node, topic: str) -> None:
+    def __init__(self, node: LockstepNode, topic: str) -> None:
         super().__init__(node, topic)
 
-    def _subscribe(self, node: Node) -> list[Subscription]:
+    def _subscribe(self, node: LockstepNode) -> list[Subscription]:
         return [node.create_subscription(PointCloud2, self.name, self._keep, QOS_NEWEST)]
 
     def _scan(self, message: PointCloud2, T_base_frame: np.ndarray) -> CloudScan:

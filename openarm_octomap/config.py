@@ -101,6 +101,10 @@ class OctomapNodeConfig(Config):
     stale_after: float = Field(
         default=1.5, gt=0.0, description="a camera without a used frame for longer is reported, s"
     )
+    # shorter than five frames, which are kept: a joint state that never comes is named
+    transform_wait: float = Field(
+        default=0.1, ge=0.0, le=5.0, description="longest wait for the robot's posture at a stamp, s"
+    )
     held_topic: str = Field(default="/motion/attached_objects", description="what the hands hold, as markers on links")
     map_file: str = Field(default="", description=".bt or .ot to start from; empty: nothing is known")
     coarse_depths: tuple[int, ...] = Field(default=(15, 14, 13), description="further depths that services answer")

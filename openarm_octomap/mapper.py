@@ -40,13 +40,13 @@ class Frame:
         source: Name of the camera or cloud.
         t_ns: Stamp.
         scan: The image or cloud.
-        joints: Positions by joint name at the stamp; None when the robot is not cut out.
+        joints: Positions by joint name at the stamp; empty when the robot is not cut out.
     """
 
     source: str
     t_ns: int
     scan: DepthScan | CloudScan
-    joints: Mapping[str, float] | None
+    joints: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +160,7 @@ class Mapper:
         for frame in frames:
             scan = frame.scan
             if self._filtering:
-                body = self._filter.shapes(frame.joints or {}, held)
+                body = self._filter.shapes(frame.joints, held)
                 shapes = body if frame is newest else shapes
                 if isinstance(scan, DepthScan):
                     label, removed[frame.source] = self._filter.label_depth(scan, body)

@@ -44,7 +44,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         self._sources: list[Source[Image] | Source[PointCloud2]] = [*self._cameras]
         if config.cloud_topic:
             self._sources.append(CloudSource(self, config.cloud_topic))
-        self._states = RobotStateListener(self, self.description, joints=False, depth=100)
+        self._states = RobotStateListener(self, self.description, joints=False, depth=100, wait=config.transform_wait)
         self._held: tuple[HeldBox, ...] = ()
         self._t_ns = 0
         self._busy = False
@@ -101,7 +101,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         if self._busy:
             self._overruns += 1
             return
-        found = [source.take(self._states.buffer, filtering=self.config.filter.enabled) for source in self._sources]
+        found = [source.take(self._states, filtering=self.config.filter.enabled) for source in self._sources]
         frames = [frame for frame in found if frame is not None]
         if not frames:
             return

@@ -14,8 +14,8 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from openarm_common.convert import cloud_from_points, image_to_array, intrinsics_from_info, stamp_to_ns
 from openarm_common.depth_view import DepthView
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import BASE_FRAME, QOS_NEWEST, QOS_SENSOR, BaseNode, run
-from openarm_common.tf import RobotStateListener
+from openarm_common.node import QOS_NEWEST, QOS_SENSOR, BaseNode, run
+from openarm_common.tf import Posture, RobotStateListener
 from openarm_perception.config import CloudNodeConfig, camera_of
 from openarm_perception.convert import check_frames
 from openarm_perception.depth import Deprojector, DepthImage, DepthLimits
@@ -34,7 +34,7 @@ class _Camera:
         self._frame_id = camera.optical_frame
         self._deprojector = Deprojector(DepthLimits(near=camera.near, far=camera.far))
         self._robot = RobotInView(node, node.config.self_filter, node.config.held_topic) if node.states else None
-        #: A frame that waits for the robot's posture at its stamp, and until when.
+        #: A frame that waits for the robot's posture at its stamp, and since when.
         self._waiting: tuple[int, dict[str, Image | CameraInfo], float] | None = None
         self._filter = CloudFilter(node.config.filter)
         streams = ("depth", "info", "color") if node.config.color else ("depth", "info")
@@ -49,6 +49,11 @@ class _Camera:
     @property
     def active(self) -> bool:
         return bool(self._inputs)
+
+    @property
+    def waiting_ns(self) -> int | None:
+        """Stamp of the frame that waits for the robot's posture."""
+        return self._waiting[0] if self._waiting else None
 
     def follow_demand(self) -> None:
         """Listen to the camera while somebody wants its points."""
@@ -77,42 +82,33 @@ class _Camera:
         if self._robot is None:
             self._publish(t_ns, messages, None)
         elif self._waiting is None:
-            self._waiting = (t_ns, messages, self._node.monotonic() + self._node.config.transform_wait)
+            self._waiting = (t_ns, messages, self._node.monotonic())
             self.try_waiting()
 
-    def try_waiting(self) -> bool:
-        """Publish the frame that waits, if the robot's posture at its stamp is known; whether it waits on.
+    def try_waiting(self) -> None:
+        """Publish the frame that waits, once the robot's posture at its stamp is known.
 
         A cloud with the robot in it is not published for one without.
         """
         if self._waiting is None or self._node.states is None:
-            return False
-        t_ns, messages, deadline = self._waiting
+            return
+        t_ns, messages, since = self._waiting
         try:
-            buffer = self._node.states.buffer
-            posture = buffer.lookup(BASE_FRAME, self._frame_id, t_ns), buffer.joints_at(t_ns)
+            posture = self._node.states.posture(self._frame_id, t_ns, since, joints=True)
         except OpenArmError as error:
-            if self._node.monotonic() < deadline:
-                self._node.retry.reset()
-                return True
             self._waiting = None
             self._refuse(f"the robot cannot be cut out: {error.message}")
-            return False
-        self._waiting = None
-        self._publish(t_ns, messages, posture)
-        return False
+            return
+        if posture is not None:
+            self._waiting = None
+            self._publish(t_ns, messages, posture)
 
     def _refuse(self, reason: str) -> None:
         self.fault = f"{self._name}: frame refused: {reason}"
         self._node.get_logger().warning(self.fault, throttle_duration_sec=5.0)
 
-    def _publish(
-        self,
-        t_ns: int,
-        messages: dict[str, Image | CameraInfo],
-        posture: tuple[NDArray[np.float64], dict[str, float]] | None,
-    ) -> None:
-        """Publish the cloud of a frame; `posture` is the pose of the camera and the joints of a robot to cut out."""
+    def _publish(self, t_ns: int, messages: dict[str, Image | CameraInfo], posture: Posture | None) -> None:
+        """Publish the cloud of a frame, without the robot when its posture is given."""
         depth, info = cast(Image, messages["depth"]), cast(CameraInfo, messages["info"])
         try:
             check_frames(messages, self._frame_id)
@@ -122,7 +118,8 @@ class _Camera:
             intrinsics = intrinsics_from_info(info)
             if self._robot is not None and posture is not None:
                 limits = self._deprojector.limits
-                robot = self._robot.find(DepthView(pixels, intrinsics, posture[0], limits.near, limits.far), posture[1])
+                view = DepthView(pixels, intrinsics, posture.T_base_frame, limits.near, limits.far)
+                robot = self._robot.find(view, posture.joints)
                 pixels = np.where(robot, pixels.dtype.type(0), pixels)
             points = self._filter.points(deproject(pixels, intrinsics))
             rgb = self._colors(cast(Image, messages["color"]), points.shape) if "color" in messages else None
@@ -159,17 +156,23 @@ class CloudNode(BaseNode[CloudNodeConfig]):
         #: Where the robot is; None when it is left in the clouds.
         self.states: RobotStateListener | None = None
         if self.config.self_filter.enabled:
-            self.states = RobotStateListener(self, self.description, joints=False, depth=100)
-        self.retry = self.create_timer(0.01, self._try_waiting, clock=self.wall_clock)
-        self.retry.cancel()
+            wait = self.config.transform_wait
+            self.states = RobotStateListener(
+                self, self.description, joints=False, depth=100, wait=wait, on_news=self._try_waiting
+            )
         self._cameras = {name: _Camera(self, name) for name in self.config.cameras}
         self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
 
+    def waiting_ns(self, camera: str) -> int | None:
+        """Stamp of the frame of a camera that waits for the robot's posture."""
+        return self._cameras[camera].waiting_ns
+
     def _try_waiting(self) -> None:
-        if not any([camera.try_waiting() for camera in self._cameras.values()]):
-            self.retry.cancel()
+        for camera in self._cameras.values():
+            camera.try_waiting()
 
     def _follow_demand(self) -> None:
+        self._try_waiting()  # what is waited for may never come
         for camera in self._cameras.values():
             camera.follow_demand()
         faults = [camera.fault for camera in self._cameras.values() if camera.fault]

@@ -6,10 +6,9 @@ It listens to the camera, and to /joint_states for the robot in view, only while
 
 from __future__ import annotations
 
-import math
 import time
 from collections import deque
-from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,7 +26,7 @@ from openarm_common.depth_view import DepthView
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import BASE_FRAME, QOS_NEWEST, QOS_SENSOR, BaseNode, reliable, run
 from openarm_common.resources import config_dir
-from openarm_common.tf import RobotStateListener
+from openarm_common.tf import Posture, RobotStateListener
 from openarm_perception import convert
 from openarm_perception.config import DetectNodeConfig, camera_of
 from openarm_perception.depth import DepthImage, DepthLimits
@@ -62,7 +61,9 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._localizer = Localizer(config.localizer, limits, config.table_top_z())
         self._pipeline = self._first_pipeline()
         self.accept_changes(self._take)
-        self._poses = RobotStateListener(self, self.description, joints=False, depth=100)
+        self._poses = RobotStateListener(
+            self, self.description, joints=False, depth=100, wait=config.transform_wait, on_news=self._try_waiting
+        )
         self._matcher: StampMatcher[Image | CameraInfo] = StampMatcher(tuple(self._topics()), self._on_frame)
         self._inputs: list[Subscription] = []
         self._waiting: Frame | None = None
@@ -86,8 +87,6 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._picture = self.create_publisher(Image, "/detection_image", QOS_SENSOR)
         self._mask = self.create_publisher(Image, "/detection_mask", QOS_SENSOR)
         self._markers = self.create_publisher(MarkerArray, "/detection_markers", reliable(5))
-        self._retry = self.create_timer(0.01, self._try_waiting, clock=self.wall_clock)
-        self._retry.cancel()
         self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
         self.diagnose(True, "idle: nobody listens", **self._counts)
         self.create_service(MeasureTable, "~/measure_table", self._on_measure_table)
@@ -139,6 +138,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         return self._newest is not None and self.monotonic() - self._newest.at <= _FRESH
 
     def _follow_demand(self) -> None:
+        self._try_waiting()  # what is waited for may never come
         outputs = (self._boxes, self._objects, self._picture, self._mask, self._markers)
         asked = self.monotonic() < self._asked_until
         wanted = asked or any(output.get_subscription_count() for output in outputs)
@@ -202,82 +202,65 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             if "depth" in messages
             else np.zeros(rgb.shape[:2], np.uint16),
             intrinsics_from_info(info),
-            self.monotonic() + self.config.transform_wait,
+            self.monotonic(),
         )
 
     def _try_waiting(self) -> None:
         frame = self._waiting
         if frame is None:
-            self._retry.cancel()
-            return
-        if self._to_come(frame):
-            self._retry.reset()
             return
         try:
-            T_base_camera = self._poses.buffer.lookup(BASE_FRAME, self._optical_frame, frame.t_ns)
-            joints = self._posture(frame)
+            posture = self._posture(frame)
         except OpenArmError as error:
-            if self.monotonic() < frame.deadline and not self._too_old(frame, error):
-                self._retry.reset()
-                return
             self._waiting = None
             if error.code is Code.STALE_DATA and self._starting():
                 self._counts["skipped"] += 1
                 return
             self._complain("skipped", f"frame skipped: pose of the camera at its stamp: {error.message}")
             return
+        if posture is None:
+            return
         self._waiting = None
         try:
             started = time.perf_counter()
-            robot = self._find_robot(frame, T_base_camera, joints)
-            self._newest = Placed(frame, T_base_camera, robot, self.monotonic())
-            perceived = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, T_base_camera, robot)
+            robot = self._find_robot(frame, posture)
+            self._newest = Placed(frame, posture.T_base_frame, robot, self.monotonic())
+            perceived = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, posture.T_base_frame, robot)
         except OpenArmError as error:
             self._complain("refused_frames", f"frame refused: {error.message}")
             return
         self._publish(frame, perceived, (time.perf_counter() - started) * 1e3)
 
-    def _posture(self, frame: Frame) -> Mapping[str, float] | None:
-        """Joints at the stamp, as long as they may still come; None when nobody tells them: objects are seen still."""
-        if self._robot is None:
-            return None
+    def _posture(self, frame: Frame) -> Posture | None:
+        """Camera and robot at the stamp, None while they may still come.
+
+        Where nobody tells the joints, objects are seen still: without them, if the camera stands.
+        """
+        at = partial(self._poses.posture, self._optical_frame, frame.t_ns, frame.since)
         try:
-            return self._poses.buffer.joints_at(frame.t_ns)
+            return at(joints=self._robot is not None)
         except OpenArmError as error:
-            heard = self._poses.age_s() <= _FRESH
-            if self._starting() or (heard and self.monotonic() < frame.deadline and not self._too_old(frame, error)):
+            if self._rides or error.code is not Code.STALE_DATA or self._starting():
                 raise
             self._uncut = error.message
-            return None
-
-    def _to_come(self, frame: Frame) -> bool:
-        """Whether the joint state after the stamp is on its way: between two the posture is exact."""
-        heard = self._poses.age_s() <= _FRESH
-        return heard and not self._poses.buffer.settled(frame.t_ns) and self.monotonic() < frame.deadline
+            return at(joints=False)
 
     def _starting(self) -> bool:
         """Whether the first joint states may still be on their way."""
         return self.monotonic() < self._listening_since + self.config.transform_wait
 
-    def _find_robot(
-        self, frame: Frame, T_base_camera: NDArray[np.float64], joints: Mapping[str, float] | None
-    ) -> Mask | None:
-        if self._robot is None or joints is None:
+    def _find_robot(self, frame: Frame, posture: Posture) -> Mask | None:
+        if self._robot is None or not posture.joints:
             return None
         limits = self._pipeline.localizer.limits
-        view = DepthView(frame.depth, frame.intrinsics, T_base_camera, limits.near, limits.far)
+        view = DepthView(frame.depth, frame.intrinsics, posture.T_base_frame, limits.near, limits.far)
         try:
-            robot = self._robot.find(view, joints)
+            robot = self._robot.find(view, posture.joints)
         except OpenArmError as error:
             self._uncut = error.message
             return None
         self._uncut = ""
         return robot
-
-    def _too_old(self, frame: Frame, error: OpenArmError) -> bool:
-        """Whether waiting is in vain: joint states have passed the stamp without one that answers for it."""
-        heard = self._poses.age_s() < math.inf
-        return error.code is Code.STALE_DATA and heard and self._poses.buffer.latest()[0] > frame.t_ns
 
     def _publish(self, frame: Frame, perceived: Perceived, elapsed_ms: float) -> None:
         self._boxes.publish(convert.detections_2d(perceived.found, self._optical_frame, frame.t_ns))

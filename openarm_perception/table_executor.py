@@ -25,7 +25,7 @@ class Frame:
     rgb: NDArray[np.uint8]
     depth: DepthImage
     intrinsics: Intrinsics
-    deadline: float  # wall clock, s
+    since: float  # when it came, on the node's clock of deadlines, s
 
 
 @dataclass(frozen=True)
