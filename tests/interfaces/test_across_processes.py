@@ -18,6 +18,8 @@ from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectoryPoint
 
 _PEER = """
+import time
+
 import rclpy
 from control_msgs.action import FollowJointTrajectory
 from geometry_msgs.msg import TransformStamped
@@ -40,6 +42,10 @@ def compute(request, response):
 
 
 def plan(goal):
+    # A goal may arrive before the publisher of feedback has met the client's subscription: what it says then is lost.
+    deadline = time.monotonic() + 10.0
+    while not node.count_subscribers("/plan/_action/feedback") and time.monotonic() < deadline:
+        time.sleep(0.01)
     for number, target in enumerate(goal.request.targets):
         goal.publish_feedback(PlanApproach.Feedback(stage=target.id, tried=number))
     goal.succeed()
@@ -89,11 +95,13 @@ def test_a_message_a_service_and_actions_make_the_round_trip(ros, peer) -> None:
     feedback: list[PlanApproach.Feedback] = []
     plan = ActionClient(ros.node, PlanApproach, "/plan")
     goal = PlanApproach.Goal(arm="right", targets=[ApproachTarget(id="top"), ApproachTarget(id="side", score=0.5)])
-    _, outcome = ros.send_goal(plan, goal, feedback_callback=lambda message: feedback.append(message.feedback))
-    result = ros.result(outcome).result
-    assert (result.code, result.chosen, [refusal.id for refusal in result.refusals]) == ("NO_PLAN", -1, ["top", "side"])
+    ros.spin_until(plan.server_is_ready, what="the action server")
+    sent = plan.send_goal_async(goal, lambda message: feedback.append(message.feedback))
+    # The result is asked for afterwards: a client that has it takes no more feedback.
     ros.spin_until(lambda: len(feedback) == 2, what="both feedback messages")
     assert [(message.stage, message.tried) for message in feedback] == [("top", 0), ("side", 1)]
+    result = ros.result(ros.result(sent).get_result_async()).result
+    assert (result.code, result.chosen, [refusal.id for refusal in result.refusals]) == ("NO_PLAN", -1, ["top", "side"])
 
     follow = ActionClient(ros.node, FollowJointTrajectory, "/follow")
     trajectory_goal = FollowJointTrajectory.Goal()
