@@ -16,6 +16,10 @@ started= holders=
 case $mode in multicast | server) ;; *) echo "two_machines: expected multicast or server, got $mode" >&2; exit 2 ;; esac
 [ "$(id -u)" = 0 ] && command -v ip >/dev/null || { echo "two_machines: needs root and iproute2" >&2; exit 77; }
 
+# What a socket is granted less than the profile asks for (config/fastdds_network.xml) costs images.
+granted=$(cat /proc/sys/net/core/rmem_max)
+[ "$granted" -ge 4194304 ] || echo "two_machines: net.core.rmem_max is $granted: images will be lost; see docs/two_machines.md" >&2
+
 finish() {
     status=$?
     trap - EXIT INT TERM
