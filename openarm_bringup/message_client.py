@@ -4,19 +4,17 @@
 from __future__ import annotations
 
 import array
-import difflib
 import importlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import yaml
 
+from openarm_bringup.meant import unknown
 from openarm_common.errors import Code, OpenArmError
 
-#: Names that an error lists.
-_MOST = 40
 _KINDS = ("msg", "srv", "action")
 _INTEGER = re.compile(r"(?P<unsigned>u?)int(?P<bits>8|16|32|64)|octet")
 _SEQUENCE = re.compile(r"^sequence<(?P<of>.+?)(, (?P<most>\d+))?>$|^(?P<array>.+)\[(?P<size>\d+)\]$")
@@ -40,16 +38,6 @@ def interface(name: str) -> Any:
     raise OpenArmError(
         Code.INVALID_ARGUMENT, f"{name!r} is not the name of a type; expected package/msg/Name (or srv, action)"
     )
-
-
-def unknown(what: str, name: str, known: Iterable[str]) -> OpenArmError:
-    """Return an error that says what was meant, as far as that can be told."""
-    names = sorted(known)
-    near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
-    near += [other for other in names if name.strip("/") and name.strip("/") in other and other not in near][:3]
-    some = ", ".join(names[:_MOST]) + (f" and {len(names) - _MOST} more" if len(names) > _MOST else "")
-    hint = f"; did you mean {' or '.join(near)}?" if near else f"; there are {some or 'none'}"
-    return OpenArmError(Code.INVALID_ARGUMENT, f"no {what} {name!r}{hint}")
 
 
 def to_data(value: Any, longest: int | None = None) -> Any:

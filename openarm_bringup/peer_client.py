@@ -20,7 +20,8 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from tf2_msgs.msg import TFMessage
 
-from openarm_bringup.message_client import to_data, unknown
+from openarm_bringup.meant import unknown
+from openarm_bringup.message_client import to_data
 from openarm_bringup.supervision import runs
 from openarm_common.convert import transform_to_matrix
 from openarm_common.errors import Code, OpenArmError
@@ -29,13 +30,19 @@ from openarm_common.node import QOS_STATIC_TF, QOS_TF, offered_qos
 #: Others are known after this long without news, s; while nobody is, or one that is known to run is not, they may come.
 _QUIET_S = 0.6
 _DISCOVERY_S = 8.0
+#: How long to wait for anybody, where no supervisor of this machine has said that there is a graph, s.
+_ANYBODY_S = 4.0
 #: Services that every node has.
 _OF_ALL_NODES = ("rcl_interfaces/srv/", "type_description_interfaces/srv/")
 _ANSWER_S = 5.0
 
 
 class Peer:
-    """A node and its executor; a context manager. Inside, those who run are known."""
+    """A node and its executor; a context manager. Inside, those who run are known.
+
+    Raises:
+        OpenArmError: NOT_READY, on entering, when nobody runs.
+    """
 
     def __init__(self) -> None:
         self._context = Context()
@@ -52,13 +59,21 @@ class Peer:
         before: Any = None
         domain = self._context.get_domain_id()
         there = {f"/{name}" for run in runs.running() if run.domain == domain for name in run.ready_nodes}
-        while (now := time.monotonic()) - began < _DISCOVERY_S:
+        while (now := time.monotonic()) - began < (_DISCOVERY_S if there else _ANYBODY_S):
             known = (self.nodes(), self.topics(), self.services())
             if known != before:
                 before, changed = known, now
             elif now - changed > _QUIET_S and known[0] and (there <= set(known[0]) or now - began > _DISCOVERY_S / 2):
                 break
             self._executor.spin_once(timeout_sec=0.05)
+        if not self.nodes():
+            self.__exit__()
+            reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+            raise OpenArmError(
+                Code.NOT_READY,
+                f"no node is heard in domain {domain} (ROS_AUTOMATIC_DISCOVERY_RANGE={reach}); start a graph with "
+                "`openarm up`, or set both as they are set where it runs (--domain N says the domain, too)",
+            )
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -53,8 +53,7 @@ def serve(install: Path, command: list[str]) -> None:
     try:
         echo = [str(install / OPENARM), "topic", "echo", "/joint_states", "-n", "1", "--timeout", "60", "--json"]
         answer = subprocess.run(echo, capture_output=True, text=True, timeout=120, check=False)
-        # Exit code 2 is a topic that is not there yet.
-        while answer.returncode == 2 and time.monotonic() - began < 120 and process.poll() is None:
+        while answer.returncode != 0 and time.monotonic() - began < 120 and process.poll() is None:
             answer = subprocess.run(echo, capture_output=True, text=True, timeout=120, check=False)
         if answer.returncode != 0:
             raise SystemExit(f"{command[0]}: no joint state: {answer.stdout}\n{answer.stderr}")

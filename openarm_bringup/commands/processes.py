@@ -126,6 +126,8 @@ def _log_folder(run: str, node: str | None) -> Path:
     folder = runs.runs_root() / run / "logs"
     if not folder.is_dir():
         existing = sorted(path.name for path in runs.runs_root().glob("*/logs/.."))[-5:]
-        found = f"; the last ones are {', '.join(existing)}" if existing else ""
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"there is no run {run!r} in {runs.runs_root()}{found}")
+        if not existing:
+            raise OpenArmError(Code.NOT_READY, f"nothing has run yet: no logs in {runs.runs_root()}; see `openarm up`")
+        last = ", ".join(existing)
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"there is no run {run!r} in {runs.runs_root()}; the last: {last}")
     return folder

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import threading
 import time
@@ -73,6 +74,7 @@ def record(
         said = f"recording ended early: {recorded.ended}; {data['messages']} messages are in {path}"
         return Outcome(False, said, Code.ENVIRONMENT, data, text)
     if not recorded.counts:
+        shutil.rmtree(path)  # made by this recording; a second try may have the name
         said = f"no message came; topics that match: {', '.join(recorder.topics) or 'none'}. Is a graph running?"
         return Outcome(False, said, Code.NOTHING_DETECTED, data)
     said = f"{data['messages']} messages, {data['bytes'] / 1e6:.1f} MB in {path}, {data['lost']} lost"
@@ -168,8 +170,8 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
     from openarm_bringup.progress import progress
 
     path = golden or (bag if bag.is_dir() else bag.parent) / "golden.json"
-    expected = {} if update and not path.exists() else stored.read(path)
     with open_bag(bag) as opened, progress() as shown:
+        expected = {} if update and not path.exists() else stored.read(path)
         task = shown.add_task("frames", total=None)
         numbers = numbers_of(opened, scene=scene, tell=lambda done, of: shown.update(task, completed=done, total=of))
     data: dict[str, Any] = {"bag": str(bag), "golden": str(path), "numbers": numbers}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 from contextlib import suppress
 from itertools import pairwise
 from statistics import median
@@ -27,6 +28,8 @@ node = App(name="node", help="List nodes and what each offers and uses.")
 
 #: Longer arrays are shown as their size.
 _LONGEST = 32
+#: The service by which an action takes goals.
+_GOAL = "/_action/send_goal"
 #: A subscriber knows of a publisher a little later than the publisher of it, s.
 _SETTLE_S = 0.3
 
@@ -35,7 +38,7 @@ def _listing(names: dict[str, str], key: str) -> Outcome:
     width = max((len(name) for name in names), default=0)
     text = "\n".join(f"{name:<{width}}  {kind}" for name, kind in sorted(names.items()))
     if not names:
-        return Outcome(False, f"no {key}; is a graph running?", Code.NOT_READY, {key: {}})
+        return Outcome(False, f"no node that is heard has {key}", Code.NOT_READY, {key: {}})
     return Outcome(True, data={key: names}, text=text)
 
 
@@ -74,26 +77,27 @@ def echo(
     meet_graph(domain)
     from openarm_bringup.message_client import interface, to_data
     from openarm_bringup.peer_client import Peer, find
+    from openarm_common.node import QOS_LATCHED
 
-    messages: list[Any] = []
+    told: deque[Any] = deque(maxlen=count)
+    waiting: list[Any] = []
     with Peer() as peer:
         found, kind = find("topic", name, peer.topics())
-
-        def take(message: Any) -> None:
-            data = to_data(message, None if full else _LONGEST)
-            if count:
-                messages.append(data)
-            if not count or len(messages) <= count:
-                show(yaml.safe_dump(data, sort_keys=False, default_flow_style=None) + "---\n")
-            heard[0] += 1
-
-        heard = [0]
-        peer.node.create_subscription(interface(kind), found, take, peer.offered(found))
-        if not peer.spin_until(lambda: heard[0] > 0, timeout):
+        offered = peer.offered(found)
+        peer.node.create_subscription(interface(kind), found, waiting.append, offered)
+        if not peer.spin_until(lambda: waiting, timeout):
             raise OpenArmError(Code.TIMEOUT, f"{found} was silent for {timeout:g} s")
+        if count and offered.durability == QOS_LATCHED.durability:
+            # What is kept comes at once, the oldest first: who asks for some of it means the newest.
+            peer.spin_until(lambda: False, _SETTLE_S)
+            del waiting[:-count]
         with suppress(KeyboardInterrupt):  # the way to end it
-            peer.spin_until(lambda: count and heard[0] >= count, float("inf"))
-    return Outcome(True, data={"topic": found, "type": kind, "messages": messages[:count]})
+            while not count or len(told) < count:
+                peer.spin_until(lambda: waiting, float("inf"))
+                data = to_data(waiting.pop(0), None if full else _LONGEST)
+                told.append(data)
+                show(yaml.safe_dump(data, sort_keys=False, default_flow_style=None) + "---\n")
+    return Outcome(True, data={"topic": found, "type": kind, "messages": list(told)})
 
 
 @topic.command
@@ -299,14 +303,12 @@ def node_list(*, domain: int | None = None) -> Outcome:
 
     with Peer() as peer:
         names = peer.nodes()
-    if not names:
-        return Outcome(False, "no nodes; is a graph running?", Code.NOT_READY, {"nodes": []})
     return Outcome(True, data={"nodes": names}, text="\n".join(names))
 
 
 @node.command
 def info(name: str, *, domain: int | None = None) -> Outcome:
-    """Show what a node publishes, listens to and offers.
+    """Show what a node publishes and listens to, the services that it offers and calls, and its actions.
 
     Args:
         name: Of the node.
@@ -325,17 +327,22 @@ def info(name: str, *, domain: int | None = None) -> Outcome:
             "offers": peer.node.get_service_names_and_types_by_node(*where),
             "calls": peer.node.get_client_names_and_types_by_node(*where),
         }
-    data = {key: {topic: kinds[0] for topic, kinds in sorted(found_)} for key, found_ in parts.items()}
+    data = {
+        key: {entry: kinds[0] for entry, kinds in sorted(entries) if "/_action/" not in entry}
+        for key, entries in parts.items()
+    }
+    for key, services in (("offers actions", "offers"), ("sends goals to", "calls")):
+        goals = [(entry, kinds[0]) for entry, kinds in sorted(parts[services]) if entry.endswith(_GOAL)]
+        data[key] = {entry.removesuffix(_GOAL): kind.removesuffix("_SendGoal") for entry, kind in goals}
     lines = [found]
     for key, entries in data.items():
-        lines += [f"  {key}:", *(f"    {entry}  {kind}" for entry, kind in entries.items() if "/_action/" not in entry)]
+        lines += [f"  {key}:", *(f"    {entry}  {kind}" for entry, kind in entries.items())]
     return Outcome(True, data={"node": found, **data}, text="\n".join(lines))
 
 
 def _answered(answer: dict[str, Any], data: dict[str, Any]) -> Outcome:
     text = yaml.safe_dump(answer, sort_keys=False, default_flow_style=None)
     if answer.get("success") is False:
-        return Outcome(
-            False, str(answer.get("message", "")), answer.get("code") or Code.INTERNAL, {**data, "answer": answer}, text
-        )
+        code = answer.get("code") or Code.INTERNAL
+        return Outcome(False, str(answer.get("message", "")), code, {**data, "answer": answer}, text)
     return Outcome(True, data={**data, "answer": answer}, text=text)

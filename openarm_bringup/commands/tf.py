@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from cyclopts import App
 
 from openarm_bringup.commands.pick import meet_graph
+from openarm_bringup.meant import unknown
 from openarm_bringup.outcome import Outcome
 from openarm_bringup.tree_picture import Row, check, write
 from openarm_common.errors import Code, OpenArmError
@@ -82,14 +83,12 @@ def _listen(domain: int | None) -> Frames:
     with Peer() as peer:
         frames = peer.frames(_LISTEN_S)
     if not frames.edges:
-        raise OpenArmError(Code.NO_TRANSFORM, "nothing on /tf and /tf_static; is a graph running?")
+        raise OpenArmError(Code.NO_TRANSFORM, "nothing on /tf and /tf_static: no node that is heard tells of frames")
     return frames
 
 
 def _to_root(edges: Edges, frame: str) -> NDArray[np.float64]:
     import numpy as np
-
-    from openarm_bringup.message_client import unknown
 
     known = edges.keys() | {parent for parent, _, _ in edges.values()}
     if frame not in known:

@@ -12,6 +12,7 @@ from openarm_bringup.doctor.graph import RATES, Heard
 from openarm_bringup.message_client import interface
 from openarm_bringup.peer_client import Peer
 from openarm_bringup.supervision.runs import RunRecord
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, offered_qos
 
 #: Long enough for two rounds of /diagnostics, s.
@@ -20,6 +21,15 @@ _LISTEN_S = 2.5
 
 def listen(run: RunRecord) -> Heard:
     """Listen to the graph of a run for a few seconds."""
+    try:
+        return _listen(run)
+    except OpenArmError as error:
+        if error.code != Code.NOT_READY:
+            raise
+        return Heard({}, {}, [])  # that nobody is heard is what doctor says of its nodes
+
+
+def _listen(run: RunRecord) -> Heard:
     os.environ["ROS_DOMAIN_ID"] = str(run.domain)
     if run.discovery != "system_default":
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = run.discovery.upper()

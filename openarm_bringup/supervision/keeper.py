@@ -11,6 +11,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+from openarm_bringup.meant import unknown
 from openarm_bringup.supervision import environment, shm
 from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready
 from openarm_bringup.supervision.process import Haste, Ladder, NodeProcess
@@ -195,10 +196,10 @@ class Keeper:
     async def _check_parameters(self) -> None:
         """Refuse parameters that the node does not have; ROS would ignore them silently."""
         existing = await self._shared.ask(lambda probe: probe.parameters(self.name))
-        unknown = [param for param in self.spec.params if param not in existing]
-        if unknown:
-            valid = ", ".join(sorted(param for param in existing if not param.startswith("qos_overrides")))
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"{self.name} has no parameter {unknown[0]!r}; it has {valid}")
+        for param in self.spec.params:
+            if param not in existing:
+                own = [name for name in existing if not name.startswith("qos_overrides")]
+                raise unknown(f"parameter of {self.name}", param, own)
 
     def _given_up(self, why: str) -> OpenArmError:
         tail = "\n".join(list(self.process.tail)[-12:]) if self.process else ""

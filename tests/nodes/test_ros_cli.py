@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -15,10 +16,11 @@ from geometry_msgs.msg import TransformStamped
 from openarm_interfaces.action import Pick
 from openarm_interfaces.srv import SetPause
 from rclpy.action import ActionServer
+from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from openarm_bringup import cli
+from openarm_bringup import cli, peer_client
 from openarm_bringup.commands import param, ros2, tf
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF
@@ -32,6 +34,11 @@ def heard(ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list
     node = ros.node
     node.declare_parameter("height", 0.5)
     node.create_publisher(String, "/status", QOS_LATCHED).publish(String(data="ready"))
+    steps = node.create_publisher(
+        String, "/steps", QoSProfile(depth=9, reliability=QOS_LATCHED.reliability, durability=QOS_LATCHED.durability)
+    )
+    for step in ("up", "along", "down"):
+        steps.publish(String(data=step))
     ticks = node.create_publisher(String, "/ticks", QOS_COMMAND)
     node.create_timer(0.02, lambda: ticks.publish(String(data="tick")))
     node.create_subscription(String, "/talk", lambda message: heard.append(message.data), QOS_COMMAND)
@@ -74,6 +81,8 @@ def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsy
     assert listed.data["topics"]["/ticks"] == "std_msgs/msg/String"
     echoed = ros2.echo("status", count=1)  # latched: it was published long before
     assert echoed.data["messages"] == [{"data": "ready"}]
+    assert ros2.echo("steps", count=1).data["messages"] == [{"data": "down"}], "the newest of those that are kept"
+    assert [step["data"] for step in ros2.echo("steps", count=2).data["messages"]] == ["along", "down"]
     assert "data: ready" in capsys.readouterr().out
     assert cli.run(["topic", "echo", "status", "-n", "1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["messages"] == [{"data": "ready"}], "JSON, and nothing else"
@@ -123,11 +132,30 @@ def test_mistakes_are_met_with_what_was_perhaps_meant(heard: list[str]) -> None:
         assert said in refused.value.message
 
 
+def test_where_nobody_runs_every_command_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(peer_client, "_ANYBODY_S", 0.5)
+    domain = os.environ["ROS_DOMAIN_ID"]
+    for command in (["topic", "list"], ["service", "call", "/grasp"], ["tf", "tree"], ["param", "dump", "grasp"]):
+        assert cli.run([*command, "--json"]) == 1
+        answer = json.loads(capsys.readouterr().out)
+        assert answer["code"] == Code.NOT_READY
+        assert f"no node is heard in domain {domain} " in answer["message"]
+    bag = tmp_path / "bag"
+    assert cli.run(["record", str(bag), "--duration", "0.2", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["code"] == Code.NOTHING_DETECTED
+    assert not bag.exists(), "its name is free for the next try"
+
+
 def test_nodes_and_parameters(heard: list[str]) -> None:
     assert "/probe" in ros2.node_list().data["nodes"]
     info = ros2.info("probe")
     assert info.data["publishes"]["/ticks"] == "std_msgs/msg/String"
     assert info.data["offers"]["/pause"] == "openarm_interfaces/srv/SetPause"
+    assert info.data["offers actions"] == {"/pick": "openarm_interfaces/action/Pick"}
+    assert "_action" not in info.text
     assert "height" in param.list_("probe").data["parameters"]
     assert param.set_("probe", "height", "0.7").success
     assert param.get("probe", "height").text == "0.7"

@@ -94,6 +94,11 @@ def test_files_without_golden_numbers_are_refused(tmp_path: Path, content: str) 
         golden.read(path)
 
 
+def test_a_bag_that_is_not_there_is_named_before_its_numbers(tmp_path: Path) -> None:
+    with pytest.raises(OpenArmError, match=f"no bag at {tmp_path}/none"):
+        record.check(tmp_path / "none")
+
+
 def test_a_bag_without_frames_is_refused_by_name(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag", {}):
         pass

@@ -231,7 +231,7 @@ def test_unknown_parameter_is_refused_because_ros_would_ignore_it(tmp_path: Path
                 await run.supervisor.wait_ready()
             return caught.value
 
-    assert "arm has no parameter 'sped'; it has speed" in asyncio.run(body()).message
+    assert "no parameter of arm 'sped'; did you mean speed?" in asyncio.run(body()).message
 
 
 def test_error_inside_the_probe_is_raised_and_not_waited_for_ever(tmp_path: Path) -> None:
