@@ -82,6 +82,7 @@ def train(
                 Code.ENVIRONMENT,
                 f"training needs {module}, which is not installed: pip install 'openarm-vision[train]'",
             )
+    _require(data)
     from openarm_perception.training.export import export
     from openarm_perception.training.fit import Fit, FitConfig, load_weights
     from openarm_perception.training.model import Network
@@ -112,6 +113,7 @@ def report(
         out: The page.
         accept: Least mean average precision (at an overlap of one half) of the last model.
     """
+    _require(data)
     from openarm_perception.network import model_path
 
     files = [model_path(model) for model in models or ("shapes_320x256", "shapes_640x480")]
@@ -139,6 +141,12 @@ def find(*words: str, domain: int | None = None, timeout: float = 20.0) -> Outco
     x, y, z = (round(float(value), 4) for value in thing.position)
     message = f"{thing.label} {thing.kind} at x {x} y {y} z {z} m"
     return Outcome(True, message, data={"label": thing.label, "kind": thing.kind, "position": [x, y, z]})
+
+
+def _require(folder: Path) -> None:
+    if not (folder / "dataset.yaml").is_file():
+        hint = "`openarm detector data` makes the suite's own, --data names another"
+        raise OpenArmError(Code.CONFIG_INVALID, f"{folder} holds no data set (no dataset.yaml); {hint}")
 
 
 def _report(

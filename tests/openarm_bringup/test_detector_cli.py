@@ -49,3 +49,8 @@ def test_b65_the_report_tells_figures_and_shows_failures(data, capsys) -> None:
 def test_a_model_that_is_not_there_is_refused_with_those_that_are(data, capsys) -> None:
     assert cli.run(["detector", "report", "pears", "--data", str(data)]) == 1
     assert "shapes_640x480" in capsys.readouterr().err
+
+
+def test_without_a_data_set_it_is_said_how_to_get_one(tmp_path, capsys) -> None:
+    assert cli.run(["detector", "report", "--data", str(tmp_path)]) == 1
+    assert f"{tmp_path} holds no data set (no dataset.yaml); `openarm detector data` makes" in capsys.readouterr().err
