@@ -21,6 +21,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState, PointCloud2
 from vision_msgs.msg import Detection3DArray
+from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_bringup.bags.bag import open_bag
 from openarm_common.convert import points_from_cloud
@@ -45,9 +46,7 @@ def user(domain: int) -> Iterator[tuple[Node, SingleThreadedExecutor]]:
         context.try_shutdown()
 
 
-def newest(
-    node: Node, executor: SingleThreadedExecutor, kind: Any, topic: str, good: Any, seconds: float = 20.0
-) -> Any:
+def newest(node: Node, executor: SingleThreadedExecutor, kind: Any, topic: str, good: Any) -> Any:
     """Spin until a message of the topic is good; return it."""
     found: list[Any] = []
     subscription = node.create_subscription(kind, topic, lambda m: found.append(m) if good(m) else None, 10)
@@ -58,6 +57,10 @@ def newest(
         assert clock.now().nanoseconds < deadline, f"nothing good on {topic}"
     node.destroy_subscription(subscription)
     return found[0]
+
+
+def texts(markers: MarkerArray) -> list[Marker]:
+    return [marker for marker in markers.markers if marker.type == Marker.TEXT_VIEW_FACING]
 
 
 def act(node: Node, executor: SingleThreadedExecutor, kind: Any, name: str, goal: Any) -> Any:
@@ -88,16 +91,19 @@ def test_b66_step_1_robot_alone_tells_its_joints_and_moves_a_gripper(start_graph
     assert up.stop() == 0
 
 
-def test_b66_step_2_every_object_is_seen_where_it_stands(start_graph: Any) -> None:
+def test_b66_step_2_every_object_is_seen_and_marked_where_it_stands(start_graph: Any) -> None:
     up = start_graph("perception")
     up.wait_ready()
     scene = {item.label: item for item in load_scene("demo").objects}
     with user(up.domain) as (node, executor):
         seen = newest(node, executor, Detection3DArray, "/detections_3d", lambda m: len(m.detections) == len(scene))
-    for detection in seen.detections:
-        item = scene[detection.results[0].hypothesis.class_id]
-        assert detection.bbox.center.position.x == pytest.approx(item.position[0], abs=0.01)
-        assert detection.bbox.center.position.y == pytest.approx(item.position[1], abs=0.01)
+        drawn = newest(node, executor, MarkerArray, "/detection_markers", lambda m: len(texts(m)) == len(scene))
+    places = {d.results[0].hypothesis.class_id: d.bbox.center.position for d in seen.detections}
+    for found in (places, {text.text.split()[0]: text.pose.position for text in texts(drawn)}):
+        assert found.keys() == scene.keys()
+        for label, place in found.items():
+            assert place.x == pytest.approx(scene[label].position[0], abs=0.01)
+            assert place.y == pytest.approx(scene[label].position[1], abs=0.01)
     assert up.stop() == 0
 
 
