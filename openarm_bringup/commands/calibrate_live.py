@@ -102,9 +102,10 @@ def sample(*, remove: str | None = None, session: str = "", advice: Flag = False
     if session and not session.endswith(".npz"):
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--session {session}: expected a name that ends in .npz")
     _meet(domain)
+    from openarm_bringup.commands.pick import needing
     from openarm_calibration.client import CalibrationClient
 
-    with CalibrationClient() as client:
+    with needing("calibration", "calibrate"), CalibrationClient() as client:
         if remove is not None:
             done = client.remove("" if remove == "last" else remove)
         elif advice:
@@ -124,11 +125,12 @@ def _running(camera: str, poses: int, save: bool, delay: bool, domain: int | Non
             Code.INVALID_ARGUMENT, "--running needs --camera NAME: the board has to be moved between the cameras"
         )
     _meet(domain)
+    from openarm_bringup.commands.pick import needing
     from openarm_calibration.client import CalibrationClient
 
     show.camera(camera)
     stop = threading.Event()
-    with CalibrationClient() as client:
+    with needing("calibration", "calibrate"), CalibrationClient() as client:
         try:
             result = client.auto(
                 camera, poses=poses, measure_delay=delay, save=save, on_feedback=show.feedback, stop=stop

@@ -30,7 +30,7 @@ def order(
     """
     from rich.console import Console
 
-    from openarm_bringup.commands.pick import meet_graph
+    from openarm_bringup.commands.pick import meet_graph, needing
     from openarm_grasp.orders import Order, load_bins
 
     work = Order(labels, load_bins(bins) if bins is not None else None, each)
@@ -39,7 +39,7 @@ def order(
 
     console = Console(stderr=True, highlight=False)
     results: list[dict[str, Any]] = []
-    with GraspClient() as client:
+    with needing("grasp", "sim"), GraspClient() as client:
         while ask := work.next():
             try:
                 result = client.pick(ask.label, place=ask.place, leave=ask.leave, timeout=timeout)

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -74,7 +75,7 @@ def pick(
         for name, which, where, turn, spot in zip(labels, arms, places, yaws, spots, strict=True)
     ]
     show = _Steps(labels)
-    with GraspClient() as client:
+    with needing("grasp", "sim"), GraspClient() as client:
         try:
             if second:
                 first, other = wanted
@@ -232,3 +233,31 @@ def meet_graph(domain: int | None) -> None:
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = record.discovery.upper()
     if record.discovery in ACROSS_MACHINES:
         os.environ.setdefault(PROFILE, str(network_profile()))
+
+
+@contextmanager
+def needing(node: str, graph: str) -> Iterator[None]:
+    """Where a node does not answer because the graph that runs here has none of the name, say that, and who has.
+
+    Args:
+        node: Its name.
+        graph: That has it.
+
+    Raises:
+        OpenArmError: NOT_READY.
+    """
+    from openarm_bringup.supervision import runs
+
+    try:
+        yield
+    except OpenArmError as error:
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        here = [run for run in runs.running() if str(run.domain) == domain]
+        if error.code != Code.NOT_READY or not here or any(node in run.nodes for run in here):
+            raise
+        names = " and ".join(run.graph for run in here)
+        raise OpenArmError(
+            Code.NOT_READY,
+            f"what runs here in domain {domain} ({names}) has no node `{node}`, and no other answers: stop it, and "
+            f"start one that has it, `openarm up {graph}`",
+        ) from error

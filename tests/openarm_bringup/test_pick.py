@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 
+import psutil
 import pytest
 
 from openarm_bringup.commands import pick
 from openarm_bringup.detector import things_client
+from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.options import Option
 from openarm_perception.attributes import Thing
@@ -46,6 +49,41 @@ def test_words_mean_the_object_that_stands_there(monkeypatch: pytest.MonkeyPatch
     assert pick._meant(("blue",), (None,)) == (("blue",), (None,))
     with pytest.raises(OpenArmError, match="leave --at out"):
         pick._meant(("red cube",), ((0.3, -0.2),))
+
+
+def test_a_graph_without_grasping_is_named_with_one_that_has_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    me = psutil.Process()
+
+    def run(*nodes: str) -> None:
+        states = {node: runs.NodeRecord(state="ready") for node in nodes}
+        record = runs.RunRecord(
+            graph="motion",
+            pid=me.pid,
+            pid_created=me.create_time(),
+            domain=7,
+            discovery="localhost",
+            run_dir="",
+            started="",
+            nodes=states,
+        )
+        runs.write_record(record)
+
+    def ask() -> str:
+        with pytest.raises(OpenArmError) as refused, pick.needing("grasp", "sim"):
+            raise OpenArmError(Code.NOT_READY, "no action")
+        assert refused.value.code == Code.NOT_READY
+        return refused.value.message
+
+    assert ask() == "no action"  # nothing runs here; elsewhere, who knows
+    run("motion", "grasp")
+    assert ask() == "no action"
+    run("motion")
+    assert ask().startswith("what runs here in domain 7 (motion) has no node `grasp`")
+    assert "`openarm up sim`" in ask()
 
 
 def test_json_has_no_number_for_a_margin_that_is_not_known() -> None:
