@@ -17,14 +17,15 @@ _held: dict[int, socket.socket] = {}
 def reserve_domain() -> int:
     """Return a random ROS domain that nobody on this machine uses, kept from other callers until this process ends.
 
-    A domain is in use when a participant holds its discovery ports, or when another process has reserved it.
+    A domain is in use when any participant holds a discovery port of it, or when another process has reserved it. Each
+    participant has a port of its own: one that an earlier owner left behind is seen, too, whatever its number.
 
     Raises:
         OpenArmError: ENVIRONMENT, when every domain is in use.
     """
     for domain in random.sample(DOMAINS, len(DOMAINS)):
         base = 7400 + 250 * domain
-        if not all(_port_free(port) for port in (base, base + 10, base + 11)):
+        if not all(_port_free(port) for port in (base, *range(base + 10, base + 250, 2))):
             continue
         # An abstract socket name belongs to one process and vanishes with it.
         claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

@@ -53,9 +53,10 @@ def test_another_process_gets_another_domain_until_this_one_ends(three: list[int
         release_domain(domain)
 
 
-def test_a_domain_whose_discovery_port_is_held_is_not_given(three: list[int]) -> None:
+@pytest.mark.parametrize("port", [0, 10, 16], ids=["of_all", "of_the_first", "of_the_fourth"])
+def test_a_domain_in_which_a_discovery_port_is_held_is_not_given(three: list[int], port: int) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
-        held.bind(("0.0.0.0", 7400 + 250 * 221))
+        held.bind(("0.0.0.0", 7400 + 250 * 221 + port))
         ours = [reserve_domain(), reserve_domain()]
         assert sorted(ours) == [220, 222]
     for domain in ours:
