@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import signal
 import socket
 import sys
@@ -282,7 +283,8 @@ class _Signals:
     """Ends the context when SIGINT or SIGTERM comes, after `BaseNode.hold`: rclpy's own handlers end it at once.
 
     They are read in a thread: the main one may be waiting in rcl, where Python's handlers don't run. And these do
-    nothing: a KeyboardInterrupt could cut the shutdown short.
+    nothing: a KeyboardInterrupt could cut the shutdown short. A SIGTERM after another signal, because the end takes too
+    long, writes to stderr where every thread stands.
     """
 
     def __init__(self) -> None:
@@ -297,6 +299,7 @@ class _Signals:
     def _wait(self) -> None:
         while self._reader.recv(1)[0] not in _ENDING:
             pass
+        faulthandler.register(signal.SIGTERM)
         executor = self.node.executor if self.node is not None else None
         # In lock-step nothing moves any more: simulated time waits for a node that ends.
         if self.node is not None and executor is not None and not self.node.lockstep:

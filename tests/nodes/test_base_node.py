@@ -79,10 +79,10 @@ def test_work_in_a_thread_leaves_the_node_answering_and_wakes_it(ros) -> None:
     slow_client, fast_client = (ros.node.create_client(Trigger, name) for name in ("slow", "fast"))
     ros.spin_until(slow_client.service_is_ready)
     pending = slow_client.call_async(Trigger.Request())
-    assert ros.call(fast_client, Trigger.Request(), 2.0).success
+    assert ros.call(fast_client, Trigger.Request()).success
     assert not pending.done()
     gate.set()
-    assert ros.result(pending, 2.0).success
+    assert ros.result(pending).success
 
 
 def test_an_error_in_a_thread_reaches_who_awaits_it(ros) -> None:
@@ -148,6 +148,24 @@ def test_a_signal_lets_the_node_bring_to_rest_what_it_moves_while_the_graph_is_t
         process.send_signal(signal.SIGTERM)
         out, _ = process.communicate(timeout=10.0)
         assert (process.returncode, out) == (0, "held True\nclosed\n")
+
+
+def test_an_end_that_takes_too_long_is_told_where_it_stands_by_a_second_signal() -> None:
+    hangs = "print('closing', flush=True); import threading; threading.Event().wait()"
+    script = _SCRIPT.replace("super().close()", hangs)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": os.environ}
+    with subprocess.Popen([sys.executable, "-c", script], **pipes) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            assert process.stdout.readline() == "ready\n"
+            process.send_signal(signal.SIGINT)
+            assert process.stdout.readline() == "closing\n"
+            process.send_signal(signal.SIGTERM)
+            told = iter(process.stderr.readline, "")
+            assert any("in close" in line for line in told)
+        finally:
+            process.kill()
 
 
 def test_a_wrong_parameter_ends_the_process_with_a_sentence_and_exit_code_1() -> None:
