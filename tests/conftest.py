@@ -7,9 +7,13 @@ conditions with a deadline, never for a time to pass.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -21,6 +25,66 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("MUJOCO_GL", "egl")
 
 
+class Floor:
+    """Who may run beside whom where tests run in several processes: one that is marked `alone`, beside none.
+
+    Who waits to be alone holds the door, so that those who come after it can't keep it out.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._door, self._floor = ((folder / name).open("a") for name in ("door", "floor"))
+        self._alone = False
+
+    def enter(self, *, alone: bool) -> None:
+        if not self._alone:
+            with _locked(self._door):
+                fcntl.flock(self._floor, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+            self._alone = alone
+
+    def leave(self) -> None:
+        fcntl.flock(self._floor, fcntl.LOCK_UN)
+        self._alone = False
+
+
+@contextmanager
+def _locked(file: IO[str]) -> Iterator[None]:
+    fcntl.flock(file, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        fcntl.flock(file, fcntl.LOCK_UN)
+
+
+_FLOOR = pytest.StashKey[Floor]()
+
+
+def _alone(item: pytest.Item) -> bool:
+    return any(item.get_closest_marker(mark) for mark in ("alone", "graph"))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if hasattr(config, "workerinput"):
+        config.stash[_FLOOR] = Floor(config.cache.mkdir("floor"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=_alone)  # last: until then nobody waits
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, object, object]:
+    floor = item.config.stash.get(_FLOOR, None)
+    if floor is None:
+        return (yield)
+    floor.enter(alone=_alone(item))
+    try:
+        return (yield)
+    finally:
+        # what a file has set up for all its tests is there between them, too
+        if nextitem is None or nextitem.path != item.path or not (_alone(item) and _alone(nextitem)):
+            floor.leave()
+
+
 class RosProbe:
     """An executor with nodes in it, driven by conditions."""
 
@@ -30,7 +94,7 @@ class RosProbe:
         from rclpy.node import Node
 
         # A domain for each test: what an earlier one left behind in this process is not met.
-        self._domain = reserve_domain()
+        self._domain, self._before = reserve_domain(), os.environ["ROS_DOMAIN_ID"]
         os.environ["ROS_DOMAIN_ID"] = str(self._domain)
         rclpy.init()
         self.executor = SingleThreadedExecutor()
@@ -79,6 +143,7 @@ class RosProbe:
             node.destroy_node()
         rclpy.try_shutdown()
         release_domain(self._domain)
+        os.environ["ROS_DOMAIN_ID"] = self._before  # another process may reserve the released one
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import subprocess
 import sys
 import time
@@ -18,6 +19,11 @@ from openarm_common.errors import Code, OpenArmError
 #: Tests that start processes come last: a fault in a core shows in seconds.
 LAST = ("nodes", "replay", "graph")
 
+#: All tests are shared out among so many processes, a file each; those marked `alone` or `graph` run by themselves.
+WORKERS = 2
+#: What pytest can't do, or shows less of, when tests run in other processes.
+NEEDS_ONE_PROCESS = ("-s", "--capture=no", "--pdb", "--trace", "--collect-only", "--co", "no:xdist")
+
 Rest = Annotated[str, Parameter(allow_leading_hyphen=True)]
 
 
@@ -25,13 +31,14 @@ def test(*args: Rest) -> Outcome:
     """Run the tests: the cores first, then nodes, then whole graphs.
 
     Args:
-        args: Passed to pytest; without a path, all tests run.
+        args: Passed to pytest; without a path, all tests run, in two processes (-n 0: in one).
     """
     root = _checkout()
     given_paths = [arg for arg in args if not arg.startswith("-") and (root / arg.partition("::")[0]).exists()]
     paths = [] if given_paths else _in_order(root / "tests")
     began = time.monotonic()
-    command = [sys.executable, "-m", "pytest", "-q", *paths, *args]
+    shared = [] if given_paths or set(NEEDS_ONE_PROCESS) & set(args) else _shared_out()
+    command = [sys.executable, "-m", "pytest", "-q", *shared, *paths, *args]
     code = subprocess.run(command, cwd=root, check=False).returncode
     seconds = time.monotonic() - began
     data = {"exit_code": code, "seconds": round(seconds, 1)}
@@ -76,6 +83,13 @@ def _in_order(tests: Path) -> list[str]:
         return (1 + LAST.index(path.name) if path.name in LAST else 0, path.name)
 
     return [str(path.relative_to(tests.parent)) for path in sorted(entries, key=rank)]
+
+
+def _shared_out() -> list[str]:
+    """Options with which tests run in several processes, where there are processors for them."""
+    if len(os.sched_getaffinity(0)) < WORKERS:
+        return []
+    return ["-n", str(WORKERS), "--dist", "loadfile", "--no-loadscope-reorder"]
 
 
 def _checkout() -> Path:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from openarm_interfaces.srv import SetPause
 from sensor_msgs.msg import JointState
@@ -50,6 +51,7 @@ while True:
 """
 
 
+@pytest.mark.alone
 def test_n23_four_thousand_commands_a_second_leave_the_rate_or_are_told(ros, tmp_path) -> None:
     published: list[int] = []
     told: list[DiagnosticArray] = []

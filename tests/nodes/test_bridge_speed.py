@@ -12,6 +12,7 @@ from openarm_common.convert import stamp_to_ns
 from openarm_common.node import QOS_COMMAND, reliable
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("speed", [0.5, 3.0])
 def test_a20_the_speed_that_was_asked_for_shows_on_the_wire_or_it_says_why_not(bridge, speed: float) -> None:
     bench = bridge(images=False, speed=speed)

@@ -79,6 +79,7 @@ def test_a15_a16_a17_names_types_and_qos(seeing) -> None:
     np.testing.assert_allclose(seeing.arm, seeing.HOME, atol=0.01)
 
 
+@pytest.mark.alone
 def test_a18_a19_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
     factors = bench.collect(Float64, "/sim/real_time_factor", 5)
     clocks = bench.collect(Clock, "/clock", QOS_CLOCK)

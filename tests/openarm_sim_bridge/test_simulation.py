@@ -68,6 +68,7 @@ def bench() -> Iterator[Bench]:
     out.simulation.stop()
 
 
+@pytest.mark.alone
 def test_a18_a19_ticks_keep_pace_with_the_wall_clock(bench: Bench) -> None:
     bench.wait(lambda: len(bench.states) > 200)
     (wall_0, first), (wall_1, last) = bench.states[50], bench.states[200]
