@@ -17,6 +17,7 @@ from typing import Any
 import psutil
 import pytest
 
+from openarm_bringup.supervision.runs import RunRecord, state_dir
 from openarm_common.domain import reserve_domain
 
 ROOT = Path(__file__).parents[2]
@@ -46,13 +47,16 @@ class Up:
 
     def wait_ready(self, seconds: float = 60.0) -> dict[str, Any]:
         """Wait until all nodes are ready."""
+        # Asked for by a process of its own only then: those would slow the start down.
+        written = state_dir(self.env) / f"{self.process.pid}.json"
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             assert self.process.poll() is None, self.output.read_text()
-            record = self.record()
-            if record is not None and record["ready"]:
-                return record
-            time.sleep(0.2)
+            if written.exists() and RunRecord.model_validate_json(written.read_text()).ready:
+                record = self.record()
+                if record is not None and record["ready"]:
+                    return record
+            time.sleep(0.05)
         pytest.fail(f"not ready within {seconds:g} s: {self.output.read_text()}")
 
     def pids(self) -> list[int]:

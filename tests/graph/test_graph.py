@@ -197,6 +197,7 @@ def test_p34_a_second_start_in_the_same_domain_works(start_graph: Any) -> None:
     first = start_graph("sim_only")
     first.wait_ready()
     assert first.stop(signal.SIGTERM) == 0
-    second = start_graph("sim_only")
+    second = start_graph("sim_only", beside=first)
+    assert second.domain == first.domain
     second.wait_ready()
     assert second.stop() == 0
