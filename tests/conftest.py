@@ -132,6 +132,16 @@ class RosProbe:
         handle = self.result(client.send_goal_async(goal, feedback_callback=feedback_callback), timeout, "goal answer")
         return handle, handle.get_result_async() if handle.accepted else None
 
+    def hear_all(self, client, goal, heard: list, last: Callable[[], object], timeout: float = 10.0):
+        """Send a goal, put its feedback into `heard`, and return its result.
+
+        That is asked for only when the `last` feedback has come: rclpy takes no more of it once it has the result.
+        """
+        self.spin_until(client.server_is_ready, timeout, "the action server is there")
+        sent = client.send_goal_async(goal, lambda message: heard.append(message.feedback))
+        self.spin_until(last, timeout, "the last feedback")
+        return self.result(self.result(sent).get_result_async(), timeout).result
+
     def close(self) -> None:
         """Shut down in order."""
         import rclpy

@@ -95,12 +95,8 @@ def test_a_message_a_service_and_actions_make_the_round_trip(ros, peer) -> None:
     feedback: list[PlanApproach.Feedback] = []
     plan = ActionClient(ros.node, PlanApproach, "/plan")
     goal = PlanApproach.Goal(arm="right", targets=[ApproachTarget(id="top"), ApproachTarget(id="side", score=0.5)])
-    ros.spin_until(plan.server_is_ready, what="the action server")
-    sent = plan.send_goal_async(goal, lambda message: feedback.append(message.feedback))
-    # The result is asked for afterwards: a client that has it takes no more feedback.
-    ros.spin_until(lambda: len(feedback) == 2, what="both feedback messages")
+    result = ros.hear_all(plan, goal, feedback, lambda: len(feedback) == 2)
     assert [(message.stage, message.tried) for message in feedback] == [("top", 0), ("side", 1)]
-    result = ros.result(ros.result(sent).get_result_async()).result
     assert (result.code, result.chosen, [refusal.id for refusal in result.refusals]) == ("NO_PLAN", -1, ["top", "side"])
 
     follow = ActionClient(ros.node, FollowJointTrajectory, "/follow")

@@ -45,8 +45,8 @@ def test_a65_two_objects_are_picked_at_once_each_by_its_arm_and_each_tells_its_s
     wish = goal("red", "blue")
     wish.requests[1].has_place_position = True
     wish.requests[1].place_position.x, wish.requests[1].place_position.y = 0.3, 0.3
-    _, future = bench.ros.send_goal(bench.two, wish, feedback_callback=lambda m: heard.append(m.feedback))
-    result: PickTwo.Result = bench.ros.result(future, 60.0).result
+    ended = lambda: {f.request for f in heard if f.status.label and f.status.state == "IDLE"} == {0, 1}  # noqa: E731
+    result: PickTwo.Result = bench.ros.hear_all(bench.two, wish, heard, ended, 60.0)
     assert (result.success, result.outcome, result.code, result.at_once) == (True, "SUCCESS", "OK", True), result
     assert [(a.label, a.arm, a.attempts, a.route) for a in result.answers] == [
         ("red", "right", 1, "direct"),

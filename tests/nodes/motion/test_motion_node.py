@@ -55,17 +55,14 @@ def test_compute_ik_answers_what_is_wrong(bench) -> None:
 
 # --- moves
 def test_a25_a_move_is_planned_sent_as_joint_targets_and_verified(bench) -> None:
-    feedback: list[tuple[str, float]] = []
-    goal = bench.named()
-    result = bench.run(
-        bench.move_client, goal, feedback_callback=lambda m: feedback.append((m.feedback.stage, m.feedback.progress))
-    )
+    feedback: list[MoveArm.Feedback] = []
+    arrived = lambda: feedback and feedback[-1].progress == 1.0  # noqa: E731
+    result = bench.ros.hear_all(bench.move_client, bench.named(), feedback, arrived)
     assert (result.success, result.code, result.message) == (True, "OK", "arrived")
     np.testing.assert_allclose(bench.q("right"), [0, 0, 0, 1.5708, 0, 0, 0], atol=1e-3)
     assert result.trajectory.joint_names == list(bench.description.arm_joints("right"))
     assert len(result.trajectory.points[0].accelerations) == 7
-    assert feedback[0][0] == "planning"
-    assert feedback[-1] == ("executing", 1.0)
+    assert (feedback[0].stage, feedback[-1].stage) == ("planning", "executing")
     assert result.planning_time < 5.0
 
 
