@@ -53,6 +53,10 @@ _QUEUE_BYTES, _LARGE = 512 * 2**20, 64 * 2**10
 _BEHIND_BYTES = 32 * 2**20
 _DISCOVERY_S = 0.5
 _LOOK_S = 0.005
+#: A graph is known when nothing new was seen of it for so long, s. To meet a participant, Fast DDS opens its port in
+#: shared memory and, if nobody reads there just then, sleeps a third of a second with a lock that readers of other
+#: topics need: images that come meanwhile are lost. So everybody is met first, and then recorded.
+_KNOWN_S, _LONGEST_S = 1.0, 10.0
 #: Messages that a reader keeps between two looks.
 _DEPTH = 200
 #: Given a message as CDR and what is known of it.
@@ -128,6 +132,7 @@ class Recorder:
             rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
             self._node = rclpy.create_node("openarm_recorder", context=self._context, use_global_arguments=False)
         self._end = threading.Event()
+        self._began = threading.Event()
         self._changed = threading.Condition()
         self._threads = [
             threading.Thread(target=self._listen, name="recorder", daemon=True),
@@ -156,15 +161,34 @@ class Recorder:
         """What is recorded, sorted."""
         return sorted(self._topics)
 
+    def wait_began(self, seconds: float) -> bool:
+        """Wait, but not longer, until it has met everybody on the graph and records; returns whether it does."""
+        return self._began.wait(seconds)
+
     def wait(self, seconds: float) -> bool:
         """Wait, but not longer than until the recording ends by itself; returns whether it goes on."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self.recorded.ended), seconds)
         return not self.recorded.ended
 
+    def _meet(self) -> None:
+        """Wait until everybody on the graph has been met."""
+        began = changed_at = time.monotonic()
+        met: object = None
+        while time.monotonic() - changed_at < _KNOWN_S and time.monotonic() - began < _LONGEST_S:
+            topics = self._node.get_topic_names_and_types()
+            seen = (self._node.get_node_names(), [(topic, self._node.count_publishers(topic)) for topic, _ in topics])
+            if seen != met:
+                met, changed_at = seen, time.monotonic()
+            if self._end.wait(0.05):
+                break
+
     def _listen(self) -> None:
+        self._meet()
+        self._discover()
+        self._began.set()
         # Looking into sixty readers takes 0.1 ms; an executor makes a wait set of them anew for every few messages.
-        found_at = 0.0
+        found_at = time.monotonic()
         while not self._end.wait(_LOOK_S):
             if time.monotonic() - found_at > _DISCOVERY_S:
                 self._discover()

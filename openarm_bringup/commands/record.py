@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
+from rich.console import Console
 
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
@@ -52,6 +53,11 @@ def record(
     before = {n: signal.signal(n, lambda *_: stop.set()) for n in (signal.SIGINT, signal.SIGTERM)}
     try:
         with Recorder(number, path, topics or PROFILES[profile], _custom(number), image_rate) as recorder:
+            while not stop.is_set() and not recorder.wait_began(0.2):
+                pass
+            topics_now = f"{len(recorder.topics)} topics" if recorder.topics else "topics that come to be"
+            console = Console(stderr=True, highlight=False)
+            console.print(f"recording {topics_now} to {path}; Ctrl-C ends it", markup=False, soft_wrap=True)
             deadline = time.monotonic() + (duration or float("inf"))
             while (left := deadline - time.monotonic()) > 0.0 and not stop.is_set():
                 if not recorder.wait(min(0.2, left)):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -152,6 +152,22 @@ def the_running(domain: int | None = None) -> RunRecord:
         where = "" if domain is None else f" in domain {domain}"
         raise OpenArmError(Code.NOT_READY, f"no graph is running{where}{hint}; start one with `openarm up`")
     raise OpenArmError(Code.INVALID_ARGUMENT, f"several graphs are running: {listed}; choose one with --domain")
+
+
+def refuse_twins(domain: int, nodes: Iterable[str]) -> None:
+    """Look for nodes that are to be started in a domain and run there already: two of a name would both be obeyed.
+
+    Raises:
+        OpenArmError: BUSY, naming the graph that has them.
+    """
+    for run in running():
+        twins = [name for name in nodes if name in run.nodes]
+        if twins and run.domain == domain and run.pid != os.getpid():
+            raise OpenArmError(
+                Code.BUSY,
+                f"{run.graph} (supervisor {run.pid}) runs in domain {domain} and has {', '.join(twins)} already: end "
+                "it with Ctrl-C where it was started, or start this one in a domain of its own (--domain)",
+            )
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

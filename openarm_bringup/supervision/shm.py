@@ -20,6 +20,8 @@ SHM = Path("/dev/shm")
 #: MiB of /dev/shm that a participant takes beside its large segment, measured.
 _PLAIN_MIB = 0.65
 _LARGE_EXTRA_MIB = 2.2
+#: Segments grow up to so many times where a graph then still takes no more than this part of the room.
+_ROOMY, _PART = 4, 0.25
 
 _SEGMENT = re.compile(r"^fastrtps_[0-9a-f]{16}$")
 _PORT = re.compile(r"^fastrtps_port(\d+)$")
@@ -74,6 +76,23 @@ def clean_shm() -> str:
     env = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}"}
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=20, check=False)
     return " ".join((done.stdout + done.stderr).split())
+
+
+def with_room(graph: Graph, free_mib: float | None = None) -> Graph:
+    """Return the graph with larger segments where /dev/shm has room for them.
+
+    A segment is how long a listener may be held up before images are lost to it: a quarter of a second of two cameras
+    in the least that a graph asks for. Fast DDS itself can take longer, when it meets many new participants.
+    """
+    free = shm_free_mib() if free_mib is None else free_mib
+    times = min(_ROOMY, int(_PART * free / shm_need_mib(graph)))
+    if times < 2:
+        return graph
+    nodes = {
+        name: spec.model_copy(update={"segment_mib": times * spec.segment_mib}) if spec.large_messages else spec
+        for name, spec in graph.nodes.items()
+    }
+    return graph.model_copy(update={"nodes": nodes})
 
 
 def mapped_by(pid: int, shm: Path = SHM) -> set[str]:

@@ -62,7 +62,7 @@ class Supervisor:
         ladder: Ladder | None = None,
         poll: float = 0.1,
     ) -> None:
-        self.graph = graph
+        self.graph = graph = shm.with_room(graph)
         self.run_dir = run_dir
         self._make_probe = probe
         self._probe: asyncio.Future[Probe] | None = None
@@ -92,8 +92,10 @@ class Supervisor:
         """Begin to start the nodes; returns at once.
 
         Raises:
-            OpenArmError: ENVIRONMENT, when /dev/shm is too small for the graph.
+            OpenArmError: BUSY, when a node of the graph runs in its domain already; ENVIRONMENT, when /dev/shm is too
+                small for it.
         """
+        runs.refuse_twins(environment.domain_id(self.graph), self.graph.nodes)
         shm.check_shm(self.graph)
         (self.run_dir / "logs").mkdir(parents=True, exist_ok=True)
         self._guard = await asyncio.create_subprocess_exec(
