@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,8 @@ app = App(name="tf", help="Show the tree of frames, or one frame in another.")
 
 #: Joint frames are told on /tf at 50 Hz, the rest on /tf_static.
 _LISTEN_S = 1.0
+#: Frames that a sentence names.
+_NAMED = 4
 
 
 @app.command
@@ -68,7 +71,7 @@ def tree(*, out: Path | None = None, domain: int | None = None) -> Outcome:
         write(rows, out)
         data["out"] = str(out)
     if frames.clashes:
-        said = "; ".join(f"{name} {what}" for name, what in sorted(frames.clashes.items()))
+        said = "; ".join(_grouped(frames.clashes))
         advice = "a frame has one parent and one publisher: `openarm node list` shows who may be one too many"
         return Outcome(False, f"{said}; {advice}", Code.NO_TRANSFORM, data, text)
     if len(roots) != 1:
@@ -100,6 +103,19 @@ def _to_root(edges: Edges, frame: str) -> NDArray[np.float64]:
         name, T_parent, _ = edges[name]
         T = T_parent @ T
     raise OpenArmError(Code.NO_TRANSFORM, f"the frames from {frame!r} on form a loop")
+
+
+def _grouped(clashes: Mapping[str, str]) -> list[str]:
+    """One sentence for each thing that is wrong, with the frames that it is wrong with."""
+    frames: dict[str, list[str]] = {}
+    for name, what in sorted(clashes.items()):
+        frames.setdefault(what, []).append(name)
+    said: list[str] = []
+    for what, names in frames.items():
+        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+        each = "each of " if len(names) > 1 else ""
+        said.append(f"{each}{', '.join(names[:_NAMED])}{more} {what}")
+    return said
 
 
 def _rows(edges: Edges) -> list[Row]:

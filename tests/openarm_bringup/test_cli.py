@@ -187,6 +187,32 @@ def test_several_graphs_are_told_apart_by_domain_and_one_that_lost_a_node_is_deg
         runs.remove_record(os.getpid())
 
 
+def test_a_graph_is_not_started_beside_another_that_has_its_nodes(capsys: pytest.CaptureFixture[str]) -> None:
+    other = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(60)"])
+    ready = runs.NodeRecord(state="ready")
+    record = runs.RunRecord(
+        graph="arms",
+        pid=other.pid,
+        pid_created=psutil.Process(other.pid).create_time(),
+        domain=67,
+        discovery="localhost",
+        run_dir="",
+        started="",
+        nodes={"motion": ready, "eye": ready},
+    )
+    runs.write_record(record)
+    try:
+        assert cli.run(["up", "motion", "--domain", "67", "--json"]) == 1
+        answer = json.loads(capsys.readouterr().out)
+        assert answer["code"] == Code.BUSY
+        assert f"arms (supervisor {other.pid}) runs in domain 67 and has motion already" in answer["message"]
+        runs.refuse_twins(67, ["hand"])  # as with eyes and hands under supervisors of their own
+        runs.refuse_twins(68, ["motion"])
+    finally:
+        other.kill()
+        other.wait()
+
+
 def test_record_of_another_process_with_the_same_number_is_not_alive() -> None:
     record = runs.RunRecord(
         graph="toy", pid=os.getpid(), pid_created=1.0, domain=0, discovery="localhost", run_dir="", started="", nodes={}

@@ -14,6 +14,7 @@ import pytest
 from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage
 
+from openarm_bringup.commands import tf
 from openarm_bringup.peer_client import Frames
 from openarm_bringup.tree_picture import Row, lay_out, write
 from openarm_common.errors import OpenArmError
@@ -79,3 +80,11 @@ def test_a_picture_that_cannot_be_written_says_why(tmp_path: Path) -> None:
         write(ROWS, tmp_path / "tree.gif")
     with pytest.raises(OpenArmError, match=r"can't write .*No such file"):
         write(ROWS, tmp_path / "none" / "tree.png")
+
+
+def test_what_is_wrong_with_many_frames_is_said_once() -> None:
+    clashes = {f"link{i}": "is told by two on /tf" for i in range(6)} | {"eye": "hangs below a and below b"}
+    assert tf._grouped(clashes) == [
+        "eye hangs below a and below b",
+        "each of link0, link1, link2, link3 and 2 more is told by two on /tf",
+    ]
