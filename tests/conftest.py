@@ -59,7 +59,7 @@ _FLOOR = pytest.StashKey[Floor]()
 
 
 def _alone(item: pytest.Item) -> bool:
-    return any(item.get_closest_marker(mark) for mark in ("alone", "graph"))
+    return item.get_closest_marker("alone") is not None
 
 
 def pytest_configure(config: pytest.Config) -> None:

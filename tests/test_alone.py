@@ -27,7 +27,7 @@ def test_of_some_time(k):
 
 def test_who_is_alone_meets_nobody_and_the_others_do_not_wait(tmp_path: Path) -> None:
     """Also between two of a file: what it has set up for all of them is there then, too."""
-    marks = {"a": "", "b": "", "c": "", "d": "@pytest.mark.alone", "e": "@pytest.mark.graph"}
+    marks = {"a": "", "b": "", "c": "", "d": "@pytest.mark.alone", "e": "@pytest.mark.alone"}
     for name, mark in marks.items():
         (tmp_path / f"test_{name}.py").write_text(FILE.format(mark=mark))
     command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.conftest", "-n", "2", "--dist", "loadfile"]

@@ -19,7 +19,7 @@ from openarm_common.errors import Code, OpenArmError
 #: Tests that start processes come last: a fault in a core shows in seconds.
 LAST = ("nodes", "replay", "graph")
 
-#: All tests are shared out among so many processes, a file each; those marked `alone` or `graph` run by themselves.
+#: All tests are shared out among so many processes, a file each; those marked `alone` have the machine for themselves.
 WORKERS = 2
 #: What pytest can't do, or shows less of, when tests run in other processes.
 NEEDS_ONE_PROCESS = ("-s", "--capture=no", "--pdb", "--trace", "--collect-only", "--co", "no:xdist")

@@ -21,7 +21,7 @@ from openarm_common.scene import load_scene
 from openarm_grasp.client import GraspClient, GraspResult
 from openarm_motion.client import MotionClient
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow]
+pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 
 #: The graph `sim`, whose eyes are not started again, without what a grasp does not need.
 BLINDABLE = """

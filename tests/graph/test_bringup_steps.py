@@ -28,7 +28,7 @@ from openarm_common.convert import points_from_cloud
 from openarm_common.description import RobotDescription
 from openarm_common.scene import load_scene
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow]
+pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 
 
 @contextmanager

@@ -16,6 +16,8 @@ from openarm_calibration.store import CalibrationStore
 from openarm_common.cameras import load_cameras, true_mount
 from openarm_common.client import BackgroundNode
 
+pytestmark = [pytest.mark.graph, pytest.mark.slow]
+
 #: Of the mounts; the suite has no calibration of it.
 SEED = 3
 LATE_MS = 20.0

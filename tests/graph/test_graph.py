@@ -28,7 +28,7 @@ from openarm_common.errors import Code
 from openarm_common.scene import load_scene
 from openarm_grasp.client import GraspClient, GraspResult
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow]
+pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 
 #: What a grasp may say when the robot is lost under it.
 LOST = {Code.ROBOT_LOST, Code.STALE_DATA, Code.EXECUTION_FAILED, Code.GRASP_LOST, Code.NOT_READY}

@@ -13,6 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+pytestmark = [pytest.mark.graph, pytest.mark.slow]
+
 SCRIPT = ("--set", "script.dry_run=true", "--set", "script.rest=0.3", "--set", "script.begin=0.5")
 
 

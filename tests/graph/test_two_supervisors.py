@@ -14,7 +14,7 @@ import pytest
 
 from openarm_common.errors import Code
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow]
+pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 
 BLIND = {Code.NOTHING_DETECTED, Code.STALE_DATA, Code.NOT_READY, Code.TIMEOUT}
 
