@@ -66,6 +66,7 @@ def test_json_may_stand_anywhere_and_its_path_is_optional(argv: list[str], path:
 def test_wrong_call_ends_with_2_and_one_sentence(
     argv: list[str], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    runs.new_run_dir()
     assert cli.run(argv) == 2
     out, err = capsys.readouterr()
     assert out == ""
