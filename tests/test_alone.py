@@ -30,8 +30,13 @@ def test_who_is_alone_meets_nobody_and_the_others_do_not_wait(tmp_path: Path) ->
     marks = {"a": "", "b": "", "c": "", "d": "@pytest.mark.alone", "e": "@pytest.mark.alone"}
     for name, mark in marks.items():
         (tmp_path / f"test_{name}.py").write_text(FILE.format(mark=mark))
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.conftest", "-n", "2", "--dist", "loadfile"]
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "xdist", "-p", "tests.conftest"]
+    command += ["-n", "2", "--dist", "loadfile"]
+    env = {
+        **os.environ,
+        "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)]),
+    }
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60.0, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     spans = {path.stem: json.loads(path.read_text()) for path in tmp_path.glob("test_*.json")}
