@@ -53,10 +53,11 @@ _QUEUE_BYTES, _LARGE = 512 * 2**20, 64 * 2**10
 _BEHIND_BYTES = 32 * 2**20
 _DISCOVERY_S = 0.5
 _LOOK_S = 0.005
-#: A graph is known when nothing new was seen of it for so long, s. To meet a participant, Fast DDS opens its port in
-#: shared memory and, if nobody reads there just then, sleeps a third of a second with a lock that readers of other
-#: topics need: images that come meanwhile are lost. So everybody is met first, and then recorded.
-_KNOWN_S, _LONGEST_S = 1.0, 10.0
+#: A graph is known when nothing new was seen of it for so long, s: a participant announces itself every three seconds.
+#: To meet one, Fast DDS opens its port in shared memory and, if nobody reads there just then, sleeps a third of a
+#: second with a lock that readers of other topics need: images that come meanwhile are lost. So everybody is met first,
+#: and then recorded.
+_KNOWN_S, _LONGEST_S = 3.2, 12.0
 #: Messages that a reader keeps between two looks.
 _DEPTH = 200
 #: Given a message as CDR and what is known of it.
@@ -175,12 +176,13 @@ class Recorder:
         """Wait until everybody on the graph has been met."""
         began = changed_at = time.monotonic()
         met: object = None
-        while time.monotonic() - changed_at < _KNOWN_S and time.monotonic() - began < _LONGEST_S:
+        while not self._end.wait(0.05):
             topics = self._node.get_topic_names_and_types()
-            seen = (self._node.get_node_names(), [(topic, self._node.count_publishers(topic)) for topic, _ in topics])
+            seen = self._node.get_node_names(), [(topic, self._node.count_publishers(topic)) for topic, _ in topics]
+            now = time.monotonic()
             if seen != met:
-                met, changed_at = seen, time.monotonic()
-            if self._end.wait(0.05):
+                met, changed_at = seen, now
+            if now - changed_at > _KNOWN_S or now - began > _LONGEST_S:
                 break
 
     def _listen(self) -> None:

@@ -23,6 +23,12 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 
 
+@pytest.fixture(autouse=True)
+def known_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The graph is this process."""
+    monkeypatch.setattr("openarm_bringup.bags.recorder_client._KNOWN_S", 0.3)
+
+
 def record(ros, path: Path, count: int, patterns: tuple[str, ...] = (".*",)) -> Recorder:
     chatter = ros.node.create_publisher(String, "/chatter", QOS_COMMAND)
     latched = ros.node.create_publisher(String, "/robot_description", QOS_LATCHED)
