@@ -7,7 +7,9 @@ can branch on them; the message is for people: what, which value, what was expec
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
+from typing import Self
 
 
 class Code(StrEnum):
@@ -59,3 +61,28 @@ class OpenArmError(Exception):
     def __reduce__(self) -> tuple[type[OpenArmError], tuple[Code, str]]:
         """Let the error cross process borders (worker pools pickle it)."""
         return (type(self), (self.code, self.message))
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a client is told in the end; packages add what else there is to know.
+
+    Attributes:
+        success: What was asked for was done.
+        code: OK, or why not.
+        message: What happened, in a sentence or two.
+    """
+
+    success: bool
+    code: Code
+    message: str
+
+    def raise_for_code(self) -> Self:
+        """Return the answer to what was done.
+
+        Raises:
+            OpenArmError: With code and message, for anything else.
+        """
+        if not self.success:
+            raise OpenArmError(self.code, self.message)
+        return self

@@ -5,21 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Answer
 from openarm_grasp.options import Option
 
 
 @dataclass(frozen=True)
-class GraspResult:
+class GraspResult(Answer):
     """How a grasp ended.
 
+    Success: the object was placed and seen there (dry run: it could be).
+
     Attributes:
-        success: The object was placed and seen there (dry run: it could be).
         outcome: SUCCESS; PARTIAL: held, not placed as asked; FAILED; REFUSED: never touched; CANCELLED.
-        code: `openarm_common.errors.Code`.
-        message: What happened, in a sentence or two.
         label: What was picked.
         arm: The arm that was used, or "".
         attempts: Physical attempts.
@@ -30,10 +28,7 @@ class GraspResult:
         options: Ways to grasp that were weighed for the newest plan, by arm, the preferred first; of one object only.
     """
 
-    success: bool
     outcome: str
-    code: Code
-    message: str
     label: str
     arm: str
     attempts: int
@@ -41,16 +36,6 @@ class GraspResult:
     duration: float
     route: str = ""
     options: tuple[Option, ...] = ()
-
-    def raise_for_code(self) -> Self:
-        """Return the result of a success.
-
-        Raises:
-            OpenArmError: With code and message, for anything else.
-        """
-        if not self.success:
-            raise OpenArmError(self.code, self.message)
-        return self
 
 
 @dataclass(frozen=True)
@@ -74,34 +59,20 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class PairResult:
+class PairResult(Answer):
     """How two grasps that were asked for at once ended.
 
+    Success: of both; else the code is that of the first that failed.
+
     Attributes:
-        success: Of both.
         outcome: SUCCESS; PARTIAL: one of them, or picked and not placed as asked; FAILED; REFUSED: none was touched;
             CANCELLED.
-        code: OK, or of the first that failed.
-        message: What happened.
         at_once: Both arms worked at the same time.
         answers: To each, in the order asked; none when they were not taken.
         duration: s of robot time.
     """
 
-    success: bool
     outcome: str
-    code: Code
-    message: str
     at_once: bool
     answers: tuple[GraspResult, ...]
     duration: float
-
-    def raise_for_code(self) -> Self:
-        """Return the result of a success.
-
-        Raises:
-            OpenArmError: With code and message, for anything else.
-        """
-        if not self.success:
-            raise OpenArmError(self.code, self.message)
-        return self

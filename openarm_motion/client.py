@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -16,7 +16,7 @@ from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
 
 from openarm_common.client import BackgroundNode
 from openarm_common.convert import matrix_to_pose, pose_to_matrix, trajectory_from_msg
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Answer, Code, OpenArmError
 from openarm_motion import convert
 from openarm_motion.solids import Box, Solid
 from openarm_motion.trajectory import Trajectory
@@ -40,34 +40,20 @@ class MotionFailure:
 
 
 @dataclass(frozen=True, eq=False)
-class MotionResult:
+class MotionResult(Answer):
     """How a motion ended.
 
+    Success: it arrived (plan only: there is a plan).
+
     Attributes:
-        success: It arrived (plan only: there is a plan).
-        code: `openarm_common.errors.Code`.
-        message: What happened, in a sentence.
         trajectories: The plan, of each arm that was asked for; empty without one.
         scene_version: Of the planning scene that it was made in; 0 for `execute`.
         failure: Where and why there is no plan; None after a success.
     """
 
-    success: bool
-    code: Code
-    message: str
     trajectories: tuple[Trajectory, ...] = ()
     scene_version: int = 0
     failure: MotionFailure | None = None
-
-    def raise_for_code(self) -> Self:
-        """Return the result of a success.
-
-        Raises:
-            OpenArmError: With code and message, for anything else.
-        """
-        if not self.success:
-            raise OpenArmError(self.code, self.message)
-        return self
 
 
 class MotionClient(BackgroundNode):
