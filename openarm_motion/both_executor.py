@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +16,12 @@ from trajectory_msgs.msg import JointTrajectory
 
 from openarm_common.convert import ns_to_stamp, trajectory_from_msg
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import BaseNode
-from openarm_common.tf import RobotStateListener
 from openarm_motion import convert
 from openarm_motion.arm import Arm, Situation
 from openarm_motion.both import BothArms
 from openarm_motion.checks import Motion, check_trajectory
-from openarm_motion.config import MotionConfig
-from openarm_motion.executor import Follower
+from openarm_motion.executor import Robot
 from openarm_motion.goals import goal_configurations, posture, yielding
-from openarm_motion.memory import HeldMemory
 from openarm_motion.situation_client import Situations
 from openarm_motion.solids import Box
 from openarm_motion.together import BothGoals, BothPlan, plan_any, plan_staggered, plan_together
@@ -46,25 +42,13 @@ class BothExecutor:
     """See the module's head.
 
     Args:
-        node: Owns executor and threads.
-        states: The robot's joint states.
-        followers: Of each arm.
-        arms: By name.
+        robot: The robot and its node.
         situations: What requests start from.
-        held: What the hands hold.
     """
 
-    def __init__(
-        self,
-        node: BaseNode[MotionConfig],
-        states: RobotStateListener,
-        arms: Mapping[str, Arm],
-        followers: Mapping[str, Follower],
-        situations: Situations,
-        held: HeldMemory,
-    ) -> None:
-        self._node, self._states, self._arms = node, states, arms
-        self._followers, self._situations, self._held = followers, situations, held
+    def __init__(self, robot: Robot, situations: Situations) -> None:
+        self._node, self._states, self._arms = robot.node, robot.states, robot.arms
+        self._followers, self._situations, self._held = robot.followers, situations, robot.held
 
     def arms_of(self, goal: MoveArms.Goal) -> tuple[Arm, Arm]:
         """The two arms of a goal.

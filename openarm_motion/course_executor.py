@@ -15,15 +15,12 @@ from visualization_msgs.msg import MarkerArray
 
 from openarm_common.convert import ns_to_stamp, trajectory_from_msg
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import QOS_LATCHED, BaseNode
-from openarm_common.tf import RobotStateListener
+from openarm_common.node import QOS_LATCHED
 from openarm_motion import convert
 from openarm_motion.arm import Arm
 from openarm_motion.beside import Course, least_wait
 from openarm_motion.checks import Motion, check_against_others, check_trajectory
-from openarm_motion.config import MotionConfig
-from openarm_motion.executor import Follower
-from openarm_motion.memory import HeldMemory
+from openarm_motion.executor import Robot
 from openarm_motion.solids import Box
 from openarm_motion.trajectory import Trajectory
 
@@ -38,26 +35,15 @@ class CourseExecutor:
     """See the module's head.
 
     Args:
-        node: Owns executor, threads and publishers.
-        states: The robot's joint states.
-        followers: Of each arm.
-        arms: By name.
-        held: What the hands hold.
+        robot: The robot and its node.
     """
 
-    def __init__(
-        self,
-        node: BaseNode[MotionConfig],
-        states: RobotStateListener,
-        followers: Mapping[str, Follower],
-        arms: Mapping[str, Arm],
-        held: HeldMemory,
-    ) -> None:
-        self._node, self._states, self._held = node, states, held
-        self._followers, self._arms = followers, arms
-        self._stops = dict.fromkeys(arms, 0)
+    def __init__(self, robot: Robot) -> None:
+        self._node, self._states, self._held = robot.node, robot.states, robot.held
+        self._followers, self._arms = robot.followers, robot.arms
+        self._stops = dict.fromkeys(robot.arms, 0)
         self._turn: Future | None = None
-        self._attached = node.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
+        self._attached = robot.node.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
         self._publish()
 
     def hold(self, name: str, boxes: Sequence[Box]) -> None:

@@ -8,7 +8,7 @@ without any joint state is wall clock.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,8 @@ from openarm_common.node import BaseNode
 from openarm_common.tf import RobotStateListener
 from openarm_motion.arm import Arm
 from openarm_motion.checks import Motion
+from openarm_motion.config import MotionConfig
+from openarm_motion.memory import HeldMemory
 
 #: Between two looks at a running motion, s of wall clock.
 _WATCH = 0.05
@@ -56,6 +58,25 @@ class Running:
     def rest(self, now_ns: int) -> Motion:
         """What is left of it, beginning now."""
         return self.motion.later((self.since_ns - now_ns) * 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """What all that plans and carries out motions needs of the robot and the node that serves it.
+
+    Attributes:
+        node: Owns executor, threads, publishers and parameters.
+        states: Joint states.
+        arms: By name.
+        followers: Of each arm: what is under way.
+        held: What the hands hold.
+    """
+
+    node: BaseNode[MotionConfig]
+    states: RobotStateListener
+    arms: Mapping[str, Arm]
+    followers: Mapping[str, Follower]
+    held: HeldMemory
 
 
 class Follower:

@@ -34,7 +34,7 @@ from openarm_motion.arm import Arm, Situation
 from openarm_motion.both_executor import BothExecutor
 from openarm_motion.config import MotionConfig
 from openarm_motion.course_executor import CourseExecutor
-from openarm_motion.executor import Follower, Watch
+from openarm_motion.executor import Follower, Robot, Watch
 from openarm_motion.goals import posture
 from openarm_motion.memory import HeldMemory
 from openarm_motion.planning_scene import PlanningScene
@@ -59,17 +59,18 @@ class MotionNode(BaseNode[MotionConfig]):
         super().__init__("motion", MotionConfig, **kwargs)
         scene = PlanningScene(table_boxes(self.config.scene))
         self._states = RobotStateListener(self, self.description)
-        robot = with_housings(self.description, load_cameras().values())
-        self._arms = {name: Arm(name, robot, self.config, scene.fixed) for name in self.config.arms}
+        body = with_housings(self.description, load_cameras().values())
+        self._arms = {name: Arm(name, body, self.config, scene.fixed) for name in self.config.arms}
         self._followers = {name: Follower(self, arm, self._states) for name, arm in self._arms.items()}
         self._claimed: set[str] = set()
         self._closing = False
         self._held = HeldMemory()
         self._preview = PreviewPublisher(self, self._arms)
-        self._courses = CourseExecutor(self, self._states, self._followers, self._arms, self._held)
-        self._situations = Situations(self, self._states, self._arms, scene, self._held, self._followers)
+        robot = Robot(self, self._states, self._arms, self._followers, self._held)
+        self._courses = CourseExecutor(robot)
+        self._situations = Situations(robot, scene)
         self._scene = SceneExecutor(self, scene, self._situations)
-        self._both = BothExecutor(self, self._states, self._arms, self._followers, self._situations, self._held)
+        self._both = BothExecutor(robot, self._situations)
         self._servers = [
             self._serve(PlanApproach, "/motion/plan_approach", self._on_plan),
             self._serve(MoveArm, "/motion/move", self._on_move),

@@ -13,13 +13,10 @@ from numpy.typing import NDArray
 
 from openarm_common.convert import pose_to_matrix
 from openarm_common.distance_field import field_path
-from openarm_common.node import BASE_FRAME, BaseNode
-from openarm_common.tf import RobotStateListener
+from openarm_common.node import BASE_FRAME
 from openarm_motion.arm import Arm, Situation
-from openarm_motion.config import MotionConfig
-from openarm_motion.executor import Follower, Watch, stale
+from openarm_motion.executor import Robot, Watch, stale
 from openarm_motion.map_eye import Look, MapEye, unexplained
-from openarm_motion.memory import HeldMemory
 from openarm_motion.planning_scene import PlanningScene
 from openarm_motion.seen import Known, carried
 from openarm_motion.solids import Box, Solid
@@ -44,25 +41,14 @@ class Situations:
     """Makes situations from what the node knows.
 
     Args:
-        node: The node.
-        states: The robot's joint states.
-        arms: By name.
+        robot: The robot and its node.
         scene: Bodies.
-        held: What the hands hold.
-        followers: Of each arm: what is under way.
     """
 
-    def __init__(
-        self,
-        node: BaseNode[MotionConfig],
-        states: RobotStateListener,
-        arms: Mapping[str, Arm],
-        scene: PlanningScene,
-        held: HeldMemory,
-        followers: Mapping[str, Follower],
-    ) -> None:
-        self._followers = followers
-        self._node, self._states, self._arms, self._scene, self._held = node, states, arms, scene, held
+    def __init__(self, robot: Robot, scene: PlanningScene) -> None:
+        self._node, self._states, self._arms = robot.node, robot.states, robot.arms
+        self._followers, self._held, self._scene = robot.followers, robot.held, scene
+        node = robot.node
         name = node.config.map.name or str(node.context.get_domain_id())
         self._eye = MapEye(node.config.map, field_path(name), (BASE_FRAME, node.description.root))
 
