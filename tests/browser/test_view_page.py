@@ -98,8 +98,8 @@ class StandIns:
         self._thread = threading.Thread(target=self._executor.spin, daemon=True)
         self._thread.start()
 
-    def say(self, state: str, reason: str, attempt: int = 0) -> None:
-        self._status.publish(self._step(state=state, reason=reason, attempt=attempt, label="blue", arm="left"))
+    def say(self, state: str, reason: str, attempt: int = 0, *, label: str = "blue", arm: str = "left") -> None:
+        self._status.publish(self._step(state=state, reason=reason, attempt=attempt, label=label, arm=arm))
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -224,6 +224,11 @@ def test_the_page_shows_the_graph_and_asks_it(stand_ins: StandIns, open_tab: Any
         await tab.until("document.querySelector('#outcome').textContent.startsWith('CANCELLED: cancelled while')")
         await tab.click("#shuffle")
         await tab.until("document.querySelector('#world-answer').textContent === 'the world is as it was'")
+
+        # of two at once each step says whose it is
+        stand_ins.say("PLACE", "carrying", 1, label="red", arm="right")
+        await tab.until("document.querySelector('#steps em').textContent === 'red · right arm'")
+        assert await tab.js("document.querySelector('#steps li:nth-child(2) em').textContent") == "blue · left arm"
 
         # one that is no longer seen can't be asked for
         stand_ins.detections.detections.pop()

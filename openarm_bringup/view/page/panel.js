@@ -18,6 +18,9 @@ export function element(tag, { text, ...attributes } = {}, ...children) {
 const swatch = (label) => SWATCHES[label] ?? "#8b989e";
 const spoken = (state) => state.charAt(0) + state.slice(1).toLowerCase().replaceAll("_", " ");
 
+/** Whose step it is: of two objects that are picked at once, the steps of both are told. */
+const whose = ({ label, arm }) => [label, arm && `${arm} arm`].filter(Boolean);
+
 export class GraspPanel {
   setStates(states) {
     this.states = states;
@@ -29,15 +32,19 @@ export class GraspPanel {
     const at = this.states.indexOf(last.state);
     $("state").textContent = spoken(last.state);
     $("reason").textContent = last.reason;
-    const facts = [last.label, last.arm && `${last.arm} arm`, last.attempt > 0 && `attempt ${last.attempt}`];
-    $("facts").textContent = facts.filter(Boolean).join(" · ");
+    const facts = last.attempt > 0 ? [...whose(last), `attempt ${last.attempt}`] : whose(last);
+    $("facts").textContent = facts.join(" · ");
     [...$("track").children].forEach((bar, i) => {
       bar.className = at === 0 ? "" : i < at ? "past" : i === at ? "now" : "";
     });
-    const rows = steps.map((step) =>
-      element("li", {}, element("time", { text: `${step.t.toFixed(1)} s` }), element("b", { text: spoken(step.state) }), element("span", { text: step.reason })),
-    );
-    $("steps").replaceChildren(...rows.reverse());
+    $("steps").replaceChildren(...steps.map((step) => this.#row(step)).reverse());
+  }
+
+  #row(step) {
+    const of = element("em", { text: whose(step).join(" · ") });
+    of.style.setProperty("--swatch", swatch(step.label));
+    const head = [element("time", { text: `${step.t.toFixed(1)} s` }), element("b", { text: spoken(step.state) }), of];
+    return element("li", {}, ...head, element("span", { text: step.reason }));
   }
 }
 
