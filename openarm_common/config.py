@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,6 +39,32 @@ def load_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise OpenArmError(Code.CONFIG_INVALID, f"{path} holds a {type(data).__name__}, expected a mapping of keys")
     return data  # pyright: ignore[reportUnknownVariableType]
+
+
+def metres_by_name(items: Sequence[str], field: str, example: str, low: float, high: float) -> dict[str, float]:
+    """What a field of `name=metres` says: ROS parameters know no mappings.
+
+    Args:
+        items: The field.
+        field: Its name.
+        example: An item as it should be.
+        low: Least value, m.
+        high: Largest value, m.
+
+    Raises:
+        ValueError: With what is wrong, for a validator of the model.
+    """
+    found: dict[str, float] = {}
+    for item in items:
+        name, _, text = item.partition("=")
+        try:
+            metres = float(text)
+        except ValueError:
+            raise ValueError(f"{field} {item!r}: expected `name=metres`, such as {example}") from None
+        if not low <= metres <= high:
+            raise ValueError(f"{field} {item!r}: expected {low:g} .. {high:g} m")
+        found[name.strip()] = metres
+    return found
 
 
 #: `json_schema_extra` of a field that may change while a node runs.

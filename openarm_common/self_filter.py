@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from openarm_common import filter_kernels as kernels
-from openarm_common.config import Config
+from openarm_common.config import Config, metres_by_name
 from openarm_common.depth_view import DepthView
 from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
@@ -42,17 +42,7 @@ class SelfFilterConfig(Config):
 
     def paddings(self) -> dict[str, float]:
         """The paddings that differ, by link."""
-        out: dict[str, float] = {}
-        for item in self.link_padding:
-            link, _, metres = item.partition("=")
-            try:
-                out[link.strip()] = float(metres)
-            except ValueError:
-                example = "openarm_left_hand=0.03"
-                raise ValueError(f"link_padding {item!r}: expected `link=metres`, such as {example}") from None
-            if not 0.0 <= out[link.strip()] <= 0.2:
-                raise ValueError(f"link_padding {item!r}: expected 0 .. 0.2 m")
-        return out
+        return metres_by_name(self.link_padding, "link_padding", "openarm_left_hand=0.03", 0.0, 0.2)
 
 
 @dataclass(frozen=True, eq=False)

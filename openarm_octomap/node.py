@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from sensor_msgs.msg import Image, PointCloud2
-from visualization_msgs.msg import MarkerArray
 
 from openarm_common.cameras import load_cameras
-from openarm_common.convert import held_from_msg
 from openarm_common.distance_field import CameraMoment, DistanceFieldWriter, field_path
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.held import HeldBox
+from openarm_common.held_client import HeldListener
 from openarm_common.housings import with_housings
 from openarm_common.managed_node import ManagedNode
-from openarm_common.node import BASE_FRAME, QOS_LATCHED, run
+from openarm_common.node import BASE_FRAME, run
 from openarm_common.tf import RobotStateListener
 from openarm_octomap.camera_client import CloudSource, DepthSource, Source
 from openarm_octomap.config import OctomapNodeConfig
@@ -45,7 +44,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         if config.cloud_topic:
             self._sources.append(CloudSource(self, config.cloud_topic))
         self._states = RobotStateListener(self, self.description, joints=False, depth=100, wait=config.transform_wait)
-        self._held: tuple[HeldBox, ...] = ()
+        self._held = HeldListener(self, config.held_topic)
         self._t_ns = 0
         self._busy = False
         self._edition = 0
@@ -55,7 +54,6 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         self._fault = ""
         self._field = self._open_field() if config.field.enabled else None
         self._publisher = MapPublisher(self, full=config.publish_full)
-        self.create_subscription(MarkerArray, config.held_topic, self._on_held, QOS_LATCHED)
         MapServices(self, self._mapper, config.coarse_depths, lambda: self._t_ns, self._show)
         self._timer = self.create_timer(config.period, self._on_timer, clock=self.wall_clock)
         self._timer.cancel()
@@ -107,7 +105,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
             return
         self._busy, edition = True, self._edition
         try:
-            report: Report = await self.in_thread(self._update, frames, self._held, self._publisher.wanted())
+            report: Report = await self.in_thread(self._update, frames, self._held.boxes, self._publisher.wanted())
         except OpenArmError as error:
             self._fault = error.message
             return
@@ -145,12 +143,6 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
     def _moments(self) -> dict[str, CameraMoment]:
         return {camera.name: CameraMoment(camera.used_t_ns, camera.used_at_ns) for camera in self._cameras}
 
-    def _on_held(self, message: MarkerArray) -> None:
-        try:
-            self._held = held_from_msg(message)
-        except OpenArmError as error:
-            self.get_logger().warning(f"{self.config.held_topic}: {error.message}")
-
     # --- health
     def _report(self) -> None:
         if not self.active:
@@ -175,7 +167,10 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
             for source_name, links in self._last.removed.items():
                 values |= {f"{source_name}_removed/{link}": n for link, n in links.items()}
             values |= {f"{source_name}_flying": n for source_name, n in self._last.flying.items()}
-        values |= {"update_ms": f"{self._elapsed_ms:.1f}", "held": ", ".join(b.name for b in self._held) or "nothing"}
+        values |= {
+            "update_ms": f"{self._elapsed_ms:.1f}",
+            "held": ", ".join(b.name for b in self._held.boxes) or "nothing",
+        }
         self.diagnose(not faults, "; ".join(faults) or f"map of {', '.join(self.config.cameras)}", **values)
 
     def _open_field(self) -> DistanceFieldWriter:

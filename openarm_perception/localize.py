@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 
 from openarm_common import se3
 from openarm_common.cameras import Intrinsics
-from openarm_common.config import Config
+from openarm_common.config import Config, metres_by_name
 from openarm_common.errors import Code, OpenArmError
 from openarm_perception import footprint, plane
 from openarm_perception.depth import DepthImage, DepthLimits
@@ -63,16 +63,7 @@ class LocalizerConfig(Config):
 
     def known_heights(self) -> dict[str, float]:
         """The known heights by label, m."""
-        out: dict[str, float] = {}
-        for item in self.heights:
-            label, _, metres = item.partition("=")
-            try:
-                out[label.strip()] = float(metres)
-            except ValueError:
-                raise ValueError(f"heights {item!r}: expected `label=metres`, such as red=0.05") from None
-            if not 0.005 <= out[label.strip()] <= 0.5:
-                raise ValueError(f"heights {item!r}: expected 0.005 .. 0.5 m")
-        return out
+        return metres_by_name(self.heights, "heights", "red=0.05", 0.005, 0.5)
 
 
 @dataclass(frozen=True)

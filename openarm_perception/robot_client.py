@@ -6,13 +6,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from visualization_msgs.msg import MarkerArray
-
-from openarm_common.convert import held_from_msg
 from openarm_common.depth_view import DepthView
-from openarm_common.errors import OpenArmError
-from openarm_common.held import HeldBox
-from openarm_common.node import QOS_LATCHED, BaseNode
+from openarm_common.held_client import HeldListener
+from openarm_common.node import BaseNode
 from openarm_common.self_filter import SelfFilterConfig
 from openarm_perception.detector import Mask
 from openarm_perception.robot import RobotFinder
@@ -29,21 +25,13 @@ class RobotInView:
 
     def __init__(self, node: BaseNode[Any], config: SelfFilterConfig, held_topic: str) -> None:
         self._finder = RobotFinder(node.description, config)
-        self._held: tuple[HeldBox, ...] = ()
+        self._held = HeldListener(node, held_topic)
         #: Pixels of the last image by link or `held/NAME`.
         self.removed: Mapping[str, int] = {}
 
-        def on_held(message: MarkerArray) -> None:
-            try:
-                self._held = held_from_msg(message)
-            except OpenArmError as error:
-                node.get_logger().warning(f"{held_topic}: {error.message}")
-
-        node.create_subscription(MarkerArray, held_topic, on_held, QOS_LATCHED)
-
     def find(self, view: DepthView, joints: Mapping[str, float]) -> Mask:
         """Pixels (h, w) of the robot; arguments and errors as for `RobotFinder.find`."""
-        robot, self.removed = self._finder.find(view, joints, self._held)
+        robot, self.removed = self._finder.find(view, joints, self._held.boxes)
         return robot
 
     def values(self, prefix: str = "") -> dict[str, object]:
