@@ -21,7 +21,7 @@ from openarm_common.robot_state import RobotStateBuffer
 from openarm_grasp import effects
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames, GoHome, Planned, Trajectory
-from openarm_grasp.performer import Link
+from openarm_grasp.link import Link
 from openarm_grasp.routing import ARMS
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class Company:
 
 
 class BesideLink:
-    """Implements `performer.Link` for one arm beside the other.
+    """Implements `Link` for one arm beside the other.
 
     Args:
         arm: Whose link.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from openarm_common.errors import Code
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.observation import Detection, Frame, sticks_out
+from openarm_grasp.observation import Detection, Frame, apart, sticks_out
 
 Array = NDArray[np.float64]
 
@@ -157,7 +157,7 @@ def judge_sight(
         d
         for frame in frames
         for d in frame.detections
-        if d.label == before.label and all(_apart(d, twin) > match_radius for twin in twins)
+        if d.label == before.label and all(apart(d, twin) > match_radius for twin in twins)
     ]
     if not same:
         return Sight.GONE, f"{before.label!r} has gone from its place"
@@ -171,14 +171,10 @@ def judge_sight(
             limit = f"expected at most {config.askew * 1e3:.0f} mm"
             return Sight.ASKEW, f"{text}, {off * 1e3:.0f} mm out of where the hand should hold it, {limit}"
         return Sight.RISEN, text
-    distance = min(_apart(d, before) for d in same)
+    distance = min(apart(d, before) for d in same)
     if distance <= match_radius:
         return Sight.STILL_THERE, f"{before.label!r} still stands at its place ({distance * 1e3:.0f} mm from it)"
     return Sight.GONE, f"{before.label!r} has left its place ({distance * 1e3:.0f} mm)"
-
-
-def _apart(a: Detection, b: Detection) -> float:
-    return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
 
 
 def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) -> tuple[bool, str]:
@@ -190,8 +186,8 @@ def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) 
         config: Thresholds.
     """
     near = (d for d in frames[-1].detections if d.label == before.label) if frames else ()
-    nearest = min(near, key=lambda d: _apart(d, before), default=None)
-    if nearest is None or _apart(nearest, before) > _ELSEWHERE:
+    nearest = min(near, key=lambda d: apart(d, before), default=None)
+    if nearest is None or apart(nearest, before) > _ELSEWHERE:
         return True, "the hand hides the object"
     if max(nearest.size[:2]) > max(before.size[:2]) + config.moved:
         return True, "the hand is in front of the object: what is seen is larger than it"

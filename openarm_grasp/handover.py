@@ -19,7 +19,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import HandOverConfig
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.observation import Detection, Sighting
-from openarm_grasp.place import PlaceTarget
+from openarm_grasp.place import PlaceTarget, grid
 from openarm_grasp.rehearsal import NO_WAY, Rehearsal, standing_at
 from openarm_grasp.routing import ARMS
 
@@ -59,8 +59,8 @@ def middle_spots(target: Detection, others: Sequence[Detection], around: Surroun
     """
     config, place = around.config.hand_over, around.config.place
     ranked: list[tuple[float, float, float]] = []
-    for x in _steps(*config.x, config.step):
-        for y in _steps(-config.abs_y, config.abs_y, config.step):
+    for x in grid(*config.x, config.step):
+        for y in grid(-config.abs_y, config.abs_y, config.step):
             spot = np.array([x, y])
             room = min((float(np.linalg.norm(spot - d.p_base[:2])) for d in others), default=np.inf)
             origin = float(np.linalg.norm(spot - target.p_base[:2]))
@@ -152,7 +152,3 @@ def _around(there: Detection, config: HandOverConfig) -> tuple[Detection, ...]:
     off, turn = config.margin, radians(config.margin_deg)
     ways = ((off, 0.0, turn), (-off, 0.0, -turn), (0.0, off, -turn), (0.0, -off, turn)) if off or turn else ()
     return tuple(standing_at(there, there.p_base[:2] + np.array([dx, dy]), by) for dx, dy, by in ways)
-
-
-def _steps(low: float, high: float, step: float) -> Array:
-    return np.linspace(low, high, max(2, round((high - low) / step) + 1))

@@ -12,8 +12,7 @@ from openarm_common.errors import Code
 from openarm_grasp import recipes
 from openarm_grasp.effects import Frames, Outcome, Planned
 from openarm_grasp.evidence import Evidence, Grip, Verdict, judge_grip, judge_place
-from openarm_grasp.judge_near import Judgement, fail
-from openarm_grasp.memory import Memory, Surroundings
+from openarm_grasp.memory import Judgement, Memory, Surroundings
 from openarm_grasp.observation import Frame, labels_in_view
 from openarm_grasp.place import check_position, free_spots, place_targets
 from openarm_grasp.states import Event
@@ -39,7 +38,7 @@ def place(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judge
     hand = m.hand
     if outcome.code is Code.GRASP_LOST:
         hand.holding = False
-        return fail(m, outcome.code, outcome.message)
+        return m.fail(outcome.code, outcome.message)
     if not outcome.ok and hand.carried and outcome.done >= recipes.RELEASED_AFTER:
         # It was let go; only the way back failed.
         hand.holding, hand.released, hand.at_object = False, True, True
@@ -54,7 +53,7 @@ def place(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judge
         grip, reason = judge_grip(outcome.last(Evidence), around.config.held, was_held=True)
         if grip is not Grip.HELD:
             hand.holding = False
-            return fail(m, Code.GRASP_LOST, f"lost on the way: {reason}")
+            return m.fail(Code.GRASP_LOST, f"lost on the way: {reason}")
         hand.carried = True
         return Event.MORE, reason
     hand.holding, hand.released = False, True
@@ -65,8 +64,8 @@ def _put_back(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
     """The place cannot be reached: put the object back, or keep it when that cannot be done either."""
     if m.hand.putting_back or m.kept is not None:
         text = f"{outcome.message}; the {m.arm} hand still holds {m.label!r}: open it over a safe place"
-        return fail(m, Code.PLACE_FAILED, text, final=True)
-    fail(m, Code.PLACE_FAILED, f"{m.label!r} could not be placed ({outcome.code}): {outcome.message}")
+        return m.fail(Code.PLACE_FAILED, text, final=True)
+    m.fail(Code.PLACE_FAILED, f"{m.label!r} could not be placed ({outcome.code}): {outcome.message}")
     if m.place_plan is not None and m.place_target is not None:
         m.used_places = (*m.used_places, m.place_target)
     m.hand.putting_back, m.hand.carried, m.place_plan = True, False, None
@@ -86,7 +85,7 @@ def reset(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judge
         if hand.released and not hand.putting_back:
             return Event.MORE, "home; looking at the place"
     elif not outcome.ok:
-        return fail(m, Code.PLACE_FAILED, f"put down, but not seen since: {outcome.message}", final=True)
+        return m.fail(Code.PLACE_FAILED, f"put down, but not seen since: {outcome.message}", final=True)
     else:
         frames, tolerance = outcome.last(Frames).frames, around.config.place.tolerance
         hand.looks += 1
@@ -125,4 +124,4 @@ def _no_way_home(m: Memory, outcome: Outcome) -> Judgement:
         return Event.MORE, f"{outcome.message}; trying another way home"
     before = m.failure or Verdict(outcome.code, "")
     keeps = f"; the {m.arm} hand still holds {m.label!r}: open it over a safe place" if stuck else ""
-    return fail(m, before.code, f"{before.reason}; the arm could not go home: {outcome.message}{keeps}", final=True)
+    return m.fail(before.code, f"{before.reason}; the arm could not go home: {outcome.message}{keeps}", final=True)

@@ -15,18 +15,10 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.candidates import GraspCandidate, propose
 from openarm_grasp.effects import Frames, Outcome, Planned
-from openarm_grasp.evidence import Evidence, Verdict, judge_still
-from openarm_grasp.memory import Memory, Surroundings
-from openarm_grasp.observation import Detection, Frame, find, on_table
+from openarm_grasp.evidence import Evidence, judge_still
+from openarm_grasp.memory import Judgement, Memory, Surroundings
+from openarm_grasp.observation import Detection, Frame, apart, find, on_table
 from openarm_grasp.states import Event
-
-Judgement = tuple[Event, str]
-
-
-def fail(m: Memory, code: Code, reason: str, *, final: bool = False) -> Judgement:
-    """Write a failure down; `final` allows no further try."""
-    m.failure = Verdict(code, reason)
-    return (Event.END if final else Event.AGAIN), reason
 
 
 def move_to_pregrasp(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
@@ -37,7 +29,7 @@ def move_to_pregrasp(m: Memory, outcome: Outcome, t_ns: int, around: Surrounding
     if hand.near == "plan":
         return _corrected_plan(m, outcome)
     if not outcome.ok:
-        return fail(m, outcome.code, outcome.message)
+        return m.fail(outcome.code, outcome.message)
     if hand.near == "" and near.enabled and m.arm == near.arm:
         hand.near = "look"
         return Event.MORE, f"the open hand is before the object; looking with the {near.camera} camera"
@@ -51,21 +43,21 @@ def move_to_grasp(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) 
     """
     if not m.hand.looked:
         if not outcome.ok:
-            return fail(m, outcome.code, outcome.message)
+            return m.fail(outcome.code, outcome.message)
         m.hand.looked = True
         target = m.need_sighting().target
         still, reason = judge_still(target, outcome.last(Frames).frames, around.config.held)
-        if not still and m.moved_from is not None and _apart(target, m.moved_from) < around.config.detect.agree_within:
+        if not still and m.moved_from is not None and apart(target, m.moved_from) < around.config.detect.agree_within:
             still, reason = True, f"{reason}; so it seemed before, and it had not: the hand hides a part of it"
         m.moved_from = target
-        return (Event.MORE, reason) if still else fail(m, Code.GRASP_MISSED, reason)
+        return (Event.MORE, reason) if still else m.fail(Code.GRASP_MISSED, reason)
     m.hand.at_object = True
     if not outcome.ok:
-        return fail(m, outcome.code, outcome.message)
+        return m.fail(outcome.code, outcome.message)
     error, limit = outcome.last(Evidence).tcp_error, around.config.held.max_tcp_error
     if error > limit:
         text = f"the hand stopped {error * 1e3:.1f} mm from the grasp, expected at most {limit * 1e3:.0f} mm"
-        return fail(m, Code.HAND_COLLISION, text)
+        return m.fail(Code.HAND_COLLISION, text)
     return Event.DONE, f"the hand is at the grasp, off by {error * 1e3:.1f} mm"
 
 
@@ -75,10 +67,7 @@ def _seen_from_near(m: Memory, outcome: Outcome, around: Surroundings) -> Judgem
     before, config = m.need_sighting(), around.config
     frames = [_near(frame, before.target, config.near.largest) for frame in outcome.last(Frames).frames]
     try:
-        found = find(
-            frames, m.label, match_radius=config.detect.match_radius, agree_within=config.detect.agree_within
-        ).target
-        target = on_table(found, around.table.top_z)
+        target = on_table(find(frames, m.label, config.detect).target, around.table.top_z)
         candidate = _same_way(m.need_candidate(), propose(target, config))
     except OpenArmError as error:
         return Event.DONE, f"the second look does not help: {error.message}"
@@ -94,16 +83,8 @@ def _seen_from_near(m: Memory, outcome: Outcome, around: Surroundings) -> Judgem
 
 def _near(frame: Frame, target: Detection, largest: float) -> Frame:
     """The detections of a frame that may be the object."""
-    kept = (
-        d
-        for d in frame.detections
-        if d.label == target.label and float(np.linalg.norm((d.p_base - target.p_base)[:2])) <= largest
-    )
+    kept = (d for d in frame.detections if d.label == target.label and apart(d, target) <= largest)
     return Frame(frame.t_ns, tuple(kept))
-
-
-def _apart(a: Detection, b: Detection) -> float:
-    return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
 
 
 def _same_way(chosen: GraspCandidate, offered: tuple[GraspCandidate, ...]) -> GraspCandidate:

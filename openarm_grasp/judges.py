@@ -12,11 +12,12 @@ from types import MappingProxyType
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.candidates import propose
+from openarm_grasp.config import DetectConfig
 from openarm_grasp.effects import Frames, Outcome, Planned, Reach
 from openarm_grasp.evidence import Evidence, Grip, Verdict, judge_grip, judge_lift, judge_sight
 from openarm_grasp.judge_end import offer_places, place, reset
-from openarm_grasp.judge_near import Judgement, fail, move_to_grasp, move_to_pregrasp
-from openarm_grasp.memory import Kept, Memory, Surroundings
+from openarm_grasp.judge_near import move_to_grasp, move_to_pregrasp
+from openarm_grasp.memory import Judgement, Kept, Memory, Surroundings
 from openarm_grasp.observation import Detection, Sighting, find, labels_in_view, on_table
 from openarm_grasp.options import not_placeable, options_of, planned
 from openarm_grasp.place import check_position, other_grasps
@@ -33,7 +34,7 @@ def idle(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgem
 def detect(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
     """Frames without the object make the machine wait for the next; no frame at all ends the request."""
     if not outcome.ok:
-        return fail(m, outcome.code, outcome.message, final=True)
+        return m.fail(outcome.code, outcome.message, final=True)
     m.seen = outcome.last(Frames)
     seen = labels_in_view(m.seen.frames)
     if m.kept is not None:
@@ -51,27 +52,18 @@ def transform(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> J
     if not outcome.ok:
         if outcome.code is Code.STALE_DATA:
             return _missed_round(m, outcome.code, outcome.message, around)
-        return fail(m, outcome.code, outcome.message, final=True)
+        return m.fail(outcome.code, outcome.message, final=True)
     m.seen = outcome.last(Frames)
     if m.kept is not None:
         return _place_what_is_held(m, m.kept, t_ns, around)
     limits, table = around.config.detect, around.table
     try:
-        sighting = find(
-            m.seen.frames,
-            m.request.label,
-            match_radius=limits.match_radius,
-            agree_within=limits.agree_within,
-            at=m.request.object_at,
-            leave=m.request.leave,
-        )
+        sighting = find(m.seen.frames, m.request.label, limits, at=m.request.object_at, leave=m.request.leave)
         target = on_table(sighting.target, table.top_z)
     except OpenArmError as error:
         return _missed_round(m, error.code, error.message, around)
-    age = (t_ns - sighting.t_ns) * 1e-9
-    if age > limits.max_age:
-        text = f"the newest detection is {age:.2f} s old, expected at most {limits.max_age:g} s"
-        return _missed_round(m, Code.STALE_DATA, text, around)
+    if old := _too_old(sighting.t_ns, t_ns, limits):
+        return _missed_round(m, Code.STALE_DATA, old, around)
     others = _standing(sighting.others, table.top_z)
     m.sighting = Sighting(target, others, sighting.t_ns, sighting.spread)
     if m.height is None or any(d.label == target.label for d in others):
@@ -85,6 +77,13 @@ def transform(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> J
     return Event.DONE, f"{target.label!r} stands at ({x:.3f}, {y:.3f}, {z:.3f}) m; {len(m.offered)} ways to grasp it"
 
 
+def _too_old(seen_ns: int, t_ns: int, limits: DetectConfig) -> str:
+    """What is said of a sight that is older than allowed; "" of any other."""
+    age = (t_ns - seen_ns) * 1e-9
+    text = f"the newest detection is {age:.2f} s old, expected at most {limits.max_age:g} s"
+    return text if age > limits.max_age else ""
+
+
 def _standing(found: Iterable[Detection], table_z: float) -> tuple[Detection, ...]:
     """What stands on the table; what is flat on it is in nobody's way."""
     return tuple(on_table(d, table_z) for d in found if d.top > table_z + 0.005)
@@ -92,10 +91,8 @@ def _standing(found: Iterable[Detection], table_z: float) -> tuple[Detection, ..
 
 def _place_what_is_held(m: Memory, kept: Kept, t_ns: int, around: Surroundings) -> Judgement:
     newest = m.need_frames().frames[-1]
-    age, limit = (t_ns - newest.t_ns) * 1e-9, around.config.detect.max_age
-    if age > limit:
-        text = f"the newest detection is {age:.2f} s old, expected at most {limit:g} s"
-        return _missed_round(m, Code.STALE_DATA, text, around)
+    if old := _too_old(newest.t_ns, t_ns, around.config.detect):
+        return _missed_round(m, Code.STALE_DATA, old, around)
     others = _standing((d for d in newest.detections if d.label != kept.target.label), around.table.top_z)
     m.sighting, m.candidate = Sighting(kept.target, others, newest.t_ns, 0.0), kept.candidate
     m.height = float(kept.target.size[2])
@@ -110,8 +107,8 @@ def _missed_round(m: Memory, code: Code, reason: str, around: Surroundings) -> J
     if m.attempt > 1 and m.failure is not None:
         # What went wrong with the arm says more than the object that is missing since.
         before = m.failure
-        return fail(m, before.code, f"{before.reason}; then {reason}" if final else before.reason, final=final)
-    return fail(m, code, reason, final=final)
+        return m.fail(before.code, f"{before.reason}; then {reason}" if final else before.reason, final=final)
+    return m.fail(code, reason, final=final)
 
 
 # --- planning
@@ -179,7 +176,7 @@ def _no_plan(m: Memory, outcome: Outcome, around: Surroundings) -> Judgement:
         distances = outcome.last(Reach).distances if outcome.ok else {}
         x, y, z = m.need_sighting().target.p_base
         reason = f"{out_of_reach(f'{m.label!r} at ({x:.3f}, {y:.3f}, {z:.3f}) m', distances)} ({reason})"
-    return fail(m, codes.pop() if len(codes) == 1 else Code.NO_PLAN, reason, final=final)
+    return m.fail(codes.pop() if len(codes) == 1 else Code.NO_PLAN, reason, final=final)
 
 
 def _offer_grasps(m: Memory, around: Surroundings) -> None:
@@ -193,10 +190,10 @@ def _offer_grasps(m: Memory, around: Surroundings) -> None:
 def close_gripper(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgement:
     """Gap, effort and rest say whether something of the right width is between the fingers."""
     if not outcome.ok:
-        return fail(m, outcome.code, outcome.message)
+        return m.fail(outcome.code, outcome.message)
     grip, reason = judge_grip(outcome.last(Evidence), around.config.held)
     if grip is not Grip.HELD:
-        return fail(m, grip.code, reason)
+        return m.fail(grip.code, reason)
     m.hand.holding = True
     return Event.DONE, reason
 
@@ -205,7 +202,7 @@ def lift(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgem
     """Held by the hand and gone from its place for the camera: two kinds of evidence."""
     if not outcome.ok:
         m.hand.holding = m.hand.holding and outcome.code is not Code.GRASP_LOST
-        return fail(m, outcome.code, outcome.message)
+        return m.fail(outcome.code, outcome.message)
     held = around.config.held
     grip = judge_grip(outcome.last(Evidence), held, was_held=True)
     frames = outcome.last(Frames).frames
@@ -214,7 +211,7 @@ def lift(m: Memory, outcome: Outcome, t_ns: int, around: Surroundings) -> Judgem
     verdict = judge_lift(grip, sight)
     if not verdict.ok:
         m.hand.holding = grip[0] is Grip.HELD
-        return fail(m, verdict.code, verdict.reason)
+        return m.fail(verdict.code, verdict.reason)
     if m.request.phase == "pick":
         m.failure = None
         return Event.SKIP, f"{verdict.reason}; the {m.arm} hand keeps it"

@@ -19,42 +19,37 @@ from openarm_grasp.effects import GraspOutcome, GraspRequest
 from openarm_grasp.handover import HandOver, plan_hand_over
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Known
-from openarm_grasp.performer import Link, Performer, run_request
+from openarm_grasp.performer import Performer, run_request
 from openarm_grasp.push import Pusher
 from openarm_grasp.rehearsal import NO_WAY, Rehearsal
 from openarm_grasp.routing import ARMS
 
 Array = NDArray[np.float64]
 
-_STOPS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
+#: These end whatever is under way; no other way is tried.
+STOPS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
 
 
 async def run_task(
-    machine: GraspMachine, performer: Performer, link: Link, request: GraspRequest, tell: Callable[[], None]
+    machine: GraspMachine, performer: Performer, request: GraspRequest, tell: Callable[[], None]
 ) -> GraspOutcome:
     """Carry out a request by whatever way leads to its place; `tell` is called after each transition and note.
 
     Raises:
         OpenArmError: BUSY, INVALID_ARGUMENT or NOT_READY, when the request is not taken.
     """
-    return await _Task(machine, performer, link, request, tell).run()
+    return await _Task(machine, performer, request, tell).run()
 
 
 class _Task:
     """One request of a user, and what became of it so far."""
 
     def __init__(
-        self,
-        machine: GraspMachine,
-        performer: Performer,
-        link: Link,
-        request: GraspRequest,
-        tell: Callable[[], None],
+        self, machine: GraspMachine, performer: Performer, request: GraspRequest, tell: Callable[[], None]
     ) -> None:
-        self._machine, self._performer, self._link, self._tell = machine, performer, link, tell
-        self._request = request
-        self._rehearsal = Rehearsal(link, machine.around)
-        self._began_ns = link.now_ns
+        self._machine, self._performer, self._request, self._tell = machine, performer, request, tell
+        self._rehearsal = Rehearsal(performer.link, machine.around)
+        self._began_ns = performer.link.now_ns
         self._attempts = 0
 
     async def run(self) -> GraspOutcome:
@@ -67,7 +62,7 @@ class _Task:
                 return await self._by_the_other_arm(outcome, known)
             return await self._pushed(outcome)
         except OpenArmError as error:
-            if error.code in _STOPS:
+            if error.code in STOPS:
                 return self._whole(replace(outcome, code=error.code, message=error.message), "")
             if error.code not in (*NO_WAY, Code.PLACE_FAILED):
                 raise
@@ -138,7 +133,7 @@ class _Task:
 
     async def _pushed(self, outcome: GraspOutcome) -> GraspOutcome:
         """No arm can grasp it where it stands."""
-        pusher = Pusher(self._machine.around, self._performer, self._link, self._rehearsal, self._note)
+        pusher = Pusher(self._machine.around, self._performer, self._rehearsal, self._note)
         for number in range(1, self._machine.around.config.push.most + 1):
             known = self._machine.known
             if known is None:
@@ -172,11 +167,11 @@ class _Task:
     async def _part(self, request: GraspRequest) -> GraspOutcome:
         """One ordinary request, in what is left of the time."""
         if request.timeout > 0.0:
-            left = request.timeout - (self._link.now_ns - self._began_ns) * 1e-9
+            left = request.timeout - self._seconds()
             if left <= 0.0:
                 raise OpenArmError(Code.TIMEOUT, f"the {request.timeout:g} s for the request are over; the arms hold")
             request = replace(request, timeout=left)
-        outcome = await run_request(self._machine, self._performer, self._link, request, self._tell)
+        outcome = await run_request(self._machine, self._performer, request, self._tell)
         self._attempts = max(self._attempts, outcome.attempts)
         return outcome
 
@@ -194,9 +189,12 @@ class _Task:
 
     def _whole(self, outcome: GraspOutcome, route: str) -> GraspOutcome:
         """The answer to all of it."""
-        duration = (self._link.now_ns - self._began_ns) * 1e-9
-        done = outcome.success
-        return replace(outcome, attempts=self._attempts, duration=duration, route=route if done else "")
+        route = route if outcome.success else ""
+        return replace(outcome, attempts=self._attempts, duration=self._seconds(), route=route)
+
+    def _seconds(self) -> float:
+        """Robot time since it was asked for, s."""
+        return (self._performer.link.now_ns - self._began_ns) * 1e-9
 
 
 def _again(number: int) -> str:

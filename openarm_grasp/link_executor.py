@@ -1,245 +1,233 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The link to the other nodes while a grasp runs: joint states, detections, action goals, and waits that always end.
-
-A wait ends by its condition, by a deadline of the wall clock, by a cancel, or because the robot went silent; it looks
-40 times a second. Robot time is the stamp of the joint states, so the node needs no /clock. /joint_states is subscribed
-only while a grasp runs, /detections_3d only in states that look.
-"""
+"""The robot as the performer reaches it: joint states, detections, actions and services of the other nodes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from copy import copy
 from typing import Any
 
+import numpy as np
+from control_msgs.action import GripperCommand, ParallelGripperCommand
+from numpy.typing import NDArray
+from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
+from openarm_interfaces.srv import ComputeIK
 from rclpy.action import ActionClient
-from rclpy.subscription import Subscription
 from rclpy.task import Future
-from vision_msgs.msg import Detection3DArray
 
-from openarm_common.convert import stamp_to_ns
+from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import BASE_FRAME, BaseNode, reliable
-from openarm_common.tf import RobotStateListener
-from openarm_grasp import convert
+from openarm_common.node import BASE_FRAME, BaseNode
+from openarm_common.robot_state import RobotStateBuffer
+from openarm_grasp import convert, effects
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.effects import Frames
-from openarm_grasp.hand import Silence
-from openarm_grasp.observation import Frame
-from openarm_grasp.pad_client import Pads
+from openarm_grasp.effects import Frames, Planned, Trajectory
+from openarm_grasp.link import check_deadline
+from openarm_grasp.nodes_executor import DETECTIONS, OtherNodes
+from openarm_grasp.routing import ARMS
 
-#: What the detector of the camera over the table finds.
-DETECTIONS = "/detections_3d"
-_TICK_S = 0.025
-#: A longer pause between two ticks is this process being starved, not the robot being silent.
-_STARVED_S = 0.2
-_STOP_LIMIT_S = 2.0
-#: An action server that is not in the graph at so many looks in a row is gone (1.5 s; a lost robot is noticed sooner).
-_GONE = 60
+Array = NDArray[np.float64]
 
 
-class RobotLink:
-    """Hears the robot and the detector, and sends goals.
+class GraphLink:
+    """Implements `Link` over the node graph.
 
     Args:
-        node: The node that owns subscriptions, clients and the timer.
+        node: The node that owns the clients.
         config: Parameters.
     """
 
     def __init__(self, node: BaseNode[Any], config: GraspConfig) -> None:
         self._node = node
         self._config = config
-        self.robot = RobotStateListener(node, node.description, joints=False)
-        self.pads = Pads(node)
-        self._detections: Subscription | None = None
-        self._topic = DETECTIONS
-        self._frames: list[Frame] = []
-        self._frame_id = BASE_FRAME
-        self._looking_since_ns = 0
-        self._next_tick = Future()
-        self._timer = node.create_timer(_TICK_S, self._on_tick, clock=node.wall_clock)
-        self._timer.cancel()
-        self._silence = Silence(_STARVED_S)
-        self._cancelled = self._active = False
-        if node.lockstep:
-            self._look(DETECTIONS)
-            self.stop_looking()
+        self._nodes = OtherNodes(node, config)
+        self._plan = ActionClient(node, PlanApproach, "/motion/plan_approach")
+        self._execute = ActionClient(node, ExecuteTrajectory, "/motion/execute")
+        self._move = ActionClient(node, MoveArm, "/motion/move")
+        self._ik = node.create_client(ComputeIK, "/motion/compute_ik")
+        gripper_action = ParallelGripperCommand if config.gripper_action == "parallel" else GripperCommand
+        self._grippers = {
+            arm: ActionClient(node, gripper_action, f"/{arm}_gripper_controller/gripper_cmd") for arm in ARMS
+        }
+        self.deadline_ns = 0
+        #: Longest rest before a motion until the other arm leaves room, s; 0: the arms never move at once.
+        self.max_wait = 0.0
+
+    def beside(self) -> GraphLink:
+        """The same link for an arm that moves while the other does: its motions may rest first, its time is its own."""
+        link = copy(self)
+        link.max_wait = self._config.limits.beside_wait
+        return link
 
     # --- begin, end, cancel
-    async def begin(self, missing: Callable[[], list[str]]) -> None:
-        """Listen to the robot and wait until nothing is missing any more.
+    async def begin(self, *, moves: bool) -> None:
+        """Listen to the robot and wait until every node that a grasp needs is there.
 
         Raises:
             OpenArmError: NOT_READY, naming what is missing; CANCELLED.
         """
-        self._cancelled = False
-        self._silence = Silence(_STARVED_S)
-        self._active = True
-        self.robot.enable(True)
-        self.pads.enable(self._config.held.use_finger_force)
-        self._timer.reset()
-        deadline = self._node.monotonic() + self._config.limits.ready_timeout
-        while faults := missing():
-            self.check()
-            if self._node.monotonic() > deadline:
-                raise OpenArmError(Code.NOT_READY, f"not ready: no {'; no '.join(faults)}")
-            await self.tick()
+        await self._nodes.begin(lambda: self._missing(moves))
 
     def end(self) -> None:
         """Stop listening."""
-        if not self._active:
-            return
-        self._active = False
-        self.stop_looking()
-        self._timer.cancel()
-        self.robot.enable(False)
-        self.pads.enable(False)
+        self._nodes.end()
+
+    def close(self) -> None:
+        """Take the clients down."""
+        self._nodes.end()
+        for client in (self._plan, self._execute, self._move, *self._grippers.values()):
+            client.destroy()
 
     def cancel(self) -> None:
-        """Let what is waited for end with CANCELLED."""
-        self._cancelled = True
+        """Let the running recipe end with CANCELLED and the arm hold."""
+        self._nodes.cancel()
+
+    def _missing(self, moves: bool) -> list[str]:
+        needed = {
+            "action /motion/plan_approach (motion node)": self._plan.server_is_ready(),
+            "action /motion/execute (motion node)": self._execute.server_is_ready(),
+            "action /motion/move (motion node)": self._move.server_is_ready(),
+            "publisher of /detections_3d (detector)": self._nodes.sees(DETECTIONS),
+            "/joint_states (bridge or robot driver)": self._nodes.hears_joints,
+        }
+        if moves:
+            for arm, client in self._grippers.items():
+                name = f"action /{arm}_gripper_controller/gripper_cmd (bridge or robot driver)"
+                needed[name] = client.server_is_ready()
+        return [what for what, there in needed.items() if not there]
+
+    # --- the robot
+    @property
+    def description(self) -> RobotDescription:
+        """The robot."""
+        return self._node.description
+
+    @property
+    def states(self) -> RobotStateBuffer:
+        """Its joint states."""
+        return self._nodes.robot.buffer
+
+    @property
+    def base_frame(self) -> str:
+        """Name of the base frame."""
+        return BASE_FRAME
 
     @property
     def now_ns(self) -> int:
         """Robot time; 0 before the first joint state."""
-        return self.robot.buffer.latest()[0] if self.hears_joints else 0
+        return self._nodes.now_ns
 
-    @property
-    def hears_joints(self) -> bool:
-        """Whether a joint state has come since `begin`."""
-        return self.robot.age_s() < float("inf")
+    def effort(self, joint: str) -> float:
+        """Newest effort of a joint, N or N m."""
+        return self._nodes.robot.efforts.get(joint, 0.0)
 
-    def sees(self, topic: str) -> bool:
-        """Whether somebody publishes detections there."""
-        return self._node.count_publishers(self._node.resolve_topic_name(topic)) > 0
-
-    # --- waiting
-    def _on_tick(self) -> None:
-        self._silence.look(self._node.monotonic(), self.now_ns if self.hears_joints else -1)
-        done, self._next_tick = self._next_tick, Future()
-        done.set_result(None)
-
-    async def tick(self) -> None:
-        """Sleep until the next look."""
-        await self._next_tick
+    def pads(self, arm: str) -> tuple[float, ...]:
+        """Force on each finger pad of a hand, N; empty when no sensor tells it."""
+        return self._nodes.pads.of(arm)
 
     def check(self) -> None:
-        """Raise when the grasp shall not go on.
+        """Raise when the grasp shall not go on."""
+        self._nodes.check()
+        check_deadline(self.now_ns, self.deadline_ns)
 
-        Raises:
-            OpenArmError: CANCELLED or ROBOT_LOST.
-        """
-        if self._cancelled:
-            raise OpenArmError(Code.CANCELLED, "cancelled; the arm holds where it is and the hand keeps what it holds")
-        self._silence.check(self._config.limits.joint_state_timeout)
+    def warn(self, text: str) -> None:
+        """Write a warning into the log."""
+        self._node.get_logger().warning(text)
 
+    # --- waiting and looking
     async def until(
         self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
     ) -> None:
-        """Wait for a condition.
+        """Wait for a condition, `limit` s of wall clock."""
+        await self._nodes.until(done, limit, what, self._watched(guard))
 
-        Args:
-            done: The condition.
-            limit: s of wall clock.
-            what: What is waited for, for the error.
-            guard: Called at each look; may raise.
-
-        Raises:
-            OpenArmError: TIMEOUT, CANCELLED, ROBOT_LOST, or from `guard`.
-        """
-        deadline = self._node.monotonic() + limit
-        while not done():
-            self.check()
-            if guard is not None:
-                guard()
-            if self._node.monotonic() > deadline:
-                raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
-            await self.tick()
-
-    async def goal(
-        self, client: ActionClient, goal: object, limit: float, what: str, guard: Callable[[], None] | None = None
-    ) -> Any:
-        """Send a goal and return its result message; whatever ends the wait early cancels the goal.
-
-        Raises:
-            OpenArmError: NOT_READY, without a server; EXECUTION_FAILED, when it rejects the goal; as `until`.
-        """
-        limits = self._config.limits
-        try:
-            await self.until(client.server_is_ready, limits.ready_timeout, what)
-        except OpenArmError as error:
-            if error.code is Code.TIMEOUT:
-                raise OpenArmError(Code.NOT_READY, f"{what}: its action server is not there") from error
-            raise
-        sent = client.send_goal_async(goal)
-        try:
-            await self.until(sent.done, limits.answer_timeout, f"{what}: acceptance of the goal")
-        except OpenArmError:
-            # Should it be accepted yet, it is withdrawn.
-            sent.add_done_callback(lambda f: f.result().cancel_goal_async() if f.result().accepted else None)
-            raise
-        handle: Any = sent.result()
-        if not handle.accepted:
-            raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the goal was rejected")
-        result = handle.get_result_async()
-        missed = 0
-
-        def watch() -> None:
-            nonlocal missed
-            missed = 0 if client.server_is_ready() else missed + 1
-            if missed > _GONE:
-                raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: its action server is gone")
+    def _watched(self, guard: Callable[[], None] | None) -> Callable[[], None]:
+        def look() -> None:
+            check_deadline(self.now_ns, self.deadline_ns)
             if guard is not None:
                 guard()
 
-        try:
-            await self.until(result.done, limit, what, watch)
-        except OpenArmError as error:
-            handle.cancel_goal_async()
-            deadline = self._node.monotonic() + (0.0 if error.code is Code.ROBOT_LOST else _STOP_LIMIT_S)
-            while not result.done() and self._node.monotonic() < deadline:
-                await self.tick()
-            raise
-        return result.result().result
+        return look
 
-    # --- looking
-    async def observe(self, count: int, topic: str, limit: float) -> Frames:
-        """Collect frames of detections that are taken from now on; `limit` is s of wall clock.
+    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
+        """Carry out several things at once."""
+        executor = self._node.executor
+        if executor is None:
+            raise OpenArmError(Code.INTERNAL, "the grasp node is not in an executor")
+        faults: list[Exception] = []
 
-        Raises:
-            OpenArmError: STALE_DATA, when they do not come; CANCELLED; ROBOT_LOST.
-        """
-        self._frames = []
-        self._looking_since_ns = self.now_ns
-        self._look(topic)
-        try:
-            await self.until(lambda: len(self._frames) >= count, limit, "looking")
-        except OpenArmError as error:
-            if error.code is not Code.TIMEOUT:
-                raise
-            seen = f"{len(self._frames)} of {count} frames came from {topic} within {limit:g} s"
-            raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
-        return Frames(tuple(self._frames[-count:]), self._frame_id)
+        async def carry_out(part: Callable[[], Awaitable[None]]) -> None:
+            # An exception that leaves a task would stop the whole executor; it is raised below.
+            try:
+                await part()
+            except Exception as error:
+                faults.append(error)
 
-    def _look(self, topic: str) -> None:
-        if self._detections is not None and self._topic != topic:
-            self.stop_looking()
-        if self._detections is None:
-            self._topic = topic
-            self._detections = self._node.create_subscription(Detection3DArray, topic, self._on_detections, reliable(5))
+        tasks: list[Future] = [executor.create_task(carry_out, part) for part in parts]
+        # All end, also those beside one that failed: they watch the same cancel, robot and deadlines.
+        while not all(task.done() for task in tasks):
+            await self._nodes.tick()
+        if faults:
+            raise faults[0]
 
-    def _on_detections(self, message: Detection3DArray) -> None:
-        # What the camera took before this look began shows another state of the world.
-        if stamp_to_ns(message.header.stamp) < self._looking_since_ns:
-            return
-        try:
-            self._frames.append(convert.frame_from_msg(message))
-        except OpenArmError as error:
-            self._node.get_logger().warning(f"dropped a frame of detections: {error.message}")
-            return
-        self._frame_id = message.header.frame_id
+    async def observe(self, count: int, *, near: bool = False) -> Frames:
+        """Frames of detections that are taken from now on."""
+        if not near:
+            return await self._nodes.observe(count, DETECTIONS, self._config.detect.frame_timeout)
+        config = self._config.near
+        if not self._nodes.sees(config.topic):
+            raise OpenArmError(Code.NOT_READY, f"nobody publishes {config.topic}")
+        return await self._nodes.observe(count, config.topic, config.timeout)
 
     def stop_looking(self) -> None:
-        """Leave /detections_3d, so that the detector may rest."""
-        if self._detections is not None:
-            self._node.destroy_subscription(self._detections)
-            self._detections = None
+        """Leave /detections_3d."""
+        self._nodes.stop_looking()
+
+    # --- planning and moving
+    async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
+        """Ask /motion/plan_approach."""
+        goal = convert.plan_goal(effect, self._config.velocity_scale)
+        what = f"{effect.arm} arm: planning"
+        result = await self._nodes.goal(self._plan, goal, self._config.limits.plan_timeout, what, self._watched(None))
+        return convert.planned_from_msg(result, len(goal.targets))
+
+    async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
+        """Ask /motion/compute_ik."""
+        if not self._ik.service_is_ready():
+            return {}
+        answered = self._ik.call_async(convert.reach_request(arm, T_base_tcp))
+        await self._nodes.until(answered.done, self._config.limits.answer_timeout, "/motion/compute_ik")
+        return convert.reach_from_msg(arm, answered.result(), T_base_tcp)
+
+    async def follow(
+        self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        """Ask /motion/execute."""
+        goal = ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_wait=self.max_wait)
+        await self._moved(self._execute, goal, what, guard)
+
+    async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
+        """Ask /motion/move for a straight line."""
+        goal = convert.linear_goal(effect, self._config.velocity_scale, self.max_wait)
+        await self._moved(self._move, goal, what)
+
+    async def move_named(self, arm: str, named: str, effect: effects.GoHome, what: str) -> None:
+        """Ask /motion/move for a free path to a posture."""
+        goal = convert.home_goal(arm, named, effect, self._config.velocity_scale, self.max_wait)
+        await self._moved(self._move, goal, what)
+
+    async def _moved(
+        self, client: ActionClient, goal: object, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        limit = self._config.limits.move_timeout + self.max_wait
+        result = await self._nodes.goal(client, goal, limit, what, self._watched(guard))
+        if not result.success:
+            code = convert.code_from_text(result.code, Code.EXECUTION_FAILED)
+            raise OpenArmError(code, f"{what}: {result.message or 'failed'}")
+
+    async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
+        """Ask the gripper's controller."""
+        goal = convert.gripper_goal(self._config.gripper_action, joint, position, effort)
+        limit = self._config.limits.gripper_timeout
+        result = await self._nodes.goal(self._grippers[arm], goal, limit, what, self._watched(None))
+        return bool(result.stalled or result.reached_goal)

@@ -15,8 +15,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.drift import DriftWatch
 from openarm_grasp.effects import Effects, GraspOutcome, GraspRequest, Outcome
 from openarm_grasp.evidence import Verdict
-from openarm_grasp.judges import JUDGES, Judgement, fail, start_over
-from openarm_grasp.memory import Hand, Kept, Known, Memory, Surroundings
+from openarm_grasp.judges import JUDGES, start_over
+from openarm_grasp.memory import Hand, Judgement, Kept, Known, Memory, Surroundings
 from openarm_grasp.recipes import RECIPES
 from openarm_grasp.routing import arm_order
 from openarm_grasp.states import TRANSITIONS, Event, State, load_transitions
@@ -145,7 +145,7 @@ class GraspMachine:
         try:
             return JUDGES[self.state](m, outcome, t_ns, self._around)
         except OpenArmError as error:
-            return fail(m, error.code, error.message, final=True)
+            return m.fail(error.code, error.message, final=True)
 
     def _enter(self, m: Memory, event: Event, reason: str, t_ns: int) -> Effects:
         came_from, self.state = self.state, self._transitions[self.state][event]

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from openarm_common.description import RobotDescription, Side
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Table
 from openarm_grasp.candidates import GraspCandidate
@@ -19,8 +20,12 @@ from openarm_grasp.evidence import Verdict
 from openarm_grasp.observation import Detection, Sighting
 from openarm_grasp.options import Options
 from openarm_grasp.place import PlaceTarget
+from openarm_grasp.routing import ARMS
+from openarm_grasp.states import Event
 
 ValueT = TypeVar("ValueT")
+#: What the outcome of a state's recipe means, and why.
+Judgement: TypeAlias = tuple[Event, str]
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,11 @@ class Surroundings:
     config: GraspConfig
     table: Table
     shoulders: Mapping[str, Sequence[float]]
+
+    @classmethod
+    def of(cls, config: GraspConfig, table: Table, robot: RobotDescription) -> Surroundings:
+        """Those of a robot at a table."""
+        return cls(config, table, {arm: _shoulder(robot, arm) for arm in ARMS})
 
 
 @dataclass
@@ -188,6 +198,11 @@ class Memory:
         """The place, once PLACE has chosen it."""
         return _need(self.place_target, "place target")
 
+    def fail(self, code: Code, reason: str, *, final: bool = False) -> Judgement:
+        """Write a failure down; `final` allows no further try."""
+        self.failure = Verdict(code, reason)
+        return (Event.END if final else Event.AGAIN), reason
+
     def forget_sight(self) -> None:
         """Start over from the camera."""
         self.seen = self.sighting = self.candidate = self.grasp_plan = self.place_target = self.place_plan = None
@@ -195,6 +210,13 @@ class Memory:
         self.place_refused = self.probed = False
         self.kept = None
         self.hand = Hand()
+
+
+def _shoulder(robot: RobotDescription, arm: Side) -> tuple[float, float]:
+    """(x, y) of the arm's first joint, base frame, m."""
+    first = robot.joint(robot.arm_joints(arm)[0])
+    T_base_shoulder = robot.link_pose(first.parent, {}) @ first.T_parent_joint
+    return float(T_base_shoulder[0, 3]), float(T_base_shoulder[1, 3])
 
 
 def _need(value: ValueT | None, what: str) -> ValueT:

@@ -14,7 +14,6 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
-from openarm_common.description import Side
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.lockstep_node import NamedActionServer
 from openarm_common.node import QOS_LATCHED, BaseNode, run
@@ -26,7 +25,6 @@ from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.pair import PairOutcome
 from openarm_grasp.request_executor import RequestExecutor
-from openarm_grasp.routing import ARMS
 from openarm_grasp.states import State
 
 AnswerT = TypeVar("AnswerT", GraspOutcome, PairOutcome)
@@ -41,8 +39,7 @@ class GraspNode(BaseNode[GraspConfig]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("grasp", GraspConfig, **kwargs)
-        shoulders = {arm: self._shoulder(arm) for arm in ARMS}
-        around = Surroundings(self.config, load_scene(self.config.scene).table, shoulders)
+        around = Surroundings.of(self.config, load_scene(self.config.scene).table, self.description)
         self._requests = RequestExecutor(self, around)
         self._goal: ServerGoalHandle | None = None
         self._status_topic = self.create_publisher(GraspStatus, "/grasp/status", _QOS_STATUS)
@@ -170,12 +167,6 @@ class GraspNode(BaseNode[GraspConfig]):
         for machine in self._requests.machines:
             if machine is not idle and machine.memory is not None:
                 self._status_topic.publish(convert.status_msg(machine, t_ns, again=True))
-
-    def _shoulder(self, arm: Side) -> tuple[float, float]:
-        """(x, y) of the arm's first joint, base frame, m."""
-        first = self.description.joint(self.description.arm_joints(arm)[0])
-        T_base_shoulder = self.description.link_pose(first.parent, {}) @ first.T_parent_joint
-        return float(T_base_shoulder[0, 3]), float(T_base_shoulder[1, 3])
 
 
 def main() -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.config import DetectConfig
 
 Array = NDArray[np.float64]
 
@@ -117,9 +118,8 @@ def labels_in_view(frames: Sequence[Frame]) -> list[str]:
 def find(
     frames: Sequence[Frame],
     label: str,
+    limits: DetectConfig,
     *,
-    match_radius: float,
-    agree_within: float,
     at: Sequence[float] | None = None,
     leave: Sequence[Sequence[float]] = (),
 ) -> Sighting:
@@ -128,8 +128,7 @@ def find(
     Args:
         frames: At least one, oldest first.
         label: What to look for; "" takes any.
-        match_radius: Detections nearer than this are one object, m.
-        agree_within: Largest distance between the positions of one object in consecutive frames, m.
+        limits: How near detections must be to be one object, and how much it may seem to move.
         at: (x, y) where it stands, m; None takes the detection with the highest score.
         leave: (x, y) of objects that are not meant, m.
 
@@ -147,7 +146,7 @@ def find(
     track: list[Detection] = []
     for frame in frames:
         fit = [d for d in frame.detections if d.label == anchor.label and d.measured]
-        near = [d for d in fit if _distance(d, anchor) <= match_radius]
+        near = [d for d in fit if _distance(d, anchor) <= limits.match_radius]
         track += [min(near, key=lambda d: _distance(d, anchor))] if near else []
     # A detector may miss a thing in one frame; in most of them it must be in its place.
     if 3 * len(track) < 2 * len(frames):
@@ -157,18 +156,18 @@ def find(
         raise OpenArmError(
             Code.STALE_DATA,
             f"{anchor.label!r} is in the same place in {len(track)} of {len(frames)} frames only: expected one within"
-            f" {match_radius * 1e3:.0f} mm of {_text(anchor.p_base)} in two thirds of them",
+            f" {limits.match_radius * 1e3:.0f} mm of {_text(anchor.p_base)} in two thirds of them",
         )
     steps = [_distance(a, b) for a, b in pairwise(track)]
-    if steps and max(steps) > agree_within:
+    if steps and max(steps) > limits.agree_within:
         raise OpenArmError(
             Code.STALE_DATA,
             f"{anchor.label!r} moved {max(steps) * 1e3:.1f} mm between two frames, expected at most"
-            f" {agree_within * 1e3:.1f} mm; is it at rest?",
+            f" {limits.agree_within * 1e3:.1f} mm; is it at rest?",
         )
     target = average(track)
     spread = max(_distance(d, target) for d in track)
-    return Sighting(target, _others(frames, target, match_radius), frames[-1].t_ns, spread)
+    return Sighting(target, _others(frames, target, limits.match_radius), frames[-1].t_ns, spread)
 
 
 def _anchor(frame: Frame, label: str, at: Sequence[float] | None, leave: Sequence[Sequence[float]]) -> Detection:
@@ -196,7 +195,7 @@ def _anchor(frame: Frame, label: str, at: Sequence[float] | None, leave: Sequenc
 
 
 def _same_thing(a: Detection, b: Detection) -> bool:
-    return a.label == b.label and _distance_xy(a, b) <= SAME_PLACE
+    return a.label == b.label and apart(a, b) <= SAME_PLACE
 
 
 def _not_measured(d: Detection) -> OpenArmError:
@@ -205,6 +204,11 @@ def _not_measured(d: Detection) -> OpenArmError:
         f"{d.label!r} is in view at about {_text(d.p_base)}, but cannot be measured: something hides its outline, or"
         " the border of the image cuts it",
     )
+
+
+def apart(a: Detection, b: Detection) -> float:
+    """Horizontal distance of two objects, m."""
+    return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
 
 
 def sticks_out(seen: Detection, stood: Detection) -> float:
@@ -268,17 +272,13 @@ def _others(frames: Sequence[Frame], target: Detection, match_radius: float) -> 
         for d in frame.detections:
             # The middle of what is seen of an object may lie near another one.
             rivals = (k for k in (target, *found) if k.label == d.label or (k.measured and d.measured))
-            if all(_distance_xy(d, known) > match_radius for known in rivals):
+            if all(apart(d, known) > match_radius for known in rivals):
                 found.append(d)
     return tuple(found)
 
 
 def _distance(a: Detection, b: Detection) -> float:
     return float(np.linalg.norm(a.p_base - b.p_base))
-
-
-def _distance_xy(a: Detection, b: Detection) -> float:
-    return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
 
 
 def _from(d: Detection, p: Sequence[float]) -> float:

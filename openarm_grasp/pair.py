@@ -15,17 +15,15 @@ import numpy as np
 from openarm_common.description import Side
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.beside import BesideLink, Company
-from openarm_grasp.config import GraspConfig
-from openarm_grasp.effects import Frames, GoHome, GraspOutcome, GraspRequest, Observe, ToBase
-from openarm_grasp.legs import run_task
+from openarm_grasp.effects import Frames, GoHome, GraspOutcome, GraspRequest
+from openarm_grasp.legs import STOPS, run_task
+from openarm_grasp.link import Link
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.observation import SAME_PLACE, Sighting, find, on_table
-from openarm_grasp.performer import Link, Performer, run_request
+from openarm_grasp.performer import Performer, run_request
 from openarm_grasp.rehearsal import NO_WAY, Rehearsal
 from openarm_grasp.routing import ARMS, arm_order
 
-#: These end both requests.
-_STOPS = (Code.CANCELLED, Code.ROBOT_LOST, Code.TIMEOUT)
 #: Places nearer to each other than this are served one after the other, m.
 _APART = 0.20
 
@@ -83,8 +81,7 @@ class PairRunner:
     Args:
         machines: Of the first and the second request.
         links: Of each arm.
-        alone: Link and performer for requests that are carried out alone.
-        config: Parameters.
+        alone: Performer of what is carried out alone.
         tell: Called after each transition, with the machine.
     """
 
@@ -92,14 +89,17 @@ class PairRunner:
         self,
         machines: tuple[GraspMachine, GraspMachine],
         links: Mapping[Side, Link],
-        alone: tuple[Link, Performer],
-        config: GraspConfig,
+        alone: Performer,
         tell: Callable[[GraspMachine], None],
     ) -> None:
-        self._machines, self._alone, self._config, self._tell = machines, alone, config, tell
+        self._machines, self._alone, self._tell = machines, alone, tell
+        self._around = machines[0].around
+        config = self._around.config
         self._company = Company()
-        self._links = {arm: BesideLink(arm, link, self._company, config) for arm, link in links.items()}
-        self._performers = {arm: Performer(link, config, arms=(arm,)) for arm, link in self._links.items()}
+        self._performers = {
+            arm: Performer(BesideLink(arm, link, self._company, config), config, arms=(arm,))
+            for arm, link in links.items()
+        }
         self._began_ns = 0
 
     async def run(self, requests: tuple[GraspRequest, GraspRequest]) -> PairOutcome:
@@ -112,8 +112,8 @@ class PairRunner:
         check_pair(requests)
         for machine in self._machines:
             for request in requests:
-                self._alone[1].check_hands(machine, request)
-        self._began_ns = self._alone[0].now_ns
+                self._alone.check_hands(machine, request)
+        self._began_ns = self._alone.link.now_ns
         self._note(f"asked for {requests[0].label!r} and {requests[1].label!r} at once: looking at both")
         how = await self._shared_out(requests)
         self._note(how.reason)
@@ -130,8 +130,7 @@ class PairRunner:
         codes = [answer.code for answer in answers if not answer.success]
         code = Code.CANCELLED if Code.CANCELLED in codes else next(iter(codes), Code.OK)
         text = "; ".join(f"{answer.label}: {answer.message}" for answer in answers)
-        duration = (self._alone[0].now_ns - self._began_ns) * 1e-9
-        return PairOutcome(answers, code, f"{how.reason}. {text}", bool(how.arms), duration)
+        return PairOutcome(answers, code, f"{how.reason}. {text}", bool(how.arms), self._seconds())
 
     def _note(self, reason: str) -> None:
         """Say what is done before the machines are asked."""
@@ -150,7 +149,7 @@ class PairRunner:
             frames = await self._look(requests)
             seen = [self._find(frames, request) for request in requests]
         except OpenArmError as error:
-            if error.code in _STOPS:
+            if error.code in STOPS:
                 raise self._late(requests, error) from error
             return Pair((), f"{error.message}: one after the other")
         straight: tuple[Side, Side] = ("left", "right")
@@ -169,36 +168,22 @@ class PairRunner:
 
     async def _look(self, requests: tuple[GraspRequest, GraspRequest]) -> Frames:
         """Frames that show both, in the base frame. A dry run moves nothing."""
-        config, (link, performer) = self._config, self._alone
-        link.deadline_ns = self._began_ns + round(requests[0].timeout * 1e9) if requests[0].timeout > 0.0 else 0
-        low = self._machines[0].around.table.top_z + 2.0 * config.approach.lift_height
-        look = Observe(config.detect.frames)
-        recipe = (look,) if requests[0].dry_run else (GoHome(ARMS, back_off_below=low), look)
-        outcome = await performer.perform(recipe)
-        if outcome.ok:
-            frames = outcome.last(Frames)
-            outcome = await performer.perform((ToBase(frames.frames, frames.frame_id),))
-        if not outcome.ok:
-            raise OpenArmError(outcome.code, outcome.message)
-        return outcome.last(Frames)
+        config, request = self._around.config, requests[0]
+        self._alone.link.deadline_ns = self._began_ns + round(request.timeout * 1e9) if request.timeout > 0.0 else 0
+        home = GoHome(ARMS, back_off_below=self._around.table.top_z + 2.0 * config.approach.lift_height)
+        return await self._alone.look(config.detect.frames, after=() if request.dry_run else (home,))
 
     def _find(self, frames: Frames, request: GraspRequest) -> Sighting:
-        limits = self._config.detect
         sighting = find(
-            frames.frames,
-            request.label,
-            match_radius=limits.match_radius,
-            agree_within=limits.agree_within,
-            at=request.object_at,
-            leave=request.leave,
+            frames.frames, request.label, self._around.config.detect, at=request.object_at, leave=request.leave
         )
-        return replace(sighting, target=on_table(sighting.target, self._machines[0].around.table.top_z))
+        return replace(sighting, target=on_table(sighting.target, self._around.table.top_z))
 
     async def _cannot(
         self, requests: tuple[GraspRequest, GraspRequest], seen: list[Sighting], arms: tuple[Side, Side]
     ) -> str:
         """Why the arms cannot do this; "" when they can."""
-        rehearsal = Rehearsal(self._alone[0], self._machines[0].around)
+        rehearsal = Rehearsal(self._alone.link, self._around)
         for request, sighting, arm in zip(requests, seen, arms, strict=True):
             try:
                 if request.place is None:
@@ -223,22 +208,21 @@ class PairRunner:
 
         async def work(i: int) -> None:
             arm, machine = how.arms[i], self._machines[i]
-            link, performer = self._links[arm], self._performers[arm]
             try:
                 asked = replace(self._in_time(requests[i]), arm=arm, why=how.reason)
-                outcome = await run_request(machine, performer, link, asked, lambda: self._tell(machine))
+                outcome = await run_request(machine, self._performers[arm], asked, lambda: self._tell(machine))
                 outcomes[i] = replace(outcome, route="direct" if outcome.success else "")
             except OpenArmError as error:
                 outcomes[i] = GraspOutcome(error.code, error.message, requests[i].label)
             finally:
                 self._company.done.add(arm)
 
-        await self._alone[0].together([lambda: work(0), lambda: work(1)])
+        await self._alone.link.together([lambda: work(0), lambda: work(1)])
         return outcomes[0], outcomes[1]
 
     async def _in_turn(self, requests: tuple[GraspRequest, GraspRequest]) -> tuple[GraspOutcome, GraspOutcome]:
         first = await self._one(0, requests[0])
-        if first.code in _STOPS or first.held:
+        if first.code in STOPS or first.held:
             text = f"not begun: {first.label!r} ended with {first.code}: {first.message}"
             return first, GraspOutcome(first.code, text, requests[1].label)
         return first, await self._one(1, requests[1])
@@ -249,14 +233,17 @@ class PairRunner:
 
     async def _one(self, i: int, request: GraspRequest) -> GraspOutcome:
         """A request alone, by whatever way, in what is left of the time."""
-        link, performer = self._alone
         machine = self._machines[i]
         try:
-            return await run_task(machine, performer, link, self._in_time(request), lambda: self._tell(machine))
+            return await run_task(machine, self._alone, self._in_time(request), lambda: self._tell(machine))
         except OpenArmError as error:
             return GraspOutcome(error.code, error.message, request.label)
 
     # --- time
+    def _seconds(self) -> float:
+        """Robot time since both were asked for, s."""
+        return (self._alone.link.now_ns - self._began_ns) * 1e-9
+
     def _in_time(self, request: GraspRequest) -> GraspRequest:
         """The request with what is left of its time.
 
@@ -265,7 +252,7 @@ class PairRunner:
         """
         if request.timeout <= 0.0:
             return request
-        left = request.timeout - (self._alone[0].now_ns - self._began_ns) * 1e-9
+        left = request.timeout - self._seconds()
         if left <= 0.0:
             raise OpenArmError(Code.TIMEOUT, f"the {request.timeout:g} s were over before it began")
         return replace(request, timeout=left)

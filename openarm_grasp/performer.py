@@ -1,40 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
 """Carries out what the state machine asks for, over a link to a robot: no ROS, no clock of its own.
 
-The same code drives a robot behind a node graph (`link_executor`) and a world in this process (a campaign); what
-differs is the `Link`. Every effect is a coroutine that ends: by its work, a deadline, a cancel, or a lost robot.
+The same code drives a robot behind a node graph and a world in this process (a campaign); what differs is the `Link`.
 """
 
 from __future__ import annotations
 
 import traceback
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from typing import Protocol
+from collections.abc import Awaitable, Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot_state import RobotStateBuffer
 from openarm_grasp import effects
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import (
     Effect,
     Effects,
     Frames,
-    GoHome,
     GraspOutcome,
     GraspRequest,
     Outcome,
-    Planned,
     Reach,
     Result,
-    Trajectory,
 )
 from openarm_grasp.evidence import Evidence
 from openarm_grasp.hand import SPEED_WINDOW_NS, HandReader
+from openarm_grasp.link import Link
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.observation import in_base
 from openarm_grasp.options import NoWayError
@@ -43,104 +37,17 @@ from openarm_grasp.routing import ARMS
 Array = NDArray[np.float64]
 
 
-class Link(Protocol):
-    """How a robot, its cameras and its planner are reached. Base frame, m, rad; robot time in ns."""
-
-    @property
-    def description(self) -> RobotDescription:
-        """The robot."""
-        ...
-
-    @property
-    def states(self) -> RobotStateBuffer:
-        """Its joint states."""
-        ...
-
-    @property
-    def base_frame(self) -> str:
-        """Name of the base frame."""
-        ...
-
-    deadline_ns: int
-    """Robot time after which `check` raises CANCELLED; 0: none."""
-
-    @property
-    def now_ns(self) -> int:
-        """Robot time."""
-        ...
-
-    def effort(self, joint: str) -> float:
-        """Newest effort of a joint, N or N m; 0 when none is told."""
-        ...
-
-    def pads(self, arm: str) -> tuple[float, ...]:
-        """Force on each finger pad of a hand, N; empty when no sensor tells it."""
-        ...
-
-    def check(self) -> None:
-        """Raise when the work shall not go on: CANCELLED, ROBOT_LOST."""
-        ...
-
-    def warn(self, text: str) -> None:
-        """Say something that does not stop the work."""
-        ...
-
-    def stop_looking(self) -> None:
-        """The camera is not needed for now."""
-        ...
-
-    async def until(
-        self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
-    ) -> None:
-        """Wait for a condition, no longer than `limit` s; `guard` is called at each look and may raise."""
-        ...
-
-    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
-        """Carry out several things at once; all end before this does, then the first error is raised."""
-        ...
-
-    async def observe(self, count: int, *, near: bool = False) -> Frames:
-        """Frames of detections that are taken from now on, by the camera over the table or the one on the hand."""
-        ...
-
-    async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
-        """Plan; raises with the planner's code."""
-        ...
-
-    async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
-        """How far the arm's TCP stays from a point, m by arm; empty when that cannot be said."""
-        ...
-
-    async def follow(
-        self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
-    ) -> None:
-        """Follow a planned trajectory."""
-        ...
-
-    async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
-        """Move the TCP on a straight line."""
-        ...
-
-    async def move_named(self, arm: str, named: str, effect: GoHome, what: str) -> None:
-        """Move an arm on a free path to a posture."""
-        ...
-
-    async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
-        """Move the fingers with at most `effort` N (0: any); whether they arrived or push against something."""
-        ...
-
-
 class Performer:
     """Effects in, outcomes out.
 
     Args:
-        link: To the robot.
+        link: To the robot; who holds a performer reaches the robot by it, too.
         config: Parameters.
         arms: That it may send home.
     """
 
     def __init__(self, link: Link, config: GraspConfig, *, arms: Sequence[str] = ARMS) -> None:
-        self._link = link
+        self.link = link
         self._arms = frozenset(arms)
         self._config = config
         self._hands = {arm: HandReader(link.description, link.states, arm) for arm in ARMS}
@@ -175,11 +82,11 @@ class Performer:
     async def perform(self, recipe: Effects) -> Outcome:
         """Carry out a recipe; the first effect that fails ends it."""
         if not any(isinstance(effect, effects.Observe) for effect in recipe):
-            self._link.stop_looking()
+            self.link.stop_looking()
         results: list[Result] = []
         for done, effect in enumerate(recipe):
             try:
-                self._link.check()
+                self.link.check()
                 result = await self._one(effect)
             except OpenArmError as error:
                 refusals = error.refusals if isinstance(error, NoWayError) else {}
@@ -188,8 +95,28 @@ class Performer:
                 results.append(result)
         return Outcome(Code.OK, "", tuple(results), len(recipe))
 
+    async def do(self, recipe: Effects) -> Outcome:
+        """Carry out a recipe that must succeed.
+
+        Raises:
+            OpenArmError: What the first effect that failed says.
+        """
+        outcome = await self.perform(recipe)
+        if not outcome.ok:
+            raise OpenArmError(outcome.code, outcome.message)
+        return outcome
+
+    async def look(self, frames: int, *, after: Effects = ()) -> Frames:
+        """So many frames of the camera over the table, in the base frame, taken after a recipe.
+
+        Raises:
+            OpenArmError: As `do`.
+        """
+        seen = (await self.do((*after, effects.Observe(frames)))).last(Frames)
+        return (await self.do((effects.ToBase(seen.frames, seen.frame_id),))).last(Frames)
+
     async def _one(self, effect: Effect) -> Result | None:
-        link = self._link
+        link = self.link
         match effect:
             case effects.Together():
                 return await link.together([self._part(part) for part in effect.effects])
@@ -224,17 +151,17 @@ class Performer:
         return carry_out
 
     async def _wait(self, duration: float) -> None:
-        link = self._link
+        link = self.link
         end_ns = link.now_ns + round(duration * 1e9)
         # Simulated time may be slow; one that stands still is noticed by the link.
         what = f"waiting {duration:g} s of robot time"
         await link.until(lambda: link.now_ns >= end_ns, 20.0 * duration + 10.0, what)
 
     def _to_base(self, effect: effects.ToBase) -> Frames:
-        base = self._link.base_frame
+        base = self.link.base_frame
         if effect.frame_id == base:
             return Frames(effect.frames, base)
-        frames = in_base(effect.frames, lambda t_ns: self._link.states.lookup(base, effect.frame_id, t_ns))
+        frames = in_base(effect.frames, lambda t_ns: self.link.states.lookup(base, effect.frame_id, t_ns))
         return Frames(frames, base)
 
     # --- moving
@@ -254,10 +181,10 @@ class Performer:
                     f" the way, expected to stay within {held.slip * 1e3:.0f} mm",
                 )
 
-        await self._link.follow(effect.arm, effect.trajectory, f"{effect.arm} arm: {effect.what}", still_held)
+        await self.link.follow(effect.arm, effect.trajectory, f"{effect.arm} arm: {effect.what}", still_held)
 
     async def _home(self, effect: effects.GoHome) -> None:
-        config, link = self._config, self._link
+        config, link = self._config, self.link
         for arm in effect.arms:
             if arm not in self._arms:
                 continue
@@ -279,7 +206,7 @@ class Performer:
 
     # --- the hand
     async def _grip(self, effect: effects.MoveGripper) -> None:
-        hand, link, what = self._hands[effect.arm], self._link, f"{effect.arm} hand: {effect.what}"
+        hand, link, what = self._hands[effect.arm], self.link, f"{effect.arm} hand: {effect.what}"
         ended_well = await link.grip(effect.arm, hand.joint, effect.position, what, effect.effort)
         if effect.position > 0.0:
             # The result may be here before the joint state that shows it.
@@ -293,7 +220,7 @@ class Performer:
             raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers neither arrived nor met anything")
 
     async def _measure(self, effect: effects.Measure) -> Evidence:
-        hand, link, limit = self._hands[effect.arm], self._link, 20.0 * effect.settle + 10.0
+        hand, link, limit = self._hands[effect.arm], self.link, 20.0 * effect.settle + 10.0
         ready_ns = link.now_ns + SPEED_WINDOW_NS
         await link.until(lambda: link.now_ns >= ready_ns, limit, "reading the hand")
         end_ns = ready_ns + round(effect.settle * 1e9)
@@ -314,22 +241,15 @@ class Performer:
         return hand.evidence(effect.expected, link.effort(hand.joint), effect.T_base_tcp, pads)
 
 
-def check_deadline(now_ns: int, deadline_ns: int) -> None:
-    """Raise CANCELLED when the time of a request is over; for links."""
-    if 0 < deadline_ns < now_ns:
-        raise OpenArmError(
-            Code.CANCELLED, "the time for the request is over; the arm holds and the hand keeps its object"
-        )
-
-
 async def run_request(
-    machine: GraspMachine, performer: Performer, link: Link, request: GraspRequest, tell: Callable[[], None]
+    machine: GraspMachine, performer: Performer, request: GraspRequest, tell: Callable[[], None]
 ) -> GraspOutcome:
     """Carry out one request from beginning to end; `tell` is called after each transition.
 
     Raises:
         OpenArmError: BUSY, INVALID_ARGUMENT or NOT_READY, when the request is not taken.
     """
+    link = performer.link
     performer.check_hands(machine, request)
     recipe = machine.step(request, link.now_ns)
     link.deadline_ns = link.now_ns + round(request.timeout * 1e9) if request.timeout > 0.0 else 0

@@ -184,8 +184,8 @@ def free_spots(arm: str, target: Detection, others: Sequence[Detection], config:
     place = config.place
     side = 1.0 if arm == "left" else -1.0
     ranked: list[tuple[bool, float, float, float]] = []
-    for x in _grid(*place.region_x, place.spot_step):
-        for abs_y in _grid(*place.region_abs_y, place.spot_step):
+    for x in grid(*place.region_x, place.spot_step):
+        for abs_y in grid(*place.region_abs_y, place.spot_step):
             spot = np.array([x, side * abs_y])
             origin = float(np.linalg.norm(spot - target.p_base[:2]))
             room = min((float(np.linalg.norm(spot - d.p_base[:2])) for d in others), default=np.inf)
@@ -254,5 +254,6 @@ def check_position(
     return p
 
 
-def _grid(low: float, high: float, step: float) -> Array:
+def grid(low: float, high: float, step: float) -> Array:
+    """Numbers from one end to the other, about a step apart."""
     return np.linspace(low, high, max(2, round((high - low) / step) + 1))

@@ -20,25 +20,22 @@ from numpy.typing import NDArray
 from openarm_common import se3
 from openarm_common.description import RobotDescription, Side
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.candidates import UP, GraspCandidate, obstacle_boxes, target_box
+from openarm_grasp.candidates import UP, GraspCandidate, obstacle_boxes, shifted, target_box
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import (
     Execute,
-    Frames,
     GoHome,
     Measure,
     MoveGripper,
     MoveLinear,
-    Observe,
     PlanGrasp,
     Planned,
-    ToBase,
     Together,
 )
 from openarm_grasp.evidence import Evidence
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.observation import Detection, Sighting, find
-from openarm_grasp.performer import Link, Performer
+from openarm_grasp.performer import Performer
 from openarm_grasp.rehearsal import NO_WAY, Rehearsal, standing_at
 from openarm_grasp.routing import ARMS, arm_order
 
@@ -80,21 +77,14 @@ class Pusher:
     Args:
         around: Parameters, table and arms.
         performer: Carries out.
-        link: To the planner.
         rehearsal: Says what could be grasped where.
         note: Is told what is done.
     """
 
     def __init__(
-        self,
-        around: Surroundings,
-        performer: Performer,
-        link: Link,
-        rehearsal: Rehearsal,
-        note: Callable[[str], None],
+        self, around: Surroundings, performer: Performer, rehearsal: Rehearsal, note: Callable[[str], None]
     ) -> None:
-        self._around, self._performer, self._link = around, performer, link
-        self._rehearsal, self._note = rehearsal, note
+        self._around, self._performer, self._rehearsal, self._note = around, performer, rehearsal, note
 
     async def plan(self, seen: Sighting) -> Push:
         """Find a push after which the object can be grasped.
@@ -135,16 +125,16 @@ class Pusher:
 
     async def _push_to(self, seen: Sighting, end: Array, taker: str) -> Push:
         """The other arm is asked first: it comes from the other side."""
-        config, faults = self._config, list[str]()
+        config, link, faults = self._config, self._performer.link, list[str]()
         for arm in sorted(ARMS, key=lambda arm: arm == taker):
-            ways = push_ways(seen.target, end, config, closed_hand(self._link.description, arm))
+            ways = push_ways(seen.target, end, config, closed_hand(link.description, arm))
             if not ways:
                 faults.append(f"{arm} hand: {seen.target.label!r} would tip over")
                 continue
-            self._link.check()
+            link.check()
             effect = PlanGrasp(arm, ways, obstacle_boxes(seen.others, config), target_box(seen.target, config))
             try:
-                plan = await self._link.plan(effect)
+                plan = await link.plan(effect)
             except OpenArmError as error:
                 if error.code not in NO_WAY:
                     raise
@@ -160,51 +150,54 @@ class Pusher:
             OpenArmError: EXECUTION_FAILED or HAND_COLLISION, when the hand did not do it; what looking raises, when the
                 object is not seen any more.
         """
-        arm, way, config = push.arm, push.way, self._config
-        self._note(f"push {number} of at most {config.push.most}: {push}")
-        outcome = await self._performer.perform(
-            (
-                Together((MoveGripper(arm, 0.0, "close"), Execute(arm, push.plan.transfer, "move behind the object"))),
-                Execute(arm, push.plan.approach, "move down behind the object"),
-                Measure(arm, 0.0, way.T_base_tcp),
-            )
-        )
-        fault = None if outcome.ok else OpenArmError(outcome.code, outcome.message)
-        if fault is None and (error := outcome.last(Evidence).tcp_error) > config.held.max_tcp_error:
-            text = f"the {arm} hand stopped {error * 1e3:.0f} mm from its place behind the object"
-            fault = OpenArmError(Code.HAND_COLLISION, text)
-        back = way.T_base_tcp
-        if fault is None:
-            outcome = await self._performer.perform((Execute(arm, push.plan.retreat, "push"),))
-            fault = None if outcome.ok else OpenArmError(outcome.code, outcome.message)
-            back = shifted(way.T_base_tcp, way.retreat_offset - config.push.gap * _direction(way.retreat_offset))
+        arm, way, gap = push.arm, push.way, self._config.push.gap
+        self._note(f"push {number} of at most {self._config.push.most}: {push}")
+        T_base_back, fault = way.T_base_tcp, None
+        try:
+            await self._go_behind(push)
+            T_base_back = shifted(way.T_base_tcp, way.retreat_offset - gap * _direction(way.retreat_offset))
+            await self._performer.do((Execute(arm, push.plan.retreat, "push"),))
+        except OpenArmError as error:
+            fault = error
         if fault is None or fault.code not in (Code.CANCELLED, Code.ROBOT_LOST):
-            home = await self._home(arm, back, label)
-            fault = fault or home
+            try:
+                await self._home(arm, T_base_back)
+            except OpenArmError as error:
+                fault = fault or error
         if fault is not None:
             raise OpenArmError(fault.code, f"push {number}: {fault.message}")
         return await self._seen(push, label, number)
 
-    async def _home(self, arm: str, T_base_back: Array, label: str) -> OpenArmError | None:
-        """Leave the object the way the hand came, and go home; what kept it from that."""
+    async def _go_behind(self, push: Push) -> None:
+        """Close the hand and bring it behind the object."""
+        arm, T_base_tcp, limit = push.arm, push.way.T_base_tcp, self._config.held.max_tcp_error
+        outcome = await self._performer.do(
+            (
+                Together((MoveGripper(arm, 0.0, "close"), Execute(arm, push.plan.transfer, "move behind the object"))),
+                Execute(arm, push.plan.approach, "move down behind the object"),
+                Measure(arm, 0.0, T_base_tcp),
+            )
+        )
+        if (error := outcome.last(Evidence).tcp_error) > limit:
+            text = f"the {arm} hand stopped {error * 1e3:.0f} mm from its place behind the object"
+            raise OpenArmError(Code.HAND_COLLISION, text)
+
+    async def _home(self, arm: str, T_base_back: Array) -> None:
+        """Leave the object the way the hand came, and go home."""
         low = self._around.table.top_z + 2.0 * self._config.approach.lift_height
         # A line that cannot be followed is a kindness that is not done; the free way home may still be there.
         await self._performer.perform((MoveLinear(arm, T_base_back, "leave the object"),))
-        outcome = await self._performer.perform((GoHome((arm,), back_off_below=low),))
-        return None if outcome.ok else OpenArmError(outcome.code, outcome.message)
+        await self._performer.do((GoHome((arm,), back_off_below=low),))
 
     async def _seen(self, push: Push, label: str, number: int) -> str:
         """Where the camera sees the object afterwards."""
         limits = self._config.detect
-        outcome = await self._performer.perform((Observe(limits.frames),))
-        if outcome.ok:
-            frames = outcome.last(Frames)
-            outcome = await self._performer.perform((ToBase(frames.frames, frames.frame_id),))
-        if not outcome.ok:
-            raise OpenArmError(outcome.code, f"push {number}: {label!r} was not seen since: {outcome.message}")
-        found = find(
-            outcome.last(Frames).frames, label, match_radius=limits.match_radius, agree_within=limits.agree_within
-        ).target
+        try:
+            frames = await self._performer.look(limits.frames)
+        except OpenArmError as error:
+            text = f"push {number}: {label!r} was not seen since: {error.message}"
+            raise OpenArmError(error.code, text) from error
+        found = find(frames.frames, label, limits).target
         x, y = found.p_base[:2]
         moved, off = (float(np.hypot(*(found.p_base[:2] - p))) for p in (push.start, push.end))
         text = (
@@ -318,13 +311,6 @@ def _front(points: Array, ahead: Array, half_width: float, height: tuple[float, 
     reach = meets @ ahead
     front = float(reach.max())
     return front, float(meets[reach > front - _FLAT, 2].min())
-
-
-def shifted(T: Array, offset: Array) -> Array:
-    """The pose moved by an offset in its parent frame."""
-    moved = T.copy()
-    moved[:3, 3] += offset
-    return moved
 
 
 def _direction(v: Array) -> Array:

@@ -6,10 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
-import numpy as np
-from numpy.typing import NDArray
-
-from openarm_grasp.candidates import UP, Box, held_box, obstacle_boxes, target_box
+from openarm_grasp.candidates import UP, Box, held_box, obstacle_boxes, shifted, target_box
 from openarm_grasp.effects import (
     Effects,
     Execute,
@@ -28,8 +25,6 @@ from openarm_grasp.effects import (
 from openarm_grasp.memory import Memory, Surroundings
 from openarm_grasp.routing import ARMS, arm_order
 from openarm_grasp.states import State
-
-Array = NDArray[np.float64]
 
 #: Frames that must not show the object in its old place after the lift: a detector may miss it in one.
 _LIFT_FRAMES = 2
@@ -139,13 +134,13 @@ def reset(m: Memory, around: Surroundings) -> Effects:
     leave: Effects = (MoveGripper(m.arm, config.hand.opening, "open"), Wait(config.timing.after_release))
     if hand.released:
         target = m.need_place_target()
-        back = MoveLinear(m.arm, _shifted(target.T_base_tcp, target.retreat_offset), "leave")
+        back = MoveLinear(m.arm, shifted(target.T_base_tcp, target.retreat_offset), "leave")
         return (back, home) if hand.at_object else (home,)
     if not hand.at_object:
         return (*leave, home)
-    back = MoveLinear(m.arm, _shifted(c.T_base_tcp, c.approach_offset), "back off")
+    back = MoveLinear(m.arm, shifted(c.T_base_tcp, c.approach_offset), "back off")
     if hand.holding:
-        down = _shifted(c.T_base_tcp, config.place.release_height * UP)
+        down = shifted(c.T_base_tcp, config.place.release_height * UP)
         return (MoveLinear(m.arm, down, "put back"), *leave, back, home)
     return (*leave, back, home)
 
@@ -158,12 +153,6 @@ def _obstacles_on_the_way_home(m: Memory, around: Surroundings) -> tuple[Box, ..
         return others
     held = held_box(s.target, m.need_candidate(), config)
     return (*others, Box(f"placed/{m.label}", m.need_place_target().T_base_tcp @ held.T_frame_box, held.size))
-
-
-def _shifted(T_base_tcp: Array, offset: Array) -> Array:
-    T = T_base_tcp.copy()
-    T[:3, 3] += offset
-    return T
 
 
 Recipe = Callable[[Memory, Surroundings], Effects]

@@ -16,9 +16,9 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.candidates import GraspCandidate, held_box, obstacle_boxes, propose, target_box
 from openarm_grasp.effects import PlanGrasp, Planned, PlanPlace
+from openarm_grasp.link import Link
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.observation import Detection
-from openarm_grasp.performer import Link
 from openarm_grasp.place import PlaceTarget, other_grasps, place_targets
 
 Array = NDArray[np.float64]

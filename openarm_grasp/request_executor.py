@@ -11,12 +11,13 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.node import BaseNode
 from openarm_grasp.crew import Crew
 from openarm_grasp.effects import GraspOutcome, GraspRequest
-from openarm_grasp.executor import GraspExecutor
 from openarm_grasp.legs import run_task
+from openarm_grasp.link import Link
+from openarm_grasp.link_executor import GraphLink
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.pair import PairOutcome, PairRunner
-from openarm_grasp.performer import Link, Performer
+from openarm_grasp.performer import Performer
 from openarm_grasp.routing import ARMS
 
 T = TypeVar("T")
@@ -33,7 +34,8 @@ class RequestExecutor:
 
     def __init__(self, node: BaseNode[Any], around: Surroundings) -> None:
         self._config = around.config
-        self._robot = GraspExecutor(node, around.config)
+        self._link = GraphLink(node, around.config)
+        self._performer = Performer(self._link, around.config)
         self._crew = Crew(around)
         self.running = False
 
@@ -45,15 +47,15 @@ class RequestExecutor:
     @property
     def now_ns(self) -> int:
         """Robot time; 0 before the first joint state."""
-        return self._robot.now_ns
+        return self._link.now_ns
 
     def cancel(self) -> None:
         """Let what runs end with CANCELLED; arms hold, hands keep what they hold."""
-        self._robot.cancel()
+        self._link.cancel()
 
     def close(self) -> None:
         """Take the clients down."""
-        self._robot.close()
+        self._link.close()
 
     async def one(self, request: GraspRequest, tell: Tell) -> GraspOutcome:
         """Carry out a request; `tell` is called after each transition.
@@ -63,12 +65,12 @@ class RequestExecutor:
         """
 
         async def work() -> GraspOutcome:
-            link, machine = self._robot, self._crew.serving(request)
-            self._crew.check_hands(link.performer, request)
-            full = self._crew.full_hands_beside(machine)
-            free = [arm for arm in ARMS if arm not in full]
-            performer = Performer(link, self._config, arms=free) if full else link.performer
-            return await run_task(machine, performer, link, request, lambda: tell(machine))
+            machine, performer = self._crew.serving(request), self._performer
+            self._crew.check_hands(performer, request)
+            if full := self._crew.full_hands_beside(machine):
+                free = [arm for arm in ARMS if arm not in full]
+                performer = Performer(self._link, self._config, arms=free)
+            return await run_task(machine, performer, request, lambda: tell(machine))
 
         return await self._taken(work, moves=not request.dry_run)
 
@@ -80,9 +82,8 @@ class RequestExecutor:
         """
 
         async def work() -> PairOutcome:
-            link = self._robot
-            links: dict[Side, Link] = {arm: link.beside() for arm in ARMS}
-            return await PairRunner(self.machines, links, (link, link.performer), self._config, tell).run(requests)
+            links: dict[Side, Link] = {arm: self._link.beside() for arm in ARMS}
+            return await PairRunner(self.machines, links, self._performer, tell).run(requests)
 
         return await self._taken(work, moves=not requests[0].dry_run)
 
@@ -93,8 +94,8 @@ class RequestExecutor:
             raise OpenArmError(Code.BUSY, text)
         self.running = True
         try:
-            await self._robot.begin(moves=moves)
+            await self._link.begin(moves=moves)
             return await work()
         finally:
-            self._robot.end()
+            self._link.end()
             self.running = False

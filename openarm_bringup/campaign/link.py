@@ -22,8 +22,8 @@ from openarm_grasp import effects
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import Frames, GoHome, Planned
 from openarm_grasp.evidence import Verdict
+from openarm_grasp.link import check_deadline
 from openarm_grasp.options import NoWayError
-from openarm_grasp.performer import check_deadline
 from openarm_motion import moves
 from openarm_motion.approach import ApproachFailedError, Refused, plan_approach
 from openarm_motion.arm import Arm, Situation
@@ -51,7 +51,7 @@ class _Turn:
 
 
 class DirectLink:
-    """Implements `openarm_grasp.performer.Link`.
+    """Implements `openarm_grasp.link.Link`.
 
     Args:
         robot: The robot.

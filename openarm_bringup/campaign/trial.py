@@ -7,7 +7,6 @@ import math
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +20,18 @@ from openarm_bringup.campaign.robot import SimRobot, SimulatedSenses
 from openarm_bringup.campaign.tasks import MISSES, PLAN_FAILS, Task
 from openarm_bringup.judging.judge import JudgeConfig, Sample, Verdict, at_rest, judge
 from openarm_bringup.judging.provenance import scene_hash
-from openarm_bringup.judging.trial import Trial
+from openarm_bringup.judging.trial import Step, Trial
 from openarm_common.description import Side
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.effects import GraspOutcome, GraspRequest
 from openarm_grasp.legs import run_task
+from openarm_grasp.link import Link
 from openarm_grasp.machine import GraspMachine
 from openarm_grasp.memory import Surroundings
 from openarm_grasp.orders import Ask, Order
 from openarm_grasp.pair import PairRunner
-from openarm_grasp.performer import Link, Performer
+from openarm_grasp.performer import Performer
 from openarm_grasp.routing import ARMS
 from openarm_sim_bridge.faults import checked_fault
 
@@ -41,18 +41,6 @@ _SETTLE_S = 0.5
 _REST_LIMIT_S = 5.0
 #: Directions that a push tries before something stands in its way on every side.
 _DIRECTIONS = 12
-
-
-@dataclass(frozen=True)
-class Step:
-    """A state that the grasp entered."""
-
-    t_ns: int
-    state: str
-    previous: str
-    reason: str
-    attempt: int
-    arm: str
 
 
 class Trials:
@@ -84,8 +72,7 @@ class Trials:
         )
         self.link = DirectLink(self.robot, config)
         self.performer = Performer(self.link, config)
-        shoulders = {arm: _shoulder(self.robot, arm) for arm in ARMS}
-        self.machine = GraspMachine(Surroundings(config, task.scene.table, shoulders))
+        self.machine = GraspMachine(Surroundings.of(config, task.scene.table, self.robot.description))
         self.steps: list[Step] = []
         self._rules = JudgeConfig()
         self._keep = record.Keeper(self.robot, folder) if folder is not None else None
@@ -136,7 +123,7 @@ class Trials:
         request = GraspRequest(ask.label, task.arm, task.place, leave=ask.leave)
         result: GraspOutcome | OpenArmError
         try:
-            result = self.link.run(run_task(self.machine, self.performer, self.link, request, self._tell))
+            result = self.link.run(run_task(self.machine, self.performer, request, self._tell))
         except OpenArmError as error:
             result = error
         wall_s = time.monotonic() - began
@@ -156,7 +143,7 @@ class Trials:
             steps[id(machine)].append(self.steps[-1])
 
         links: dict[Side, Link] = {arm: self.link.beside(self._config.limits.beside_wait) for arm in ARMS}
-        pair = PairRunner((self.machine, second), links, (self.link, self.performer), self._config, tell)
+        pair = PairRunner((self.machine, second), links, self.performer, tell)
         robot.pass_time(0.1)
         outcomes: Sequence[GraspOutcome]
         try:
@@ -197,7 +184,13 @@ class Trials:
     def _tell(self, machine: GraspMachine | None = None) -> None:
         machine = machine or self.machine
         step = Step(
-            self.robot.t_ns, machine.state.value, machine.previous.value, machine.reason, machine.attempt, machine.arm
+            self.robot.t_ns,
+            machine.state.value,
+            machine.previous.value,
+            machine.reason,
+            machine.attempt,
+            machine.label,
+            machine.arm,
         )
         self.steps.append(step)
         if self._keep is not None:
@@ -272,16 +265,9 @@ def row_of(task: Task, trials: list[Trial], wall_s: float) -> dict[str, Any]:
     )
     refused = expected and not placed
     shown = bad or grasps[-1]
-    return {
-        "set": task.set_name,
-        "seed": task.seed,
-        "kind": task.kind,
-        "scene_hash": scene_hash(task.scene),
-        "objects": len(task.scene.objects),
-        "targets": len(trials),
+    return _head(task, len(trials)) | {
         "outcome": "false success" if false else "placed" if placed else "refused" if refused else "failed",
         "as_expected": expected,
-        "expected": ["placed" if code is Code.OK else code.value for code in task.codes],
         "placed": placed,
         "false_success": false,
         "code": shown["code"],
@@ -305,16 +291,9 @@ def add_gap(row: dict[str, Any], least: float, sim_s: float) -> None:
 
 def crashed_row(task: Task, error: Exception) -> dict[str, Any]:
     """The row of a task that a fault of this program ended."""
-    return {
-        "set": task.set_name,
-        "seed": task.seed,
-        "kind": task.kind,
-        "scene_hash": scene_hash(task.scene),
-        "objects": len(task.scene.objects),
-        "targets": len(task.labels),
+    return _head(task, len(task.labels)) | {
         "outcome": "failed",
         "as_expected": False,
-        "expected": ["placed" if code is Code.OK else code.value for code in task.codes],
         "placed": False,
         "false_success": False,
         "code": Code.INTERNAL.value,
@@ -329,8 +308,14 @@ def crashed_row(task: Task, error: Exception) -> dict[str, Any]:
     }
 
 
-def _shoulder(robot: SimRobot, arm: str) -> tuple[float, float]:
-    description = robot.description
-    first = description.joint(description.arm_joints("left" if arm == "left" else "right")[0])
-    T = description.link_pose(first.parent, {}) @ first.T_parent_joint
-    return float(T[0, 3]), float(T[1, 3])
+def _head(task: Task, targets: int) -> dict[str, Any]:
+    """What a row says of the task, whatever came of it."""
+    return {
+        "set": task.set_name,
+        "seed": task.seed,
+        "kind": task.kind,
+        "scene_hash": scene_hash(task.scene),
+        "objects": len(task.scene.objects),
+        "targets": targets,
+        "expected": ["placed" if code is Code.OK else code.value for code in task.codes],
+    }

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from openarm_bringup.demo.demo import DemoResult
-    from openarm_bringup.judging.observer_client import Step
-    from openarm_bringup.judging.trial import Trial
+    from openarm_bringup.judging.trial import Step, Trial
     from openarm_bringup.supervision.supervisor import Event
 
 

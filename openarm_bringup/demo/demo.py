@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from openarm_bringup.demo import mounts
 from openarm_bringup.judging import provenance
-from openarm_bringup.judging.trial import Ask, Trial, choose_target, run_trial
+from openarm_bringup.judging.trial import Ask, Step, Trial, choose_target, run_trial
 from openarm_bringup.supervision import environment, runs
 from openarm_bringup.supervision.graph import Graph, load_graph
 from openarm_bringup.supervision.session import in_thread, running_graph
@@ -22,7 +22,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import load_scene
 
 if TYPE_CHECKING:
-    from openarm_bringup.judging.observer_client import Observer, Step
+    from openarm_bringup.judging.observer_client import Observer
     from openarm_bringup.supervision.supervisor import Event
     from openarm_grasp.client import GraspClient
 

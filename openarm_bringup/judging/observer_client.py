@@ -27,6 +27,7 @@ from sensor_msgs.msg import Image, JointState
 
 from openarm_bringup.judging.film import Picture
 from openarm_bringup.judging.judge import Sample
+from openarm_bringup.judging.trial import Step
 from openarm_common.convert import image_to_array, stamp_to_ns
 from openarm_common.errors import Code, OpenArmError
 
@@ -36,19 +37,6 @@ Frame = tuple[int, Picture]
 _RELIABLE = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
 _LATCHED = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _NEWEST = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-
-@dataclass(frozen=True)
-class Step:
-    """A state that the grasp has entered, at simulated time `t_ns`."""
-
-    t_ns: int
-    state: str
-    previous: str
-    reason: str
-    attempt: int
-    label: str
-    arm: str
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,25 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene import Scene, SceneObject
 
 if TYPE_CHECKING:
-    from openarm_bringup.judging.observer_client import Observer, Step
+    from openarm_bringup.judging.observer_client import Observer
     from openarm_grasp.client import GraspClient, GraspResult
 
 #: How near an object must be to its place in the scene file to be that scene's, m.
 _SAME_PLACE = 0.02
 SETTLE_TIMEOUT_S = 20.0
+
+
+@dataclass(frozen=True)
+class Step:
+    """A state that a grasp has entered, at simulated time `t_ns`."""
+
+    t_ns: int
+    state: str
+    previous: str
+    reason: str
+    attempt: int
+    label: str
+    arm: str
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.config import DetectConfig
 from openarm_grasp.observation import Detection, Frame, average, find, in_base, on_table, sticks_out
 
 
@@ -24,7 +25,7 @@ def frames(*detections: tuple[Detection, ...]) -> list[Frame]:
 
 
 def look(seq, label="red", **kwargs):
-    return find(seq, label, match_radius=0.03, agree_within=0.003, **kwargs)
+    return find(seq, label, DetectConfig(match_radius=0.03, agree_within=0.003), **kwargs)
 
 
 def test_agreeing_frames_are_averaged_and_others_kept():

@@ -96,7 +96,7 @@ def test_the_planner_says_what_became_of_each_and_how_near_to_a_limit() -> None:
     trials = Trials(Task("nominal", 1, scene, ()), SimulatedSenses(depth_noise=False), config)
     trials.robot.pass_time(0.3)
     request = fx.GraspRequest("red", arm="right", dry_run=True)
-    work = run_request(trials.machine, trials.performer, trials.link, request, lambda: None)
+    work = run_request(trials.machine, trials.performer, request, lambda: None)
     outcome = trials.link.run(work)
     assert outcome.success, outcome.message
     (chosen,) = (o for o in outcome.options if o.code is Code.OK)

@@ -33,7 +33,7 @@ class Bench:
     def ask(self, label: str = "", **kwargs) -> GraspOutcome:
         t = self.trials
         t.link.cancelled = ""
-        work = run_request(t.machine, t.performer, t.link, GraspRequest(label, **kwargs), t._tell)
+        work = run_request(t.machine, t.performer, GraspRequest(label, **kwargs), t._tell)
         return t.link.run(work)
 
     def position(self, name: str) -> np.ndarray:

@@ -28,7 +28,7 @@ def trials(*objects: SceneObject) -> Trials:
 
 
 def ask(run: Trials, label: str, **kwargs) -> GraspOutcome:
-    return run.link.run(run_request(run.machine, run.performer, run.link, GraspRequest(label, **kwargs), run._tell))
+    return run.link.run(run_request(run.machine, run.performer, GraspRequest(label, **kwargs), run._tell))
 
 
 @dataclass

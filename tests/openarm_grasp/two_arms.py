@@ -13,17 +13,18 @@ from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp import effects as fx
 from openarm_grasp.legs import run_task
+from openarm_grasp.performer import Performer
 from openarm_grasp.rehearsal import standing_at
 
 #: How far either arm reaches over the middle, m.
 OVER = 0.10
 
 
-class TwoArms:
+class TwoArms(Performer):
     """A performer and a link to a scripted world in which each arm reaches its own side and a strip of the other's."""
 
     def __init__(self, world: Any) -> None:
-        self.world = world
+        self.world, self.link = world, self
         self.deadline_ns = 0
         self.description = RobotDescription.load()
         self.notes: list[str] = []
@@ -39,7 +40,7 @@ class TwoArms:
     def ask(self, label: str = "red", **kwargs: Any) -> fx.GraspOutcome:
         request = fx.GraspRequest(label, **kwargs)
         machine = self.world.machine
-        return _run(run_task(machine, self, self, request, lambda: self.notes.append(machine.reason)))  # type: ignore[arg-type]
+        return _run(run_task(machine, self, request, lambda: self.notes.append(machine.reason)))
 
     # --- performer
     def check_hands(self, machine: object, request: object) -> None:
