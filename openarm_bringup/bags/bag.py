@@ -23,7 +23,7 @@ from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from openarm_bringup.bags.mcap import mend
+from openarm_bringup.bags.mcap import is_closed, mend
 from openarm_common.errors import Code, OpenArmError
 
 _PRIMITIVES = {"float": "float32", "double": "float64", "boolean": "bool", "octet": "byte"}
@@ -260,6 +260,12 @@ def open_bag(path: Path) -> Iterator[Bag]:
                     f"{', '.join(p.name for p in sorted(path.iterdir())[:5]) or 'nothing'}",
                 )
             source = files[0]
+        elif cut := [file for file in files if not is_closed(file)]:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"{cut[0]} was cut short after it had been recorded; copy the bag again, or open this file by itself: "
+                "all that is whole in it is kept",
+            )
     if source.is_file() and source.suffix == ".mcap":
         mended = mend(source)
     elif source.is_file():

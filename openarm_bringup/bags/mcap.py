@@ -1,23 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
 """The end of an MCAP file that was cut short is written anew (https://mcap.dev/spec).
 
-A file is a magic, records (one byte of kind, eight of length, content), a footer record and the magic again. Without
-the end no reader opens it, though all records before the cut are whole.
+A file is a magic, records (one byte of kind, eight of length, content), a summary, a footer record and the magic again.
+Without the end no reader opens it, and without the summary's index of chunks none gives the messages of several topics
+in the order of their stamps, though all records before the cut are whole.
 """
 
 from __future__ import annotations
 
 import os
 import struct
+from io import BytesIO
 from pathlib import Path
+from typing import BinaryIO
+
+from rosbags.rosbag2.storage_mcap import decompress
 
 from openarm_common.errors import Code, OpenArmError
 
 MAGIC = b"\x89MCAP0\r\n"
-_HEADER, _FOOTER, _CHUNK, _DATA_END = 0x01, 0x02, 0x06, 0x0F
+_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = range(1, 8)
+_CHUNK_INDEX, _STATISTICS, _DATA_END = 0x08, 0x0B, 0x0F
 #: Records of the data section; what follows them is a summary, which would be incomplete.
-_DATA = (_HEADER, 0x03, 0x04, 0x05, _CHUNK, 0x07, 0x09, 0x0C)
+_DATA = (_HEADER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, 0x09, 0x0C)
 _HEAD = struct.Struct("<BQ")
+#: Of a chunk: first and last stamp, size unpacked, its CRC, length of the compression's name.
+_OF_CHUNK = struct.Struct("<QQQII")
+#: Of a message: channel, number, stamp.
+_OF_MESSAGE = struct.Struct("<HIQ")
+
+
+def is_closed(path: Path) -> bool:
+    """Whether a file has its end."""
+    with path.open("rb") as file:
+        file.seek(0, os.SEEK_END)
+        if file.tell() < 2 * len(MAGIC):
+            return False
+        file.seek(-len(MAGIC), os.SEEK_END)
+        return file.read() == MAGIC
 
 
 def mend(path: Path) -> int | None:
@@ -27,35 +47,101 @@ def mend(path: Path) -> int | None:
         Bytes after the last whole record, which were given up; None when there was nothing to mend.
 
     Raises:
-        OpenArmError: INVALID_ARGUMENT, when it is no MCAP file, or nothing in it is whole.
+        OpenArmError: INVALID_ARGUMENT, when it is no MCAP file, or nothing in it is whole, or it can't be written.
     """
     size = path.stat().st_size
-    with path.open("r+b") as file:
+    with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             what = "is empty" if size == 0 else "is not an MCAP file (wrong magic at its start)"
             raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} {what}")
-        file.seek(-len(MAGIC), os.SEEK_END)
-        if size >= 2 * len(MAGIC) and file.read() == MAGIC:
-            return None
-        end, chunks = _whole(file, size)
-        if chunks == 0:
+    if is_closed(path):
+        return None
+    if not os.access(path, os.W_OK):
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, f"{path} was cut short, and can't be written to give it an end; copy it first"
+        )
+    with path.open("r+b") as file:
+        chunks, end = _chunks(file, size)
+        if not chunks:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} was cut short before anything whole was written")
-        file.truncate(end)
-        file.seek(end)
-        file.write(_HEAD.pack(_DATA_END, 4) + bytes(4))
-        file.write(_HEAD.pack(_FOOTER, 20) + bytes(20) + MAGIC)  # no summary: readers scan the data
+        # Whether all indexes of the last chunk were written can only be told from its content: they are made anew.
+        start, length = chunks[-1]
+        file.seek(start + length)
+        file.write(b"".join(_record(_INDEX, index) for index in _indexes(file, start)))
+        file.truncate()
+        indexed = [_chunk_index(file, *chunk, until) for chunk, until in _until(chunks, file.tell())]
+        file.seek(0, os.SEEK_END)
+        file.write(_record(_DATA_END, bytes(4)))
+        summary = file.tell()
+        # Counts of nothing: readers that find no schema here count for themselves while they look for them.
+        file.write(b"".join(_record(_CHUNK_INDEX, index) for index in indexed))
+        file.write(_record(_STATISTICS, bytes(46)))
+        file.write(_record(_FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)
     return size - end
 
 
-def _whole(file: object, size: int) -> tuple[int, int]:
-    """Where the last whole record of the data ends, and how many chunks there are before it."""
-    read, seek = file.read, file.seek  # type: ignore[attr-defined]
-    at, chunks = len(MAGIC), 0
+def _record(kind: int, content: bytes) -> bytes:
+    return _HEAD.pack(kind, len(content)) + content
+
+
+def _chunks(file: BinaryIO, size: int) -> tuple[list[tuple[int, int]], int]:
+    """Start and length of each whole chunk, and where the last whole record of the data ends."""
+    at, chunks = len(MAGIC), list[tuple[int, int]]()
     while at + _HEAD.size <= size:
-        seek(at)
-        kind, length = _HEAD.unpack(read(_HEAD.size))
+        file.seek(at)
+        kind, length = _HEAD.unpack(file.read(_HEAD.size))
         if kind not in _DATA or at + _HEAD.size + length > size:
             break
-        chunks += kind == _CHUNK
+        if kind == _CHUNK:
+            chunks.append((at, _HEAD.size + length))
         at += _HEAD.size + length
-    return at, chunks
+    return chunks, at
+
+
+def _until(chunks: list[tuple[int, int]], end: int) -> list[tuple[tuple[int, int], int]]:
+    """Each chunk, and where the next one begins."""
+    return list(zip(chunks, [*(start for start, _ in chunks[1:]), end], strict=True))
+
+
+def _indexes(file: BinaryIO, start: int) -> list[bytes]:
+    """Contents of the index records of a chunk: of each channel, stamp and place of its messages."""
+    at = file.tell()
+    file.seek(start + _HEAD.size)
+    _, _, unpacked, crc, name = _OF_CHUNK.unpack(file.read(_OF_CHUNK.size))
+    compression = file.read(name).decode()
+    (packed,) = struct.unpack("<Q", file.read(8))
+    content = BytesIO(decompress(file.read(packed), compression, unpacked, crc))
+    found: dict[int, bytes] = {}
+    while len(head := content.read(_HEAD.size)) == _HEAD.size:
+        place = content.tell() - _HEAD.size
+        kind, length = _HEAD.unpack(head)
+        if kind == _MESSAGE:
+            channel, _, stamp = _OF_MESSAGE.unpack(content.read(_OF_MESSAGE.size))
+            found[channel] = found.get(channel, b"") + struct.pack("<QQ", stamp, place)
+        content.seek(place + _HEAD.size + length)
+    file.seek(at)
+    return [struct.pack("<HI", channel, len(entries)) + entries for channel, entries in found.items()]
+
+
+def _chunk_index(file: BinaryIO, start: int, length: int, until: int) -> bytes:
+    """Content of the summary's record of a chunk, whose own indexes lie between it and `until`."""
+    file.seek(start + _HEAD.size)
+    first, last, unpacked, _, name = _OF_CHUNK.unpack(file.read(_OF_CHUNK.size))
+    compression = file.read(name)
+    packed = file.read(8)
+    offsets, at = b"", start + length
+    while at < until:
+        file.seek(at)
+        kind, size = _HEAD.unpack(file.read(_HEAD.size))
+        if kind != _INDEX:
+            break
+        offsets += file.read(2) + struct.pack("<Q", at)
+        at += _HEAD.size + size
+    return (
+        struct.pack("<QQQQI", first, last, start, length, len(offsets))
+        + offsets
+        + struct.pack("<QI", at - start - length, name)
+        + compression
+        + packed
+        + struct.pack("<Q", unpacked)
+    )

@@ -66,6 +66,41 @@ def test_a_recording_that_was_cut_short_keeps_what_is_whole(tmp_path: Path, lost
         assert bag.mended is None, "mended once and for all"
 
 
+@pytest.mark.parametrize(("compress", "share"), [(True, 0.9), (False, 0.5), (False, 0.95)])
+def test_a_cut_recording_of_several_topics_comes_in_the_order_of_stamps(
+    tmp_path: Path, compress: bool, share: float
+) -> None:
+    """A recorder takes one topic after the other: its file is not in that order, and has no index where it was cut."""
+    with BagWriter(tmp_path / "bag", {}, compress=compress) as bag:
+        for topic in ("/a", "/b"):
+            bag.add_topic(topic, "std_msgs/msg/String", from_profile(QOS_COMMAND))
+        for i in range(300):
+            for topic, t_ns in (("/b", 2 * i + 1), ("/a", 2 * i)):
+                bag.write(topic, t_ns, serialize_message(String(data=f"{t_ns:010}" * 1000)))
+    (tmp_path / "bag" / "metadata.yaml").unlink()
+    file = tmp_path / "bag" / "bag.mcap"
+    with file.open("r+b") as data:
+        data.truncate(int(file.stat().st_size * share))
+    for mended in (True, False):
+        with open_bag(tmp_path / "bag") as bag:
+            assert (bag.mended is not None) == mended
+            stamps = [record.t_ns for record in bag.records()]
+            assert stamps == sorted(stamps)
+            assert len(stamps) > 400 * share
+            assert set(bag.topics) == {"/a", "/b"}
+
+
+def test_a_bag_that_was_cut_short_later_is_told_from_an_unfinished_recording(tmp_path: Path) -> None:
+    file = write(tmp_path / "bag", 400, size=10_000) / "bag.mcap"
+    with file.open("r+b") as data:
+        data.truncate(file.stat().st_size // 2)
+    with pytest.raises(OpenArmError, match="copy the bag again, or open this file"), open_bag(tmp_path / "bag"):
+        pass
+    with open_bag(file) as bag:
+        assert bag.mended is not None
+        assert 100 < sum(bag.counts.values()) < 300
+
+
 @pytest.mark.parametrize(
     ("content", "said"),
     [(b"", "is empty"), (b"\x89MCAP0\r\n" + bytes(3), "before anything whole"), (b"nonsense" * 9, "not an MCAP file")],
