@@ -155,7 +155,7 @@ class _Run:
             self._tell("looking", "for the most telling pose")
             state = await self._node.photographer.state()
             for proposal in await self._node.in_thread(self._search.propose, self._node.samples, state, _AT_ONCE):
-                self._tell("moving", f"pose {tried + 1} that was looked for" if tried else "")
+                self._tell("moving", f"try {tried + 1}: the arm did not get to the one before" if tried else "")
                 tried += 1
                 try:
                     await self._move(proposal.q, self._config.velocity_scale, self._stopped)

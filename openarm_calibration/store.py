@@ -184,7 +184,7 @@ class CalibrationStore:
         if len(good) < 2:
             raise OpenArmError(
                 Code.CONFIG_INVALID,
-                f"{camera!r} has {len(good)} stored calibrations; going back needs one before the present",
+                f"going back needs a calibration of {camera!r} before the present one; stored: {len(good)}",
             )
         path, before = good[-2]
         _write(self.path(camera), path.read_text(encoding="utf-8"))

@@ -112,5 +112,5 @@ def check_deadline(now_ns: int, deadline_ns: int) -> None:
     """Raise CANCELLED when the time of a request is over; for links."""
     if 0 < deadline_ns < now_ns:
         raise OpenArmError(
-            Code.CANCELLED, "the time for the request is over; the arm holds and the hand keeps its object"
+            Code.CANCELLED, "the time for the request is over; the arm holds, and the hand keeps what it has"
         )

@@ -92,12 +92,14 @@ class InverseKinematics:
         found = self._closed.classify(values)
         return Solution(values, found.swivel, found.branch)
 
-    def why_not(self, pose: Array, margin: float = 0.0, *, position_only: bool = False) -> str:
-        """Sentences about why a pose has no configuration: what binds, and where the nearest reachable pose is."""
+    def why_not(
+        self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None, *, position_only: bool = False
+    ) -> str:
+        """Sentences about why a pose has no configuration: what binds, and what `nearest` finds with that guess."""
         reasons: list[str] = []
         if self._closed is not None and not position_only:
             reasons.append(self._binding(self._closed.sweep(pose, self._swivels, margin)[1], self._closed, margin))
-        best = self.nearest(pose, position_only=position_only, margin=margin)
+        best = self.nearest(pose, near, position_only=position_only, margin=margin)
         p = ", ".join(f"{x:.3f}" for x in self.kinematics.fk(best.q)[:3, 3])
         turn = "" if position_only else f" and {math.degrees(best.orientation_error):.0f}°"
         reasons.append(f"the nearest reachable pose is {best.position_error * 1e3:.0f} mm{turn} away, at ({p}) m")

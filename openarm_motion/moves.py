@@ -119,11 +119,13 @@ def to_pose_on_line(arm: Arm, now: Situation, pose: Array, around: Around) -> Tr
     raise PlanFailedError(worst.code, f"{arm.name} arm: {worst.message}", "line", worst.contact)
 
 
-def unreachable(arm: Arm, pose: Array, *, free_orientation: bool, margin: float | None = None) -> OpenArmError:
-    """The error for a pose that the arm can't reach: the reason, and the nearest pose that it can."""
+def unreachable(
+    arm: Arm, pose: Array, *, free_orientation: bool, margin: float | None = None, near: Array | None = None
+) -> OpenArmError:
+    """The error for a pose that the arm can't reach: the reason, and the nearest pose to it, looked for from `near`."""
     x, y, z = pose[:3, 3]
     kept = arm.config.planning.joint_margin if margin is None else margin
-    why = arm.inverse.why_not(pose, kept, position_only=free_orientation)
+    why = arm.inverse.why_not(pose, kept, near, position_only=free_orientation)
     hint = "" if free_orientation else "; or leave the orientation free"
     text = f"{arm.name} arm can't reach ({x:.3f}, {y:.3f}, {z:.3f}) m: {why}{hint}"
     return PlanFailedError(Code.UNREACHABLE, text, "goal")

@@ -240,7 +240,8 @@ class MotionNode(BaseNode[MotionConfig]):
             response.position_error, response.orientation_error = best.position_error, best.orientation_error
             response.nearest = matrix_to_pose(arm.kinematics.fk(best.q))
             if not best.success:
-                raise moves.unreachable(arm, pose, free_orientation=request.free_orientation, margin=0.0)
+                free = request.free_orientation
+                raise moves.unreachable(arm, pose, free_orientation=free, margin=0.0, near=now.start)
             response.success, response.code, response.message = True, Code.OK.value, "solved"
         except OpenArmError as error:
             response.code, response.message = error.code.value, error.message

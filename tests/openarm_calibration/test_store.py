@@ -76,7 +76,7 @@ def test_rollback_goes_back_one_and_says_when_there_is_none(tmp_path: Path) -> N
     assert store.rollback("wrist").position[0] == 0.2
     assert store.load("wrist").position[0] == 0.2
     assert store.rollback("wrist").position[0] == 0.1
-    with pytest.raises(OpenArmError, match="has 1 stored calibrations"):
+    with pytest.raises(OpenArmError, match="before the present one; stored: 1"):
         store.rollback("wrist")
 
 

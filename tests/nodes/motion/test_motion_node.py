@@ -39,6 +39,9 @@ def test_a66_compute_ik_in_the_table_frame(bench) -> None:
     assert "left arm can't reach (0.400, 0.200, 0.700) m" in answer.message
     assert 0.0 < answer.position_error < 0.1
     assert abs(answer.nearest.position.x - 0.4) < 0.1
+    nearest = ", ".join(f"{getattr(answer.nearest.position, axis):.3f}" for axis in "xyz")
+    assert f"{answer.position_error * 1e3:.0f} mm" in answer.message
+    assert f"away, at ({nearest}) m" in answer.message
 
 
 def test_compute_ik_answers_what_is_wrong(bench) -> None:
