@@ -53,7 +53,7 @@ def test_p28_solve_check_save_report_list_rollback(capsys, session_file: Path, t
     assert run(capsys, "rollback", "wrist")[0] == 0
     code, _, err = run(capsys, "rollback", "wrist")
     assert code == 1
-    assert "going back needs one before" in err
+    assert "going back needs a calibration of" in err
     page = tmp_path / "report.html"
     assert run(capsys, "report", str(session_file), str(page))[0] == 0
     text = page.read_text()
@@ -133,7 +133,7 @@ def test_a45_a_stored_file_that_would_run_something_is_told_and_not_run(capsys, 
         (["report", "SESSION", "/proc/nowhere/page.html"], 1, "can't write /proc/nowhere/page.html"),
         (["report", "SESSION", "page.doc"], 2, "written as .html"),
         (["rollback", "../wrist"], 2, "camera name"),
-        (["rollback", "wrist"], 1, "has 0 stored"),
+        (["rollback", "wrist"], 1, "stored: 0"),
         (["frobnicate"], 2, "frobnicate"),
         (["together", "SESSION"], 2, "1 sessions given"),
         (["together", "SESSION", "SESSION"], 2, "one session for each camera"),
