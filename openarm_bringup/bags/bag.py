@@ -18,12 +18,11 @@ from typing import Any
 
 from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
-from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from openarm_bringup.bags.mcap import is_closed, mend
+from openarm_bringup.bags.mcap import DAMAGE, is_closed, mend
 from openarm_common.errors import Code, OpenArmError
 
 _PRIMITIVES = {"float": "float32", "double": "float64", "boolean": "bool", "octet": "byte"}
@@ -233,7 +232,7 @@ class Bag:
         try:
             for connection, t_ns, data in self._reader.messages(chosen, start=start):
                 yield Record(connection.topic, connection.msgtype, t_ns, bytes(data))
-        except (ReaderError, EOFError, ValueError) as error:
+        except DAMAGE as error:
             raise _damaged(self.path, error) from error
 
 
@@ -273,7 +272,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     reader = Reader(source)
     try:
         reader.open()
-    except (ReaderError, OSError, EOFError, ValueError, TypeError) as error:
+    except (*DAMAGE, OSError) as error:
         raise _damaged(path, error) from error
     try:
         yield Bag(path, reader, mended)

@@ -14,10 +14,13 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-from rosbags.rosbag2.storage_mcap import decompress
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.storage_mcap import decompress, zstd
 
 from openarm_common.errors import Code, OpenArmError
 
+#: What is raised where the content of a file is not what its format says.
+DAMAGE = (ReaderError, zstd.ZstdError, RuntimeError, EOFError, ValueError, TypeError)
 MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = range(1, 8)
 _CHUNK_INDEX, _STATISTICS, _DATA_END = 0x08, 0x0B, 0x0F
@@ -61,13 +64,16 @@ def mend(path: Path) -> int | None:
             Code.INVALID_ARGUMENT, f"{path} was cut short, and can't be written to give it an end; copy it first"
         )
     with path.open("r+b") as file:
-        chunks, end = _chunks(file, size)
-        if not chunks:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} was cut short before anything whole was written")
+        chunks, end = whole_chunks(file, size)
         # Whether all indexes of the last chunk were written can only be told from its content: they are made anew.
-        start, length = chunks[-1]
-        file.seek(start + length)
-        file.write(b"".join(_record(_INDEX, index) for index in _indexes(file, start)))
+        # After a loss of power its content may be missing, whatever its length: then it is given up.
+        indexes: list[bytes] | None = None
+        while chunks and (indexes := _indexes(file, chunks[-1][0])) is None:
+            end, _ = chunks.pop()
+        if not indexes:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} was cut short before anything whole was written")
+        file.seek(sum(chunks[-1]))
+        file.write(b"".join(_record(_INDEX, index) for index in indexes))
         file.truncate()
         indexed = [_chunk_index(file, *chunk, until) for chunk, until in _until(chunks, file.tell())]
         file.seek(0, os.SEEK_END)
@@ -84,7 +90,7 @@ def _record(kind: int, content: bytes) -> bytes:
     return _HEAD.pack(kind, len(content)) + content
 
 
-def _chunks(file: BinaryIO, size: int) -> tuple[list[tuple[int, int]], int]:
+def whole_chunks(file: BinaryIO, size: int) -> tuple[list[tuple[int, int]], int]:
     """Start and length of each whole chunk, and where the last whole record of the data ends."""
     at, chunks = len(MAGIC), list[tuple[int, int]]()
     while at + _HEAD.size <= size:
@@ -103,23 +109,26 @@ def _until(chunks: list[tuple[int, int]], end: int) -> list[tuple[tuple[int, int
     return list(zip(chunks, [*(start for start, _ in chunks[1:]), end], strict=True))
 
 
-def _indexes(file: BinaryIO, start: int) -> list[bytes]:
-    """Contents of the index records of a chunk: of each channel, stamp and place of its messages."""
-    at = file.tell()
+def _indexes(file: BinaryIO, start: int) -> list[bytes] | None:
+    """Contents of the index records of a chunk: of each channel, stamp and place of its messages; None if damaged."""
     file.seek(start + _HEAD.size)
     _, _, unpacked, crc, name = _OF_CHUNK.unpack(file.read(_OF_CHUNK.size))
     compression = file.read(name).decode()
     (packed,) = struct.unpack("<Q", file.read(8))
-    content = BytesIO(decompress(file.read(packed), compression, unpacked, crc))
+    try:
+        content = BytesIO(decompress(file.read(packed), compression, unpacked, crc))
+    except DAMAGE:
+        return None
     found: dict[int, bytes] = {}
     while len(head := content.read(_HEAD.size)) == _HEAD.size:
         place = content.tell() - _HEAD.size
         kind, length = _HEAD.unpack(head)
+        if kind not in (_SCHEMA, _CHANNEL, _MESSAGE):
+            return None
         if kind == _MESSAGE:
             channel, _, stamp = _OF_MESSAGE.unpack(content.read(_OF_MESSAGE.size))
             found[channel] = found.get(channel, b"") + struct.pack("<QQ", stamp, place)
         content.seek(place + _HEAD.size + length)
-    file.seek(at)
     return [struct.pack("<HI", channel, len(entries)) + entries for channel, entries in found.items()]
 
 

@@ -10,6 +10,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import String
 
 from openarm_bringup.bags.bag import BagWriter, definition, message_class, open_bag
+from openarm_bringup.bags.mcap import whole_chunks
 from openarm_bringup.bags.player_client import to_profile
 from openarm_bringup.bags.recorder_client import from_profile
 from openarm_common.errors import Code, OpenArmError
@@ -88,6 +89,26 @@ def test_a_cut_recording_of_several_topics_comes_in_the_order_of_stamps(
             assert stamps == sorted(stamps)
             assert len(stamps) > 400 * share
             assert set(bag.topics) == {"/a", "/b"}
+
+
+@pytest.mark.parametrize("compress", [True, False])
+def test_a_last_chunk_whose_content_never_reached_the_disk_is_given_up(tmp_path: Path, compress: bool) -> None:
+    """As a loss of power leaves it: of its full length, and empty."""
+    path = tmp_path / "bag"
+    with BagWriter(path, {}, compress=compress) as writer:
+        writer.add_topic("/a", "std_msgs/msg/String", from_profile(QOS_COMMAND))
+        for i in range(400):  # 4 MB: four chunks
+            writer.write("/a", i, serialize_message(String(data=f"{i:010}" * 1000)))
+    (path / "metadata.yaml").unlink()
+    file = path / "bag.mcap"
+    with file.open("r+b") as data:
+        (*_, (start, length)), _ = whole_chunks(data, file.stat().st_size)
+        data.seek(start + 100)
+        data.write(bytes(length - 100))
+        data.truncate()
+    with open_bag(path) as bag:
+        assert bag.mended is not None
+        assert len(list(bag.records())) > 200
 
 
 def test_a_bag_that_was_cut_short_later_is_told_from_an_unfinished_recording(tmp_path: Path) -> None:
