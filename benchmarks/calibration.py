@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
-from openarm_calibration import synthetic
-from openarm_calibration.closed_form import METHODS, closed_form
-from openarm_calibration.problem import Setup, difference
-from openarm_calibration.refine import Noise
-from openarm_calibration.solve import SolveConfig, solve
+from openarm_calibration.handeye.closed_form import METHODS, closed_form
+from openarm_calibration.handeye.problem import Setup, difference
+from openarm_calibration.handeye.refine import Noise
+from openarm_calibration.handeye.solve import SolveConfig, solve
+from openarm_calibration.synthetic import synthetic
 from openarm_common.errors import Code, OpenArmError
 
 ROBOTS = {"exact": (0.0, 0.0), "0.2mm/0.02deg": (2e-4, math.radians(0.02))}

@@ -23,16 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.campaign.mounts import with_mounts
-from openarm_bringup.campaign.robot import SimulatedSenses
-from openarm_bringup.campaign.tasks import Task
-from openarm_bringup.campaign.trial import Trials
-from openarm_bringup.demo.demo import parse_seeds
-from openarm_calibration.refine import mount_error
-from openarm_calibration.store import CalibrationStore
-from openarm_common.cameras import load_cameras, true_mount
+from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.store.store import CalibrationStore
+from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.resources import config_dir
-from openarm_common.scene import load_scene
+from openarm_common.scene.scene import load_scene
+from openarm_evaluation.campaign.mounts import with_mounts
+from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.tasks import Task
+from openarm_evaluation.campaign.trial import Trials
+from openarm_evaluation.demo.demo import parse_seeds
 from openarm_grasp.config import GraspConfig
 
 #: The cameras that grasps look through; the first tells where objects are.

@@ -26,13 +26,13 @@ from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
 from openarm_bringup.calibration.run import CalibrationOptions, as_row, run_calibration
-from openarm_bringup.demo.demo import parse_seeds
-from openarm_calibration.offline import calibrate
-from openarm_calibration.refine import mount_error
-from openarm_calibration.session_file import load_session
-from openarm_common.cameras import load_cameras, true_mount
-from openarm_common.description import RobotDescription
+from openarm_calibration.handeye.offline import calibrate
+from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.sampling.session_file import load_session
+from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_evaluation.demo.demo import parse_seeds
 
 Array = NDArray[np.float64]
 #: Predicted errors that are never reached, so that the whole budget of poses is used: m, rad.

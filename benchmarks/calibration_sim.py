@@ -24,11 +24,11 @@ os.environ.setdefault("LP_NUM_THREADS", "1")
 import numpy as np
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.campaign.mounts import Bench
-from openarm_calibration.offline import calibrate
-from openarm_calibration.problem import difference
-from openarm_calibration.refine import mount_error
-from openarm_common.cameras import T_LINK_OPTICAL, load_cameras, true_mount
+from openarm_calibration.handeye.offline import calibrate
+from openarm_calibration.handeye.problem import difference
+from openarm_calibration.handeye.refine import mount_error
+from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras, true_mount
+from openarm_evaluation.campaign.mounts import Bench
 
 CAMERAS = ("wrist", "overhead")
 COUNTS = (15, 10)

@@ -27,12 +27,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.detector.data import DataConfig, make_data
-from openarm_perception.boxes import Candidates, Letterbox, blob, decode
-from openarm_perception.network import NetworkConfig, NetworkDetector
-from openarm_perception.training.report import LEAST, evaluate
-from openarm_perception.training.samples import Samples
-from openarm_perception.training.scores import Scores, score
+from openarm_evaluation.detector.data import DataConfig, make_data
+from openarm_evaluation.detector.training.report import LEAST, evaluate
+from openarm_evaluation.detector.training.samples import Samples
+from openarm_evaluation.detector.training.scores import Scores, score
+from openarm_perception.detection.boxes import Candidates, Letterbox, blob, decode
+from openarm_perception.detection.network import NetworkConfig, NetworkDetector
 
 MODELS = {"320": "shapes_320x256", "640": "shapes_640x480"}
 

@@ -25,19 +25,19 @@ import yaml
 from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.detector.looks import surface
-from openarm_bringup.judging.observer_client import Observer
 from openarm_bringup.supervision import environment
 from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import running_graph
 from openarm_common import se3
-from openarm_common.cameras import load_cameras
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.domain import reserve_domain
-from openarm_common.scene import SHAPES, Scene, random_scene
-from openarm_perception.network import NetworkConfig, NetworkDetector
-from openarm_perception.training.report import evaluate
-from openarm_perception.training.samples import Samples
-from openarm_perception.yolo_text import write_classes, write_labels
+from openarm_common.scene.scene import SHAPES, Scene, random_scene
+from openarm_evaluation.detector.looks import surface
+from openarm_evaluation.detector.training.report import evaluate
+from openarm_evaluation.detector.training.samples import Samples
+from openarm_evaluation.detector.yolo_text import write_classes, write_labels
+from openarm_evaluation.judging.ros.observer import Observer
+from openarm_perception.detection.network import NetworkConfig, NetworkDetector
 
 CAMERA, TOPIC = load_cameras()["overhead"], "/overhead/color/image_raw"
 

@@ -33,7 +33,7 @@ from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.keeper import NodeState
 from openarm_bringup.supervision.session import running_graph
 from openarm_common.domain import release_domain, reserve_domain
-from openarm_common.scene import load_scene
+from openarm_common.scene.scene import load_scene
 
 
 async def run_once(scene: str, seed: int, folder: Path, timeout: float) -> dict[str, Any]:

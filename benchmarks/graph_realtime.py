@@ -63,7 +63,7 @@ def watch(seconds: float) -> dict[str, Any]:
     from rclpy.executors import SingleThreadedExecutor
     from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
 
-    from openarm_common.node import QOS_COMMAND, QOS_SENSOR
+    from openarm_common.ros.node import QOS_COMMAND, QOS_SENSOR
 
     rclpy.init()
     node = rclpy.create_node("graph_realtime")

@@ -35,7 +35,7 @@ from benchmarks.grasp_trials import (
     make,
 )
 from benchmarks.report import Row, write_report
-from openarm_sim_bridge.model import PhysicsConfig
+from openarm_sim_bridge.world.model import PhysicsConfig
 
 PEER = "MuJoCo's own settings"
 LIFTED, LOST, TIPPED, PLACED, OUT_OF_HAND = 0.10, 0.08, 0.98, 0.015, 0.05

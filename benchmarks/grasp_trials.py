@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription, Side, mirror
-from openarm_common.scene import Scene, SceneObject, Table
-from openarm_sim_bridge.model import PhysicsConfig, compile_model
+from openarm_common.robot.description import RobotDescription, Side, mirror
+from openarm_common.scene.scene import Scene, SceneObject, Table
+from openarm_sim_bridge.world.model import PhysicsConfig, compile_model
 
 Array = NDArray[np.float64]
 TABLE = Table()

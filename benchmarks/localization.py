@@ -6,7 +6,7 @@
 Every pose is a random object (cube, box, cylinder or can, 4 to 7 cm wide) at a random place and yaw on the table, drawn
 from a seed of its own. The overhead camera looks past the robot at home; the wrist camera looks from a posture within
 0.06 rad of `wrist_look`, at objects that are in its picture. Images are 640 x 480, 16UC1; noisy depth is that of a
-D435 (`openarm_sim_bridge.noise`: error growing with the square of the depth, flying pixels, holes).
+D435 (`openarm_sim_bridge.cameras.noise`: error growing with the square of the depth, flying pixels, holes).
 
     CAMERA_DEPTH_position_p50_mm, ..._p95_mm, ..._max_mm   middle of the object; peer: the depth of the box's middle,
                                                            as tutorials do it, its horizontal error alone
@@ -30,20 +30,20 @@ from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
 from openarm_common import se3
-from openarm_common.cameras import CameraConfig, load_cameras
+from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.config import load_config
-from openarm_common.description import SIDES, RobotDescription
 from openarm_common.resources import config_dir
-from openarm_common.scene import Scene, random_scene
-from openarm_common.scene_types import SceneObject, Table
-from openarm_perception.depth import DepthLimits
-from openarm_perception.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.localize import Detection3D, Localizer, LocalizerConfig
-from openarm_perception.pipeline import Perceived, Pipeline
-from openarm_sim_bridge.cameras import SnapshotRenderer
-from openarm_sim_bridge.model import compile_model
-from openarm_sim_bridge.noise import DepthNoiseConfig, add_depth_noise
-from openarm_sim_bridge.world import Snapshot
+from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.scene.scene import Scene, random_scene
+from openarm_common.scene.types import SceneObject, Table
+from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detection.localize import Detection3D, Localizer, LocalizerConfig
+from openarm_perception.detection.pipeline import Perceived, Pipeline
+from openarm_perception.geometry.depth import DepthLimits
+from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
+from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
+from openarm_sim_bridge.world.model import compile_model
+from openarm_sim_bridge.world.world import Snapshot
 
 #: Largest turn of each joint away from the observation posture, rad.
 _JITTER = 0.06

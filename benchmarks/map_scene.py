@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.cameras import CameraConfig, load_cameras, true_mount
-from openarm_common.description import SIDES, RobotDescription
-from openarm_common.housings import with_housings
-from openarm_common.lattice import Lattice
-from openarm_common.scene import Scene
+from openarm_common.camera.cameras import CameraConfig, load_cameras, true_mount
+from openarm_common.camera.housings import with_housings
+from openarm_common.octree.lattice import Lattice
+from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.scene.scene import Scene
 from openarm_octomap.grid import DepthScan
 from openarm_octomap.mapper import Frame
-from openarm_sim_bridge.cameras import SnapshotRenderer
-from openarm_sim_bridge.model import compile_model
-from openarm_sim_bridge.noise import DepthNoiseConfig, add_depth_noise
-from openarm_sim_bridge.world import Snapshot
+from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
+from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
+from openarm_sim_bridge.world.model import compile_model
+from openarm_sim_bridge.world.world import Snapshot
 
 Array = NDArray[np.float64]
 _D435 = DepthNoiseConfig()

@@ -38,17 +38,17 @@ from visualization_msgs.msg import Marker, MarkerArray
 from benchmarks.report import Row, write_report
 from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import in_thread, running_graph
-from openarm_common.convert import pose_to_matrix, xyz
-from openarm_common.description import RobotDescription
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import OpenArmError
-from openarm_common.lattice import Lattice
-from openarm_common.node import QOS_COMMAND, QOS_LATCHED, reliable
-from openarm_common.octomap_codec import decode
-from openarm_common.scene import load_scene
-from openarm_grasp.client import GraspClient
-from openarm_motion.client import MotionClient
-from openarm_motion.solids import Box
+from openarm_common.octree.codec import decode
+from openarm_common.octree.lattice import Lattice
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import pose_to_matrix, xyz
+from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, reliable
+from openarm_common.scene.scene import load_scene
+from openarm_grasp.ros.client import GraspClient
+from openarm_motion.collision.solids import Box
+from openarm_motion.ros.client import MotionClient
 
 ARM, LABEL = "right", "red"
 #: Lowest height above the table that counts, m: two cells, in which the table itself may be.

@@ -41,18 +41,18 @@ from benchmarks.motion_problems import (
     table_problems,
 )
 from benchmarks.report import Row, write_report
-from openarm_common.cameras import load_cameras
-from openarm_common.description import RobotDescription
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.housings import with_housings
-from openarm_motion.arm import Arm, Situation
-from openarm_motion.both import BothArms
-from openarm_motion.collision import box_from
+from openarm_common.robot.description import RobotDescription
+from openarm_motion.collision.collision import box_from
+from openarm_motion.collision.fast import FastScene
+from openarm_motion.collision.seen import Known
 from openarm_motion.config import MotionConfig
-from openarm_motion.fast import FastScene
-from openarm_motion.fast_planner import FastPlanner
-from openarm_motion.planner import OmplPlanner, Planner, PlanQuery
-from openarm_motion.seen import Known
+from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.planning.both import BothArms
+from openarm_motion.planning.fast_planner import FastPlanner
+from openarm_motion.planning.planner import OmplPlanner, Planner, PlanQuery
 
 Array = NDArray[np.float64]
 #: A problem counts as feasible when some planner finds a path within this time, s.
@@ -165,7 +165,13 @@ def _through_ros(planner: str, count: int) -> list[float]:
 
     environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     parameters = ["scene:=demo", f"planning.planner:={planner}"]
-    command = [sys.executable, "-m", "openarm_motion.node", "--ros-args", *(x for p in parameters for x in ("-p", p))]
+    command = [
+        sys.executable,
+        "-m",
+        "openarm_motion.ros.node",
+        "--ros-args",
+        *(x for p in parameters for x in ("-p", p)),
+    ]
     arms, home = arms_and_home()
     node = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:

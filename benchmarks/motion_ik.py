@@ -17,10 +17,10 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from benchmarks.report import Row
-from openarm_common.description import RobotDescription
-from openarm_common.scene_types import Scene, Table
-from openarm_motion.arm import Arm
-from openarm_sim_bridge.model import compile_model
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.types import Scene, Table
+from openarm_motion.planning.arm import Arm
+from openarm_sim_bridge.world.model import compile_model
 
 Array = NDArray[np.float64]
 #: What counts as reached: position (m) and rotation (rad).

@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.map_scene import MapScene
-from openarm_common.scene_types import PALETTE, Scene, SceneObject, Table
-from openarm_motion.arm import Arm
+from openarm_common.scene.types import PALETTE, Scene, SceneObject, Table
+from openarm_motion.collision.seen import Known, SeenMap
+from openarm_motion.collision.solids import Box
 from openarm_motion.config import MapConfig
-from openarm_motion.map_eye import unexplained
-from openarm_motion.seen import Known, SeenMap
-from openarm_motion.solids import Box
+from openarm_motion.planning.arm import Arm
+from openarm_motion.scene.map_eye import unexplained
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.kernels import OCCUPIED
 from openarm_octomap.mapper import Mapper

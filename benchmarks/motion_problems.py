@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from benchmarks.motion_map import rendered
 from openarm_common import se3
-from openarm_motion.arm import Arm
-from openarm_motion.both import BothArms
-from openarm_motion.seen import NOTHING, Known
-from openarm_motion.solids import Box, box_from
+from openarm_motion.collision.seen import NOTHING, Known
+from openarm_motion.collision.solids import Box, box_from
+from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.both import BothArms
 
 Array = NDArray[np.float64]
 #: Whether configurations collide that are free of everything else is asked of this.

@@ -15,9 +15,9 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
 from openarm_common import se3
-from openarm_common.convert import matrix_to_pose
-from openarm_common.node import BASE_FRAME
-from openarm_motion.arm import Arm
+from openarm_common.ros.convert import matrix_to_pose
+from openarm_common.ros.node import BASE_FRAME
+from openarm_motion.planning.arm import Arm
 
 _LIMIT = 30.0
 

@@ -32,21 +32,21 @@ from benchmarks.motion_problems import around_box, random_free, table_boxes
 from benchmarks.motion_stand import FAR, Seen, Stand
 from benchmarks.report import Row, write_report
 from openarm_common import se3
-from openarm_common.cameras import load_cameras
-from openarm_common.description import RobotDescription
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.housings import with_housings
-from openarm_common.scene import load_scene
-from openarm_motion import moves
-from openarm_motion.arm import Arm, Situation
-from openarm_motion.beside import Course, least_wait
-from openarm_motion.both import BothArms
-from openarm_motion.checks import Motion
-from openarm_motion.collision import Box, box_from
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import load_scene
+from openarm_motion.collision.collision import Box, box_from
+from openarm_motion.collision.seen import Known
 from openarm_motion.config import MotionConfig
-from openarm_motion.seen import Known
-from openarm_motion.together import BothGoals, plan_staggered, plan_together
-from openarm_motion.trajectory import Trajectory
+from openarm_motion.planning import moves
+from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.planning.beside import Course, least_wait
+from openarm_motion.planning.both import BothArms
+from openarm_motion.planning.together import BothGoals, plan_staggered, plan_together
+from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription
-from openarm_common.scene import load_scene
-from openarm_motion.collision import Box
-from openarm_motion.trajectory import Trajectory
-from openarm_sim_bridge.actuation import TrajectoryConfig, TrajectoryOutcome
-from openarm_sim_bridge.controller import RobotController
-from openarm_sim_bridge.gripper import GripperConfig
-from openarm_sim_bridge.model import PhysicsConfig, build_spec
-from openarm_sim_bridge.stage import Stage
-from openarm_sim_bridge.trajectory import Trajectory as Commanded
-from openarm_sim_bridge.world import World
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import load_scene
+from openarm_motion.collision.collision import Box
+from openarm_motion.timing.trajectory import Trajectory
+from openarm_sim_bridge.control.actuation import TrajectoryConfig, TrajectoryOutcome
+from openarm_sim_bridge.control.controller import RobotController
+from openarm_sim_bridge.control.gripper import GripperConfig
+from openarm_sim_bridge.control.trajectory import Trajectory as Commanded
+from openarm_sim_bridge.world.model import PhysicsConfig, build_spec
+from openarm_sim_bridge.world.stage import Stage
+from openarm_sim_bridge.world.world import World
 
 Array = NDArray[np.float64]
 

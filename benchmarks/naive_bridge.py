@@ -16,13 +16,13 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
-from openarm_common.cameras import load_cameras
-from openarm_common.convert import info_from_intrinsics, ns_to_stamp
-from openarm_common.description import RobotDescription
-from openarm_common.node import QOS_CLOCK, QOS_COMMAND, QOS_SENSOR
-from openarm_common.scene import load_scene
-from openarm_sim_bridge.model import PhysicsConfig
-from openarm_sim_bridge.stage import Stage
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import info_from_intrinsics, ns_to_stamp
+from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_SENSOR
+from openarm_common.scene.scene import load_scene
+from openarm_sim_bridge.world.model import PhysicsConfig
+from openarm_sim_bridge.world.stage import Stage
 
 
 class NaiveBridge(Node):

@@ -41,17 +41,17 @@ import numpy as np
 
 from benchmarks.map_scene import MapScene
 from benchmarks.report import Row, write_report
-from openarm_common.flying_pixels import FlyingConfig, label_flying
-from openarm_common.octomap_codec import read_file, write_file
-from openarm_common.scene import load_scene, random_scene
-from openarm_common.self_filter import SelfFilter
+from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
+from openarm_common.octree.codec import read_file, write_file
+from openarm_common.robot.self_filter import SelfFilter
+from openarm_common.scene.scene import load_scene, random_scene
 from openarm_octomap.accuracy import compare
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import DepthScan, OccupancyGrid
 from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN
 from openarm_octomap.mapper import Frame, Mapper
-from openarm_perception.depth import Deprojector, DepthLimits
+from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
 PERIOD_NS = 500_000_000
 #: liboctomap's numbers, so that its map and ours can be compared cell by cell.

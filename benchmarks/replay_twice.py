@@ -40,8 +40,8 @@ from benchmarks.report import Row, write_report
 from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import running_graph
 from openarm_common.domain import release_domain, reserve_domain
-from openarm_common.lattice import Lattice
-from openarm_common.octomap_codec import decode
+from openarm_common.octree.codec import decode
+from openarm_common.octree.lattice import Lattice
 from openarm_octomap.config import GridConfig
 from openarm_octomap.grid import OccupancyGrid
 
@@ -62,7 +62,7 @@ def listen(path: Path) -> None:
     from sensor_msgs.msg import PointCloud2
     from vision_msgs.msg import Detection3DArray
 
-    from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+    from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 
     rclpy.init()
     node = rclpy.create_node("replay_twice")

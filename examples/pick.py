@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 
-from openarm_grasp.client import GraspClient
+from openarm_grasp.ros.client import GraspClient
 
 
 def main() -> int:

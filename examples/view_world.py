@@ -11,10 +11,10 @@ import time
 
 import mujoco
 
-from openarm_common.cameras import load_cameras
-from openarm_common.description import RobotDescription
-from openarm_common.scene import load_scene
-from openarm_sim_bridge.model import compile_model
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import load_scene
+from openarm_sim_bridge.world.model import compile_model
 
 STEPS = 1000
 

@@ -11,6 +11,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 
 import cyclopts
@@ -19,6 +20,9 @@ from cyclopts import App, Group, Parameter
 from openarm_bringup.outcome import FOR_PEOPLE, Outcome, failure
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
+
+#: Commands of the package that evaluates; it imports this one, which therefore names it here alone.
+EVALUATION = "openarm_evaluation.commands"
 
 HELP = """Eyes and hands for the OpenArm robot.
 
@@ -31,11 +35,8 @@ def build_app() -> App:
     """Return the application with all its commands."""
     from openarm_bringup.commands import (
         calibrate,
-        campaign,
         checks,
         completion,
-        demo,
-        detector,
         doctor,
         graph,
         grasp,
@@ -51,6 +52,7 @@ def build_app() -> App:
         view,
     )
 
+    demo, campaign, detector = (import_module(f"{EVALUATION}.{name}") for name in ("demo", "campaign", "detector"))
     app = App(
         name="openarm",
         help=HELP,

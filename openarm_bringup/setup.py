@@ -1,25 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 # For colcon; pip reads the pyproject.toml above.
-from setuptools import setup
+from setuptools import find_packages, setup
 
 NAME = "openarm_bringup"
-PARTS = (
-    "bags",
-    "calibration",
-    "campaign",
-    "commands",
-    "demo",
-    "detector",
-    "doctor",
-    "judging",
-    "supervision",
-    "view",
-)
 
 setup(
     name=NAME,
     version="0.1.0",
-    packages=[NAME, *(f"{NAME}.{part}" for part in PARTS)],
+    packages=[NAME, *(f"{NAME}.{part}" for part in find_packages("."))],
     package_dir={NAME: "."},
     package_data={NAME: ["py.typed", "view/page/*"]},
     data_files=[

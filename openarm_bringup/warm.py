@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 
 from openarm_calibration.warm import warm as warm_calibration
-from openarm_common.cameras import Intrinsics
+from openarm_common.camera.cameras import Intrinsics
 from openarm_motion.warm import warm as warm_motion
 from openarm_octomap.warm import warm as warm_octomap
-from openarm_perception.depth import Deprojector, DepthLimits
-from openarm_perception.filters import drop_flying, voxel_filter
+from openarm_perception.geometry.depth import Deprojector, DepthLimits
+from openarm_perception.geometry.filters import drop_flying, voxel_filter
 
 
 def warm_perception() -> None:

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from openarm_calibration.gate import GateConfig
-from openarm_calibration.next_pose import SearchConfig
-from openarm_calibration.offline import ALGORITHMS
-from openarm_calibration.store_config import StoreConfig
-from openarm_calibration.verdict import Limits
+from openarm_calibration.handeye.offline import ALGORITHMS
+from openarm_calibration.handeye.verdict import Limits
+from openarm_calibration.sampling.gate import GateConfig
+from openarm_calibration.sampling.next_pose import SearchConfig
+from openarm_calibration.store.store_config import StoreConfig
 from openarm_common import se3
 from openarm_common.config import Config
 

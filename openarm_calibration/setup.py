@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 # For colcon; pip reads the pyproject.toml above.
-from setuptools import setup
+from setuptools import find_packages, setup
 
 NAME = "openarm_calibration"
 
 setup(
     name=NAME,
     version="0.1.0",
-    packages=[NAME],
+    packages=[NAME, *(f"{NAME}.{part}" for part in find_packages("."))],
     package_dir={NAME: "."},
     package_data={NAME: ["py.typed"]},
     data_files=[
@@ -17,8 +17,8 @@ setup(
     install_requires=["setuptools"],
     entry_points={
         "console_scripts": [
-            "calibration = openarm_calibration.node:main",
-            "publisher = openarm_calibration.publisher:main",
+            "calibration = openarm_calibration.ros.node:main",
+            "publisher = openarm_calibration.ros.publisher:main",
         ]
     },
 )

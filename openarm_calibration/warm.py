@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from openarm_calibration import synthetic
-from openarm_calibration.refine import Noise
-from openarm_calibration.solve import solve
+from openarm_calibration.handeye.refine import Noise
+from openarm_calibration.handeye.solve import solve
+from openarm_calibration.synthetic import synthetic
 
 
 def warm() -> None:

@@ -2,7 +2,7 @@
 # For colcon; pip reads the pyproject.toml above. This package brings the suite's models and parameters.
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 NAME = "openarm_common"
 SHARED = [path for folder in ("models", "config") for path in Path("..", folder).rglob("*") if path.is_file()]
@@ -10,7 +10,7 @@ SHARED = [path for folder in ("models", "config") for path in Path("..", folder)
 setup(
     name=NAME,
     version="0.1.0",
-    packages=[NAME],
+    packages=[NAME, *(f"{NAME}.{part}" for part in find_packages("."))],
     package_dir={NAME: "."},
     package_data={NAME: ["py.typed"]},
     data_files=[

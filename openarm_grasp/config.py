@@ -8,7 +8,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from openarm_common.config import Config
-from openarm_grasp.drift import DriftConfig
+from openarm_grasp.evidence.drift import DriftConfig
 
 
 class ApproachConfig(Config):

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 # For colcon; pip reads the pyproject.toml above.
-from setuptools import setup
+from setuptools import find_packages, setup
 
 NAME = "openarm_motion"
 
 setup(
     name=NAME,
     version="0.1.0",
-    packages=[NAME],
+    packages=[NAME, *(f"{NAME}.{part}" for part in find_packages("."))],
     package_dir={NAME: "."},
     package_data={NAME: ["py.typed"]},
     data_files=[
@@ -15,5 +15,5 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
     ],
     install_requires=["setuptools"],
-    entry_points={"console_scripts": ["motion = openarm_motion.node:main"]},
+    entry_points={"console_scripts": ["motion = openarm_motion.ros.node:main"]},
 )

@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from openarm_common.description import SIDES, RobotDescription
-from openarm_common.lattice import KEY_ZERO, Lattice
-from openarm_motion.cartesian import solve_line
-from openarm_motion.collision import CollisionScene, Surroundings
-from openarm_motion.collision_robot import CollisionRobot
-from openarm_motion.fast import FastScene
-from openarm_motion.fast_planner import warm_search
-from openarm_motion.inverse import InverseKinematics
-from openarm_motion.kinematics import ArmKinematics
-from openarm_motion.seen import SeenMap
+from openarm_common.octree.lattice import KEY_ZERO, Lattice
+from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_motion.collision.collision import CollisionScene, Surroundings
+from openarm_motion.collision.collision_robot import CollisionRobot
+from openarm_motion.collision.fast import FastScene
+from openarm_motion.collision.seen import SeenMap
+from openarm_motion.kinematics.cartesian import solve_line
+from openarm_motion.kinematics.inverse import InverseKinematics
+from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.planning.fast_planner import warm_search
 
 
 def warm() -> None:

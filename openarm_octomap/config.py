@@ -7,9 +7,9 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from openarm_common.camera.flying_pixels import FlyingConfig
 from openarm_common.config import Config
-from openarm_common.flying_pixels import FlyingConfig
-from openarm_common.self_filter import SelfFilterConfig
+from openarm_common.robot.self_filter import SelfFilterConfig
 
 Vector3 = tuple[float, float, float]
 

@@ -8,8 +8,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_common import distance_kernels as kernels
-from openarm_common.lattice import Lattice
+from openarm_common.octree import distance_kernels as kernels
+from openarm_common.octree.lattice import Lattice
 from openarm_octomap.config import UnknownPolicy
 from openarm_octomap.kernels import OCCUPIED, UNKNOWN
 

@@ -11,9 +11,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from openarm_common.depth_view import DepthImage
-from openarm_common.filter_kernels import Whole
-from openarm_common.lattice import KEY_ZERO
+from openarm_common.camera.depth_view import DepthImage
+from openarm_common.octree.lattice import KEY_ZERO
+from openarm_common.robot.filter_kernels import Whole
 from openarm_octomap.kernels import HIT_BIT, cell_distance
 
 Floats = NDArray[np.float32]

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from openarm_common.cameras import Intrinsics
-from openarm_common.depth_view import DepthView
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.depth_view import DepthView
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.lattice import DEPTH, Lattice
-from openarm_common.octomap_codec import Leaves, OctreeEncoder, Payload
-from openarm_common.self_filter import Shapes
+from openarm_common.octree.codec import Leaves, OctreeEncoder, Payload
+from openarm_common.octree.lattice import DEPTH, Lattice
+from openarm_common.robot.self_filter import Shapes
 from openarm_octomap import end_kernels, kernels
 from openarm_octomap.config import GridConfig, UnknownPolicy
 from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN

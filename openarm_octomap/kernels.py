@@ -3,7 +3,7 @@
 
 Together with `end_kernels` they do what liboctomap does for a cloud whose points are first made unique by cell, with
 the same types in the same order, so that the cells come out identical. Coordinates are in the frame of the map, m;
-keys are those of `openarm_common.lattice`. Marks of a scan: bit 0 a ray went through, bit 1 a ray ended there. The GIL
+keys are those of `octree.lattice`. Marks of a scan: bit 0 a ray went through, bit 1 a ray ended there. The GIL
 is released.
 """
 
@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from openarm_common.filter_kernels import Whole
-from openarm_common.lattice import KEY_ZERO
+from openarm_common.octree.lattice import KEY_ZERO
+from openarm_common.robot.filter_kernels import Whole
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from openarm_common.description import RobotDescription
+from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.flying_pixels import FlyingConfig, label_flying
-from openarm_common.held import HeldBox
-from openarm_common.lattice import DEPTH, Lattice
-from openarm_common.octomap_codec import Payload, encode_states, read_file, write_file
-from openarm_common.self_filter import SelfFilter, Shapes
+from openarm_common.octree.codec import Payload, encode_states, read_file, write_file
+from openarm_common.octree.lattice import DEPTH, Lattice
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.held import HeldBox
+from openarm_common.robot.self_filter import SelfFilter, Shapes
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig, UnknownPolicy
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numba kernel that takes what the robot fills out of the map; shapes are those of `openarm_common.filter_kernels`."""
+"""Numba kernel that takes what the robot fills out of the map; shapes are those of `robot.filter_kernels`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from openarm_common.filter_kernels import inside
-from openarm_common.lattice import KEY_ZERO
+from openarm_common.octree.lattice import KEY_ZERO
+from openarm_common.robot.filter_kernels import inside
 from openarm_octomap.kernels import OCCUPIED, UNKNOWN
 
 Array = NDArray[np.float64]

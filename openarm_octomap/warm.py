@@ -6,12 +6,12 @@ from __future__ import annotations
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.cameras import Intrinsics
-from openarm_common.description import RobotDescription
-from openarm_common.distance_field import sphere_clearance
-from openarm_common.flying_pixels import FlyingConfig, label_flying
-from openarm_common.octomap_codec import decode
-from openarm_common.self_filter import SelfFilter, SelfFilterConfig
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
+from openarm_common.octree.codec import decode
+from openarm_common.octree.distance_field import sphere_clearance
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.self_filter import SelfFilter, SelfFilterConfig
 from openarm_octomap.config import GridConfig
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid

@@ -5,16 +5,16 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from openarm_common.cameras import CameraConfig, load_cameras
+from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.config import AT_RUN_TIME, Config
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import load_scene
-from openarm_perception.detector import Policy
-from openarm_perception.filters import FilterConfig
-from openarm_perception.kinds import DetectorKind
-from openarm_perception.localize import LocalizerConfig
-from openarm_perception.network import NetworkConfig
-from openarm_perception.robot import CloudRobotConfig, RobotConfig
+from openarm_common.scene.scene import load_scene
+from openarm_perception.detection.detector import Policy
+from openarm_perception.detection.kinds import DetectorKind
+from openarm_perception.detection.localize import LocalizerConfig
+from openarm_perception.detection.network import NetworkConfig
+from openarm_perception.detection.robot import CloudRobotConfig, RobotConfig
+from openarm_perception.geometry.filters import FilterConfig
 
 
 class DetectNodeConfig(Config):

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 # For colcon; pip reads the pyproject.toml above.
-from setuptools import setup
+from setuptools import find_packages, setup
 
 NAME = "openarm_perception"
 
 setup(
     name=NAME,
     version="0.1.0",
-    packages=[NAME, f"{NAME}.training"],
+    packages=[NAME, *(f"{NAME}.{part}" for part in find_packages("."))],
     package_dir={NAME: "."},
     package_data={NAME: ["py.typed"]},
     data_files=[
@@ -17,8 +17,8 @@ setup(
     install_requires=["setuptools"],
     entry_points={
         "console_scripts": [
-            "cloud_node = openarm_perception.cloud_node:main",
-            "detect_node = openarm_perception.detect_node:main",
+            "cloud_node = openarm_perception.ros.cloud_node:main",
+            "detect_node = openarm_perception.ros.detector_node:main",
         ]
     },
 )

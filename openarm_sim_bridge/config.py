@@ -8,10 +8,10 @@ from typing import Any, Literal
 from pydantic import Field, field_validator
 
 from openarm_common.config import Config
-from openarm_sim_bridge.actuation import TrajectoryConfig
-from openarm_sim_bridge.gripper import GripperConfig
-from openarm_sim_bridge.model import PhysicsConfig
-from openarm_sim_bridge.noise import ColourNoiseConfig, DepthNoiseConfig
+from openarm_sim_bridge.cameras.noise import ColourNoiseConfig, DepthNoiseConfig
+from openarm_sim_bridge.control.actuation import TrajectoryConfig
+from openarm_sim_bridge.control.gripper import GripperConfig
+from openarm_sim_bridge.world.model import PhysicsConfig
 
 
 class BarrierConfig(Config):

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.controller import RobotController
+from openarm_sim_bridge.control.controller import RobotController
+from openarm_sim_bridge.faults.world_faults import WorldFaults
 from openarm_sim_bridge.pacing import Pacer, PeriodMeter, RealTimeFactor
-from openarm_sim_bridge.world import JointReadout, World
-from openarm_sim_bridge.world_faults import WorldFaults
+from openarm_sim_bridge.world.world import JointReadout, World
 
 T = TypeVar("T")
 Array = NDArray[np.float64]

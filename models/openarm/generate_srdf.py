@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from openarm_common.description import BASE_LINK, SIDES, RobotDescription, Side, mirror
+from openarm_common.robot.description import BASE_LINK, SIDES, RobotDescription, Side, mirror
 
 MARGIN = 0.01  # m
 SEED = 1

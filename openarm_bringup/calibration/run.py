@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from openarm_bringup.supervision import environment, runs
 from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import in_thread, running_graph
-from openarm_common.cameras import load_cameras
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
     from openarm_bringup.supervision.supervisor import Event
-    from openarm_calibration.client import AutoResult, OnFeedback
+    from openarm_calibration.ros.client import AutoResult, OnFeedback
 
 GRAPH = "calibrate"
 
@@ -144,8 +144,8 @@ def _all(
     told: CalibrationListeners,
     stop: threading.Event,
 ) -> None:
-    from openarm_bringup.calibration.scene_client import SceneClient
-    from openarm_calibration.client import CalibrationClient
+    from openarm_bringup.calibration.ros.scene import SceneClient
+    from openarm_calibration.ros.client import CalibrationClient
 
     with SceneClient() as scenes, CalibrationClient() as client:
         for k, camera in enumerate(cameras):

@@ -15,10 +15,10 @@ from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
-    from openarm_calibration.board import Board
-    from openarm_calibration.offline import Result
-    from openarm_calibration.samples import SampleSet
-    from openarm_calibration.store import CalibrationStore, StoredCalibration
+    from openarm_calibration.board.board import Board
+    from openarm_calibration.handeye.offline import Result
+    from openarm_calibration.sampling.samples import SampleSet
+    from openarm_calibration.store.store import CalibrationStore, StoredCalibration
 
 
 @Parameter(name="*")
@@ -70,8 +70,8 @@ def with_solved(
     Raises:
         OpenArmError: What is wrong with the file or the options; DEGENERATE, when a session determines nothing.
     """
-    from openarm_calibration.offline import REFINED, calibrate, checked_algorithm, without_named
-    from openarm_calibration.solve import SolveConfig
+    from openarm_calibration.handeye.offline import REFINED, calibrate, checked_algorithm, without_named
+    from openarm_calibration.handeye.solve import SolveConfig
 
     name = checked_algorithm(algorithm)
     if free_intrinsics and name != REFINED:
@@ -95,8 +95,8 @@ def with_solved(
 
 
 def _from_session(path: Path, recording: Recording) -> tuple[SampleSet, str]:
-    from openarm_calibration.session_file import load_session
-    from openarm_common.description import RobotDescription
+    from openarm_calibration.sampling.session_file import load_session
+    from openarm_common.robot.description import RobotDescription
 
     given = [f"--{f.name.replace('_', '-')}" for f in fields(recording) if getattr(recording, f.name) != f.default]
     if given:
@@ -110,8 +110,8 @@ def _from_session(path: Path, recording: Recording) -> tuple[SampleSet, str]:
 
 def _from_bag(path: Path, recording: Recording) -> tuple[SampleSet, str, list[dict[str, Any]], str]:
     from openarm_bringup.bags.bag import open_bag
-    from openarm_bringup.calibration.samples_client import BagOptions, samples_of
-    from openarm_calibration import stills
+    from openarm_bringup.calibration.ros.samples import BagOptions, samples_of
+    from openarm_calibration.sampling import stills
 
     session = recording.session
     if session is not None and session.suffix != ".npz":
@@ -126,7 +126,7 @@ def _from_bag(path: Path, recording: Recording) -> tuple[SampleSet, str, list[di
 
 
 def _board(text: str) -> Board:
-    from openarm_calibration.board import read_board
+    from openarm_calibration.board.board import read_board
 
     try:
         return read_board(text, "--board")
@@ -140,7 +140,7 @@ def store_in(folder: Path | None) -> CalibrationStore:
     Raises:
         OpenArmError: INVALID_ARGUMENT, when it is a file.
     """
-    from openarm_calibration.store import CalibrationStore, default_folder
+    from openarm_calibration.store.store import CalibrationStore, default_folder
 
     if folder is not None and folder.exists() and not folder.is_dir():
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--store {folder} is a file, expected a folder")

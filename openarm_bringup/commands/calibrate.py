@@ -14,7 +14,7 @@ from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
-    from openarm_calibration.store import CalibrationStore, StoredCalibration
+    from openarm_calibration.store.store import CalibrationStore, StoredCalibration
 
 app = App(name="calibrate", help="Where are the cameras? Boards, solving, checking and storing hand-eye calibrations.")
 
@@ -46,8 +46,8 @@ def board(
         border: White around the marks, m.
         dpi: Of a PNG.
     """
-    from openarm_calibration.board import parse_board
-    from openarm_calibration.board_files import write_board
+    from openarm_calibration.board.board import parse_board
+    from openarm_calibration.board.board_files import write_board
 
     given = {"columns": columns, "rows": rows, "spacing": spacing, "diameter": diameter, "border": border}
     chosen = {key: value for key, value in given.items() if value is not None}
@@ -145,10 +145,10 @@ def together(
         save: Store the results, unless one fails.
         store: Folder of stored calibrations.
     """
-    from openarm_calibration.report import summary
-    from openarm_calibration.session_file import load_session
-    from openarm_calibration.together import calibrate_together
-    from openarm_common.description import RobotDescription
+    from openarm_calibration.handeye.together import calibrate_together
+    from openarm_calibration.report.report import summary
+    from openarm_calibration.sampling.session_file import load_session
+    from openarm_common.robot.description import RobotDescription
 
     if len(sessions) < 2:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{len(sessions)} sessions given, expected two or more; one: `solve`")
@@ -189,7 +189,7 @@ def report(
         store: Folder of stored calibrations.
         recording: What a bag does not say.
     """
-    from openarm_calibration.report import page
+    from openarm_calibration.report.report import page
 
     if out.suffix not in (".html", ".htm"):
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{out}: a report is written as .html")
@@ -247,7 +247,7 @@ def _json(done: Solved) -> dict[str, Any]:
 
 
 def _outcome(done: Solved, store: CalibrationStore | None, *, force: bool = False) -> Outcome:
-    from openarm_calibration.report import summary
+    from openarm_calibration.report.report import summary
 
     result, data = done.result, _json(done)
     text = "\n\n".join(part for part in (done.text, summary(result)) if part)

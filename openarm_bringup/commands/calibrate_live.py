@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from openarm_interfaces.action import AutoCalibrate
 
     from openarm_bringup.supervision.supervisor import Event
-    from openarm_calibration.client import AutoResult
+    from openarm_calibration.ros.client import AutoResult
 
 #: Of ROS_DOMAIN_ID; there are no ports above.
 LAST_DOMAIN = 232
@@ -103,7 +103,7 @@ def sample(*, remove: str | None = None, session: str = "", advice: Flag = False
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--session {session}: expected a name that ends in .npz")
     _meet(domain)
     from openarm_bringup.commands.pick import needing
-    from openarm_calibration.client import CalibrationClient
+    from openarm_calibration.ros.client import CalibrationClient
 
     with needing("calibration", "calibrate"), CalibrationClient() as client:
         if remove is not None:
@@ -126,7 +126,7 @@ def _running(camera: str, poses: int, save: bool, delay: bool, domain: int | Non
         )
     _meet(domain)
     from openarm_bringup.commands.pick import needing
-    from openarm_calibration.client import CalibrationClient
+    from openarm_calibration.ros.client import CalibrationClient
 
     show.camera(camera)
     stop = threading.Event()
@@ -212,10 +212,10 @@ def _outcome(results: dict[str, AutoResult], error: OpenArmError | None, run_dir
 
 def _page(session: Path, out: Path) -> None:
     """Write the page of a session, when there is one that can be solved."""
-    from openarm_calibration.offline import calibrate
-    from openarm_calibration.report import page
-    from openarm_calibration.session_file import load_session
-    from openarm_common.description import RobotDescription
+    from openarm_calibration.handeye.offline import calibrate
+    from openarm_calibration.report.report import page
+    from openarm_calibration.sampling.session_file import load_session
+    from openarm_common.robot.description import RobotDescription
 
     if not session.is_file():
         return

@@ -117,7 +117,7 @@ def _graph_findings(name: str) -> list[Finding]:
     for run in running:
         findings += graph.check_nodes(run)
         if run.ready_nodes:
-            from openarm_bringup.doctor.listening_client import listen
+            from openarm_bringup.doctor.ros.listener import listen
 
             findings += graph.check_heard(run, listen(run))
     return findings

@@ -21,7 +21,7 @@ def graph(transitions: Path | None = None, *, form: Literal["text", "mermaid"] =
         transitions: YAML of a state machine; that of the suite when not given.
         form: text or mermaid.
     """
-    from openarm_grasp.states import as_text, load_transitions, mermaid
+    from openarm_grasp.strategy.states import as_text, load_transitions, mermaid
 
     table = load_transitions(transitions)
     drawing = mermaid(table) if form == "mermaid" else as_text(table)

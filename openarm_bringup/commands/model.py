@@ -28,7 +28,7 @@ def model(
         seed: Seed of a random scene.
         view: Of the picture: front, three_quarter, side, back, top, or the name of a camera.
     """
-    from openarm_sim_bridge.export import export, render_png
+    from openarm_sim_bridge.world.export import export, render_png
 
     text = export(kind, scene, seed) if scene is None or kind == "mjcf" else export(kind)
     written: list[str] = []

@@ -31,11 +31,11 @@ def order(
     from rich.console import Console
 
     from openarm_bringup.commands.pick import meet_graph, needing
-    from openarm_grasp.orders import Order, load_bins
+    from openarm_grasp.strategy.orders import Order, load_bins
 
     work = Order(labels, load_bins(bins) if bins is not None else None, each)
     meet_graph(domain)
-    from openarm_grasp.client import GraspClient
+    from openarm_grasp.ros.client import GraspClient
 
     console = Console(stderr=True, highlight=False)
     results: list[dict[str, Any]] = []

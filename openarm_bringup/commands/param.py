@@ -64,7 +64,7 @@ def set_(node: str, name: str, value: str, *, domain: int | None = None) -> Outc
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.peer_client import Peer
+    from openarm_bringup.ros.peer import Peer
 
     with Peer() as peer:
         parameters = peer.parameters(node)
@@ -80,7 +80,7 @@ def set_(node: str, name: str, value: str, *, domain: int | None = None) -> Outc
 
 def _read(node: str, name: str | None, domain: int | None) -> dict[str, Any]:
     meet_graph(domain)
-    from openarm_bringup.peer_client import Peer
+    from openarm_bringup.ros.peer import Peer
 
     with Peer() as peer:
         parameters = peer.parameters(node)

@@ -18,8 +18,8 @@ from openarm_common.errors import Code, OpenArmError
 if TYPE_CHECKING:
     from openarm_interfaces.msg import GraspStatus
 
-    from openarm_grasp.answers import GraspResult, PairResult
-    from openarm_grasp.options import Option
+    from openarm_grasp.planning.options import Option
+    from openarm_grasp.ros.answers import GraspResult, PairResult
 
 
 Arm = Literal["auto", "left", "right"]
@@ -67,8 +67,8 @@ def pick(
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--phase {phase} is of one object; two are picked and placed")
     meet_graph(domain)
     labels, spots = _meant(labels, spots)
-    from openarm_grasp.answers import Wanted
-    from openarm_grasp.client import GraspClient
+    from openarm_grasp.ros.answers import Wanted
+    from openarm_grasp.ros.client import GraspClient
 
     wanted = [
         Wanted(name, which or "auto", where, None if turn is None else math.radians(turn), spot)
@@ -112,7 +112,7 @@ def _meant(
     worded = [i for i, label in enumerate(labels) if " " in label.strip()]
     if not worded:
         return labels, spots
-    from openarm_bringup.detector import things_client
+    from openarm_bringup.ros import things_client
 
     names, places = list(labels), list(spots)
     for i, thing in zip(worded, things_client.find([labels[i] for i in worded]), strict=True):

@@ -45,7 +45,7 @@ def record(
     from openarm_bringup.commands.pick import meet_graph
 
     meet_graph(domain)
-    from openarm_bringup.bags.recorder_client import PROFILES, Recorder
+    from openarm_bringup.bags.ros.recorder import PROFILES, Recorder
 
     path = bag or Path(datetime.now().strftime("bag_%Y%m%d_%H%M%S"))
     number = int(os.environ.get("ROS_DOMAIN_ID") or "0")
@@ -135,7 +135,7 @@ def replay(
             known = ", ".join(sorted(opened.topics))
             raise OpenArmError(Code.INVALID_ARGUMENT, f"not in {bag}: {', '.join(unknown)}; topics: {known}")
         meet_graph(domain)
-        from openarm_bringup.bags.player_client import Player
+        from openarm_bringup.bags.ros.player import Player
 
         before = {n: signal.signal(n, lambda *_: stop.set()) for n in (signal.SIGINT, signal.SIGTERM)}
         try:
@@ -172,7 +172,7 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
     """
     from openarm_bringup.bags import golden as stored
     from openarm_bringup.bags.bag import open_bag
-    from openarm_bringup.bags.bag_client import numbers_of
+    from openarm_bringup.bags.ros.bag import numbers_of
     from openarm_bringup.progress import progress
 
     path = golden or (bag if bag.is_dir() else bag.parent) / "golden.json"

@@ -50,7 +50,7 @@ def topic_list(*, domain: int | None = None) -> Outcome:
         domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
     """
     meet_graph(domain)
-    from openarm_bringup.peer_client import Peer
+    from openarm_bringup.ros.peer import Peer
 
     with Peer() as peer:
         return _listing(peer.topics(), "topics")
@@ -75,9 +75,9 @@ def echo(
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.message_client import interface, to_data
-    from openarm_bringup.peer_client import Peer, find
-    from openarm_common.node import QOS_LATCHED
+    from openarm_bringup.ros.messages import interface, to_data
+    from openarm_bringup.ros.peer import Peer, find
+    from openarm_common.ros.node import QOS_LATCHED
 
     told: deque[Any] = deque(maxlen=count)
     waiting: list[Any] = []
@@ -113,8 +113,8 @@ def hz(name: str, *, seconds: float = 5.0, domain: int | None = None) -> Outcome
     """
     meet_graph(domain)
     from openarm_bringup.bags.losses import Arrivals
-    from openarm_bringup.message_client import interface
-    from openarm_bringup.peer_client import Peer, find
+    from openarm_bringup.ros.messages import interface
+    from openarm_bringup.ros.peer import Peer, find
 
     at: list[float] = []
     delays: list[float] = []
@@ -171,9 +171,9 @@ def pub(
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.message_client import fill, interface, type_and_fields
-    from openarm_bringup.peer_client import Peer, find
-    from openarm_common.node import QOS_COMMAND
+    from openarm_bringup.ros.messages import fill, interface, type_and_fields
+    from openarm_bringup.ros.peer import Peer, find
+    from openarm_common.ros.node import QOS_COMMAND
 
     with Peer() as peer:
         asked, fields = type_and_fields(message)
@@ -205,7 +205,7 @@ def service_list(
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.peer_client import Peer, plain
+    from openarm_bringup.ros.peer import Peer, plain
 
     with Peer() as peer:
         return _listing(peer.services() if all_ else plain(peer.services()), "services")
@@ -222,8 +222,8 @@ def call(name: str, *request: str, timeout: float = 30.0, domain: int | None = N
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.message_client import fields_of, fill, interface, to_data
-    from openarm_bringup.peer_client import Peer, find
+    from openarm_bringup.ros.messages import fields_of, fill, interface, to_data
+    from openarm_bringup.ros.peer import Peer, find
 
     with Peer() as peer:
         found, kind = find("service", name, peer.services())
@@ -243,7 +243,7 @@ def action_list(*, domain: int | None = None) -> Outcome:
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.peer_client import Peer
+    from openarm_bringup.ros.peer import Peer
 
     with Peer() as peer:
         return _listing(peer.actions(), "actions")
@@ -267,8 +267,8 @@ def send(
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.message_client import fields_of, fill, interface, to_data
-    from openarm_bringup.peer_client import Peer, find
+    from openarm_bringup.ros.messages import fields_of, fill, interface, to_data
+    from openarm_bringup.ros.peer import Peer, find
 
     def tell(message: Any) -> None:
         if feedback:
@@ -299,7 +299,7 @@ def node_list(*, domain: int | None = None) -> Outcome:
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.peer_client import Peer
+    from openarm_bringup.ros.peer import Peer
 
     with Peer() as peer:
         names = peer.nodes()
@@ -315,7 +315,7 @@ def info(name: str, *, domain: int | None = None) -> Outcome:
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.peer_client import Peer, find
+    from openarm_bringup.ros.peer import Peer, find
 
     with Peer() as peer:
         found, _ = find("node", name, dict.fromkeys(peer.nodes(), ""))

@@ -12,14 +12,14 @@ from cyclopts import App
 from openarm_bringup.commands.pick import meet_graph
 from openarm_bringup.meant import unknown
 from openarm_bringup.outcome import Outcome
-from openarm_bringup.tree_picture import Row, check, write
+from openarm_bringup.view.tree_picture import Row, check, write
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from openarm_bringup.peer_client import Frames
+    from openarm_bringup.ros.peer import Frames
 
     Edges = dict[str, tuple[str, NDArray[np.float64], bool]]
 
@@ -81,7 +81,7 @@ def tree(*, out: Path | None = None, domain: int | None = None) -> Outcome:
 
 def _listen(domain: int | None) -> Frames:
     meet_graph(domain)
-    from openarm_bringup.peer_client import Peer
+    from openarm_bringup.ros.peer import Peer
 
     with Peer() as peer:
         frames = peer.frames(_LISTEN_S)

@@ -47,7 +47,7 @@ def up(
     of_viz = tuple(item for item in set_ if viz and item.startswith(f"{NODE}."))
     loaded = load_graph(graph, overrides=overrides, sets=[item for item in set_ if item not in of_viz])
     from openarm_bringup.supervision.runs import new_run_dir
-    from openarm_common.scene import load_scene
+    from openarm_common.scene.scene import load_scene
 
     load_scene(loaded.scene, loaded.seed)  # a scene that does not fit is refused before anything starts
     address = ""

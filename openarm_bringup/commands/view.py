@@ -89,10 +89,10 @@ def make_server(host: str, on_end: Callable[[BaseException], None]) -> Iterator[
         on_end: Called in the loop with what ended the thread too early.
     """
     from openarm_bringup.view.guard import Guard
-    from openarm_bringup.view.page_client import GraphView
+    from openarm_bringup.view.ros.page import GraphView
     from openarm_bringup.view.server import ViewServer
     from openarm_bringup.view.wire import robot_shapes
-    from openarm_grasp.states import State
+    from openarm_grasp.strategy.states import State
 
     loop = asyncio.get_running_loop()
     graph = GraphView(

@@ -29,7 +29,7 @@ async def running_graph(
     ros = environment.ros_environment(graph)
 
     def make_probe() -> Probe:
-        from openarm_bringup.supervision.readiness_client import ReadinessClient
+        from openarm_bringup.supervision.ros.readiness import ReadinessClient
 
         return ReadinessClient(ros)
 

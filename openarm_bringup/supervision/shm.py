@@ -25,7 +25,7 @@ _ROOMY, _PART = 4, 0.25
 
 _SEGMENT = re.compile(r"^fastrtps_[0-9a-f]{16}$")
 _PORT = re.compile(r"^fastrtps_port(\d+)$")
-#: Distance fields (`openarm_common.distance_field.field_path`), and what one is called while it is made.
+#: Distance fields (`openarm_common.octree.distance_field.field_path`), and what one is called while it is made.
 _FIELD = re.compile(r"^openarm_field_([A-Za-z0-9_.-]+)$")
 _UNFINISHED = re.compile(r"^[a-z0-9_]{8}$")
 

@@ -40,7 +40,7 @@ def with_viz(graph: Graph, port: int) -> tuple[Graph, str]:
             raise OpenArmError(Code.ENVIRONMENT, text) from error
     token = secrets.token_urlsafe(24)
     node = NodeSpec(
-        module="openarm_bringup.view.foxglove_node",
+        module="openarm_bringup.view.ros.foxglove_node",
         params={"port": port},
         env={TOKEN_VARIABLE: token},
         uses=("every topic and service",),

@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_common.cameras import Intrinsics
-from openarm_common.description import RobotDescription
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.octomap_codec import Leaves
-from openarm_common.urdf import Primitive
-from openarm_perception.depth import Deprojector
+from openarm_common.octree.codec import Leaves
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.urdf import Primitive
+from openarm_perception.geometry.depth import Deprojector
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -42,7 +42,7 @@ def frame(head: Mapping[str, Any], *arrays: NDArray[Any] | bytes) -> bytes:
 def robot_shapes(description: RobotDescription) -> dict[str, Any]:
     """The robot as the page draws it: names of the links, and shapes with the index of their link.
 
-    Poses are `T_link_shape`, 16 numbers by columns; `size` is that of `openarm_common.urdf.Primitive`.
+    Poses are `T_link_shape`, 16 numbers by columns; `size` is that of `openarm_common.robot.urdf.Primitive`.
     """
     links = list(description.links)
     shapes = [_shape(i, shape) for i, link in enumerate(description.links.values()) for shape in link.visual]

@@ -45,11 +45,11 @@ class StandIns:
         from sensor_msgs.msg import Image, JointState
         from vision_msgs.msg import Detection3DArray
 
-        from openarm_common.convert import array_to_image
-        from openarm_common.description import SIDES, RobotDescription
-        from openarm_common.lattice import Lattice
-        from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
-        from openarm_common.octomap_codec import encode_states
+        from openarm_common.octree.codec import encode_states
+        from openarm_common.octree.lattice import Lattice
+        from openarm_common.robot.description import SIDES, RobotDescription
+        from openarm_common.ros.convert import array_to_image
+        from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 
         self.picks: list[Any] = []
         self.resets: list[Any] = []

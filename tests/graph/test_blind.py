@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from openarm_bringup.judging.judge import JudgeConfig
-from openarm_bringup.judging.observer_client import Observer
-from openarm_bringup.judging.trial import wait_scene
 from openarm_common.errors import Code
-from openarm_common.scene import load_scene
-from openarm_grasp.client import GraspClient, GraspResult
-from openarm_motion.client import MotionClient
+from openarm_common.scene.scene import load_scene
+from openarm_evaluation.judging.judge import JudgeConfig
+from openarm_evaluation.judging.ros.observer import Observer
+from openarm_evaluation.judging.trial import wait_scene
+from openarm_grasp.ros.client import GraspClient, GraspResult
+from openarm_motion.ros.client import MotionClient
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 

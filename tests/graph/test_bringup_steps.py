@@ -24,9 +24,9 @@ from vision_msgs.msg import Detection3DArray
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_bringup.bags.bag import open_bag
-from openarm_common.convert import points_from_cloud
-from openarm_common.description import RobotDescription
-from openarm_common.scene import load_scene
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import points_from_cloud
+from openarm_common.scene.scene import load_scene
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 

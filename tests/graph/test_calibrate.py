@@ -11,10 +11,10 @@ import pytest
 from openarm_interfaces.srv import InjectFault
 
 from openarm_bringup.calibration.run import CalibrationListeners, CalibrationOptions, run_calibration
-from openarm_calibration.refine import mount_error
-from openarm_calibration.store import CalibrationStore
-from openarm_common.cameras import load_cameras, true_mount
-from openarm_common.client import BackgroundNode
+from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.store.store import CalibrationStore
+from openarm_common.camera.cameras import load_cameras, true_mount
+from openarm_common.ros.client import BackgroundNode
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow]
 

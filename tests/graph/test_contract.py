@@ -132,7 +132,7 @@ def _services(node: Node) -> dict[str, tuple[str, str]]:
 def test_a73_one_publisher_for_each_edge_of_the_frame_tree(graph: Node) -> None:
     from tf2_msgs.msg import TFMessage
 
-    from openarm_common.node import QOS_STATIC_TF, QOS_TF
+    from openarm_common.ros.node import QOS_STATIC_TF, QOS_TF
 
     parents: dict[str, set[tuple[str, str]]] = {}
 

@@ -18,15 +18,15 @@ from openarm_interfaces.srv import Grasp
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
-from openarm_bringup.campaign.gap import LEAST_GAP, least_gap
-from openarm_bringup.judging.judge import JudgeConfig, judge
-from openarm_bringup.judging.observer_client import Observer
-from openarm_bringup.judging.trial import run_pair, wait_scene
 from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.shm import ports_of, unused
 from openarm_common.errors import Code
-from openarm_common.scene import load_scene
-from openarm_grasp.client import GraspClient, GraspResult
+from openarm_common.scene.scene import load_scene
+from openarm_evaluation.campaign.gap import LEAST_GAP, least_gap
+from openarm_evaluation.judging.judge import JudgeConfig, judge
+from openarm_evaluation.judging.ros.observer import Observer
+from openarm_evaluation.judging.trial import run_pair, wait_scene
+from openarm_grasp.ros.client import GraspClient, GraspResult
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 

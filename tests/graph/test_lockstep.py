@@ -54,7 +54,7 @@ def test_a_node_that_does_not_answer_ends_the_run_with_its_name(
         "lockstep: {participants: [calibration_publisher]}\n"
         "nodes:\n"
         "  mujoco_bridge:\n"
-        "    module: openarm_sim_bridge.node\n"
+        "    module: openarm_sim_bridge.ros.node\n"
         "    params: {images: false, speed: 1.0, barrier.timeout: 1.0}\n"
     )
     up = start_graph(str(graph))

@@ -18,8 +18,8 @@ import yaml
 
 from openarm_bringup.supervision.environment import node_arguments
 from openarm_bringup.supervision.graph import load_graph
-from openarm_common.description import RobotDescription
 from openarm_common.resources import config_dir
+from openarm_common.robot.description import RobotDescription
 
 ROOT = Path(__file__).parents[2]
 LAUNCH = ROOT / "openarm_bringup" / "launch" / "openarm.launch.py"

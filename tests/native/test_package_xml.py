@@ -64,6 +64,6 @@ def test_every_node_of_the_graphs_is_an_executable_of_its_package() -> None:
     from openarm_bringup.supervision.graph import graph_names, load_graph
 
     modules = {spec.module for name in graph_names() for spec in load_graph(name).nodes.values() if spec.module}
-    for module in modules - {"openarm_bringup.script_node"}:
+    for module in modules - {"openarm_bringup.ros.script_node"}:
         package = module.partition(".")[0]
         assert f"{module}:main" in (ROOT / package / "setup.py").read_text(encoding="utf-8"), module

@@ -27,8 +27,8 @@ class Bench:
         from rclpy.parameter import Parameter
         from sensor_msgs.msg import JointState
 
-        from openarm_common.node import QOS_COMMAND
-        from openarm_sim_bridge.node import MujocoBridge
+        from openarm_common.ros.node import QOS_COMMAND
+        from openarm_sim_bridge.ros.node import MujocoBridge
 
         self.ros = ros
         overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
@@ -65,7 +65,7 @@ class Bench:
 
     @property
     def t_ns(self) -> int:
-        from openarm_common.convert import stamp_to_ns
+        from openarm_common.ros.convert import stamp_to_ns
 
         return stamp_to_ns(self.joints[-1].header.stamp)
 

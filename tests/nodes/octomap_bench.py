@@ -14,19 +14,19 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from openarm_common.cameras import T_LINK_OPTICAL, load_cameras
-from openarm_common.convert import (
+from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras
+from openarm_common.octree.codec import decode
+from openarm_common.octree.distance_field import field_path
+from openarm_common.octree.lattice import Lattice
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import (
     array_to_image,
     info_from_intrinsics,
     matrix_to_transform,
     ns_to_stamp,
 )
-from openarm_common.description import RobotDescription
-from openarm_common.distance_field import field_path
-from openarm_common.lattice import Lattice
-from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF
-from openarm_common.octomap_codec import decode
-from openarm_octomap.node import OctomapNode
+from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF
+from openarm_octomap.ros.node import OctomapNode
 
 CAMERA = load_cameras()["overhead"]
 K, FRAME = CAMERA.intrinsics, CAMERA.optical_frame

@@ -9,7 +9,7 @@ import rclpy
 from rclpy.duration import Duration
 from std_msgs.msg import String
 
-from openarm_common.node import QOS_COMMAND, QOS_SENSOR
+from openarm_common.ros.node import QOS_COMMAND, QOS_SENSOR
 
 STREAMS, ROUNDS = 8, 150
 

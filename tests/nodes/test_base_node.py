@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from openarm_common.config import Config
 from openarm_common.errors import OpenArmError
-from openarm_common.node import QOS_COMMAND, BaseNode
+from openarm_common.ros.node import QOS_COMMAND, BaseNode
 
 
 class _Limits(Config):
@@ -100,7 +100,7 @@ def test_an_error_in_a_thread_reaches_who_awaits_it(ros) -> None:
 _SCRIPT = textwrap.dedent(
     """
     from openarm_common.config import Config
-    from openarm_common.node import BaseNode, run
+    from openarm_common.ros.node import BaseNode, run
     class Settings(Config):
         rate: float = 1.0
     class Example(BaseNode[Settings]):

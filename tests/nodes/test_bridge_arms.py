@@ -11,10 +11,10 @@ from control_msgs.msg import JointTrajectoryControllerState
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from openarm_common.convert import (
+from openarm_common.ros.convert import (
     stamp_to_ns,
 )
-from openarm_common.node import QOS_COMMAND
+from openarm_common.ros.node import QOS_COMMAND
 
 
 def test_a25_a_trajectory_is_followed(bench) -> None:

@@ -16,10 +16,10 @@ from openarm_interfaces.srv import ResetWorld
 from sensor_msgs.msg import CameraInfo, Image
 from tf2_msgs.msg import TFMessage
 
-from openarm_calibration.publisher import PublisherNode
+from openarm_calibration.ros.publisher import PublisherNode
 from openarm_common import se3
-from openarm_common.cameras import load_cameras
-from openarm_common.convert import (
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.ros.convert import (
     depth_to_metres,
     image_to_array,
     intrinsics_from_info,
@@ -27,7 +27,7 @@ from openarm_common.convert import (
     stamp_to_ns,
     transform_to_matrix,
 )
-from openarm_common.node import QOS_SENSOR, QOS_STATIC_TF, QOS_TF
+from openarm_common.ros.node import QOS_SENSOR, QOS_STATIC_TF, QOS_TF
 
 
 def test_a26_a28_a30_images_info_and_joint_states_belong_together(seeing) -> None:

@@ -11,9 +11,9 @@ from openarm_interfaces.msg import ObjectStateArray
 from openarm_interfaces.srv import ClearFaults, InjectFault, MoveObject, RemoveObject
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
-from openarm_common.convert import image_to_array, stamp_to_ns
-from openarm_common.node import QOS_COMMAND, QOS_SENSOR
-from openarm_sim_bridge.faults import FAULTS
+from openarm_common.ros.convert import image_to_array, stamp_to_ns
+from openarm_common.ros.node import QOS_COMMAND, QOS_SENSOR
+from openarm_sim_bridge.faults.faults import FAULTS
 
 FINGER = "openarm_right_finger_joint1"
 ELBOW = "openarm_right_joint4"

@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from openarm_interfaces.srv import SetPause
 from sensor_msgs.msg import JointState
 
-from openarm_common.node import QOS_COMMAND
+from openarm_common.ros.node import QOS_COMMAND
 
 #: What a client gone wild sends, s and messages a second: right ones, ones of bad sizes and values, bytes that are no
 #: message, and messages of another type on a topic of the controller.
@@ -77,7 +77,7 @@ def test_n23_four_thousand_commands_a_second_leave_the_rate_or_are_told(ros, tmp
     def run(*command: str) -> subprocess.Popen:
         return subprocess.Popen([sys.executable, *command], stderr=log, env=os.environ)
 
-    bridge = run("-m", "openarm_sim_bridge.node", "--ros-args", "-p", "scene:=empty", "-p", "images:=false")
+    bridge = run("-m", "openarm_sim_bridge.ros.node", "--ros-args", "-p", "scene:=empty", "-p", "images:=false")
     flood: subprocess.Popen | None = None
     try:
         ros.spin_until(lambda: published and told, 30.0, "the bridge")

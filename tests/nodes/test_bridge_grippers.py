@@ -12,10 +12,10 @@ from openarm_interfaces.msg import ObjectStateArray
 from openarm_interfaces.srv import InjectFault, SetPause, SpawnObject
 from sensor_msgs.msg import JointState
 
-from openarm_common.convert import (
+from openarm_common.ros.convert import (
     point,
 )
-from openarm_common.node import QOS_SENSOR
+from openarm_common.ros.node import QOS_SENSOR
 
 
 @pytest.mark.parametrize("position", [0.005, 0.035])

@@ -8,8 +8,8 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Float64
 
-from openarm_common.convert import stamp_to_ns
-from openarm_common.node import QOS_COMMAND, reliable
+from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.node import QOS_COMMAND, reliable
 
 
 @pytest.mark.alone

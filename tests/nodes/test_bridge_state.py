@@ -24,13 +24,13 @@ from std_msgs.msg import Float64, String
 from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from openarm_common.convert import (
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import (
     stamp_to_ns,
     transform_to_matrix,
 )
-from openarm_common.description import RobotDescription
-from openarm_common.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, reliable
-from openarm_sim_bridge.state_publisher import JOINT_STATE_DEADLINE
+from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, reliable
+from openarm_sim_bridge.ros.state_publisher import JOINT_STATE_DEADLINE
 
 
 def test_a15_a16_a17_names_types_and_qos(seeing) -> None:
@@ -199,7 +199,7 @@ def test_p34_a_signal_ends_the_process_in_order(ros, stop: signal.Signals) -> No
     ros.node.create_subscription(JointState, "/joint_states", joints.append, QOS_COMMAND)
     ros.node.create_subscription(Image, "/overhead/color/image_raw", images.append, QOS_SENSOR)
     client = ActionClient(ros.node, FollowJointTrajectory, "/right_joint_trajectory_controller/follow_joint_trajectory")
-    command = [sys.executable, "-m", "openarm_sim_bridge.node", "--ros-args", "-p", "scene:=empty"]
+    command = [sys.executable, "-m", "openarm_sim_bridge.ros.node", "--ros-args", "-p", "scene:=empty"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ) as process:
         try:
             ros.spin_until(lambda: joints and images, 30.0, "joint states and images of the process")

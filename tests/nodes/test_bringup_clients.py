@@ -17,11 +17,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from openarm_bringup.judging.observer_client import Observer
-from openarm_bringup.judging.trial import Step
 from openarm_bringup.supervision.graph import Ready
-from openarm_bringup.supervision.readiness_client import ReadinessClient
+from openarm_bringup.supervision.ros.readiness import ReadinessClient
 from openarm_common.errors import Code, OpenArmError
+from openarm_evaluation.judging.ros.observer import Observer
+from openarm_evaluation.judging.trial import Step
 
 LATCHED = QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

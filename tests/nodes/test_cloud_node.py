@@ -11,11 +11,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from openarm_common.cameras import load_cameras
-from openarm_common.convert import array_to_image, info_from_intrinsics, points_from_cloud, stamp_to_ns
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import OpenArmError
-from openarm_common.node import QOS_SENSOR
-from openarm_perception.cloud_node import CloudNode
+from openarm_common.ros.convert import array_to_image, info_from_intrinsics, points_from_cloud, stamp_to_ns
+from openarm_common.ros.node import QOS_SENSOR
+from openarm_perception.ros.cloud_node import CloudNode
 
 CAMERAS = load_cameras()
 OVERHEAD = CAMERAS["overhead"]

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 
-from openarm_bringup.detector.things_client import DetectionListener
-from openarm_common.convert import pose_to_matrix, stamp_to_ns
-from openarm_perception.attributes import parse, resolve
+from openarm_bringup.ros.things_client import DetectionListener
+from openarm_common.ros.convert import pose_to_matrix, stamp_to_ns
+from openarm_perception.detection.attributes import parse, resolve
 from tests.nodes.detect_bench import TABLE, Bench, FakeCamera
 from tests.openarm_perception.onnx_file import boxes, write_network
 

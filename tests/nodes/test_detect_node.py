@@ -13,7 +13,9 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from vision_msgs.msg import Detection2DArray
 from visualization_msgs.msg import Marker, MarkerArray
 
-from openarm_common.convert import (
+from openarm_common.errors import OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import (
     array_to_image,
     image_to_array,
     info_from_intrinsics,
@@ -21,10 +23,8 @@ from openarm_common.convert import (
     pose_to_matrix,
     stamp_to_ns,
 )
-from openarm_common.description import RobotDescription
-from openarm_common.errors import OpenArmError
-from openarm_common.node import BASE_FRAME, QOS_SENSOR
-from openarm_perception.detect_node import DetectNode
+from openarm_common.ros.node import BASE_FRAME, QOS_SENSOR
+from openarm_perception.ros.detector_node import DetectNode
 from tests.nodes.detect_bench import MS, TABLE, TOP, Bench, FakeCamera, Watch
 
 

@@ -24,7 +24,7 @@ class Foxglove:
     def __init__(self, ros) -> None:
         from rclpy.parameter import Parameter
 
-        from openarm_bringup.view.foxglove_node import FoxgloveNode
+        from openarm_bringup.view.ros.foxglove_node import FoxgloveNode
 
         self.ros = ros
         self.node = ros.add(FoxgloveNode(parameter_overrides=[Parameter("port", value=0)]))
@@ -84,7 +84,7 @@ def test_a_topic_is_advertised_with_its_definition_and_its_messages_come_byte_fo
     from geometry_msgs.msg import PointStamped
     from rclpy.serialization import serialize_message
 
-    from openarm_common.node import QOS_LATCHED
+    from openarm_common.ros.node import QOS_LATCHED
 
     message = PointStamped()
     message.header.frame_id = "table_frame"  # of a length that needs no padding, whose bytes are anything

@@ -11,7 +11,7 @@ from rclpy.action import ActionClient, get_action_names_and_types
 from rclpy.parameter import Parameter
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.node import GraspNode
+from openarm_grasp.ros.node import GraspNode
 
 NAME = "/right_gripper_controller/gripper_cmd"
 TYPES = {"parallel": "ParallelGripperCommand", "classic": "GripperCommand"}

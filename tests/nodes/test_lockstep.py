@@ -17,10 +17,10 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from openarm_common.config import Config
-from openarm_common.convert import ns_to_stamp
-from openarm_common.lockstep_executor import ParticipantExecutor
-from openarm_common.lockstep_node import ACK_TOPIC, QOS_TICK, TICK_TOPIC
-from openarm_common.node import QOS_COMMAND, QOS_SENSOR, BaseNode
+from openarm_common.ros.convert import ns_to_stamp
+from openarm_common.ros.lockstep_executor import ParticipantExecutor
+from openarm_common.ros.lockstep_node import ACK_TOPIC, QOS_TICK, TICK_TOPIC
+from openarm_common.ros.node import QOS_COMMAND, QOS_SENSOR, BaseNode
 
 
 class Nothing(Config):

@@ -19,7 +19,9 @@ from std_srvs.srv import Empty
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
-from openarm_common.convert import (
+from openarm_common.errors import OpenArmError
+from openarm_common.octree.distance_field import DistanceFieldReader, field_path
+from openarm_common.ros.convert import (
     cloud_from_points,
     info_from_intrinsics,
     matrix_to_pose,
@@ -27,10 +29,8 @@ from openarm_common.convert import (
     points_from_cloud,
     stamp_to_ns,
 )
-from openarm_common.distance_field import DistanceFieldReader, field_path
-from openarm_common.errors import OpenArmError
-from openarm_common.node import BASE_FRAME, QOS_LATCHED, QOS_SENSOR
-from openarm_octomap.node import OctomapNode
+from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, QOS_SENSOR
+from openarm_octomap.ros.node import OctomapNode
 from tests.nodes.octomap_bench import FRAME, JOINTS, ROBOT, T_BASE_CAMERA, Bench, K, sheet
 
 

@@ -15,18 +15,18 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 from openarm_bringup.bags.bag import open_bag
-from openarm_bringup.bags.player_client import Player
-from openarm_bringup.bags.recorder_client import Recorder, Thinner
+from openarm_bringup.bags.ros.player import Player
+from openarm_bringup.bags.ros.recorder import Recorder, Thinner
 from openarm_bringup.commands.record import replay
-from openarm_common.convert import array_to_image
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+from openarm_common.ros.convert import array_to_image
+from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 
 
 @pytest.fixture(autouse=True)
 def known_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The graph is this process."""
-    monkeypatch.setattr("openarm_bringup.bags.recorder_client._KNOWN_S", 0.3)
+    monkeypatch.setattr("openarm_bringup.bags.ros.recorder._KNOWN_S", 0.3)
 
 
 def record(ros, path: Path, count: int, patterns: tuple[str, ...] = (".*",)) -> Recorder:
@@ -103,8 +103,8 @@ def test_a_full_disk_ends_the_recording_and_leaves_a_bag(ros, tmp_path: Path, mo
     class Usage:
         free = 10**12
 
-    monkeypatch.setattr("openarm_bringup.bags.recorder_client.shutil.disk_usage", lambda _: Usage)
-    monkeypatch.setattr("openarm_bringup.bags.recorder_client._SPARE_BYTES", 2**20)
+    monkeypatch.setattr("openarm_bringup.bags.ros.recorder.shutil.disk_usage", lambda _: Usage)
+    monkeypatch.setattr("openarm_bringup.bags.ros.recorder._SPARE_BYTES", 2**20)
     images = ros.node.create_publisher(Image, "/overhead/color/image_raw", QOS_COMMAND)
     picture = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     with Recorder(int(os.environ["ROS_DOMAIN_ID"]), tmp_path / "bag", ("/overhead/.*",), {}) as recorder:

@@ -23,9 +23,9 @@ from sensor_msgs.msg import Image
 from openarm_bringup.bags.bag import open_bag
 from openarm_bringup.supervision.environment import PROFILE, write_profile
 from openarm_bringup.supervision.graph import NodeSpec
-from openarm_common.convert import array_to_image
 from openarm_common.domain import release_domain, reserve_domain
-from openarm_common.node import QOS_COMMAND
+from openarm_common.ros.convert import array_to_image
+from openarm_common.ros.node import QOS_COMMAND
 from tests.nodes import streams
 
 TOPIC = "/overhead/color/image_raw"

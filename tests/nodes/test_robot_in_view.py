@@ -15,8 +15,9 @@ from vision_msgs.msg import Detection2DArray, Detection3DArray
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
-from openarm_common.cameras import T_LINK_OPTICAL, load_cameras
-from openarm_common.convert import (
+from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import (
     array_to_image,
     image_to_array,
     info_from_intrinsics,
@@ -25,10 +26,9 @@ from openarm_common.convert import (
     ns_to_stamp,
     points_from_cloud,
 )
-from openarm_common.description import RobotDescription
-from openarm_common.node import BASE_FRAME, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, reliable
-from openarm_perception.cloud_node import CloudNode
-from openarm_perception.detect_node import DetectNode
+from openarm_common.ros.node import BASE_FRAME, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, reliable
+from openarm_perception.ros.cloud_node import CloudNode
+from openarm_perception.ros.detector_node import DetectNode
 
 MS = 1_000_000
 ROBOT = RobotDescription.load()

@@ -20,10 +20,11 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from openarm_bringup import cli, peer_client
+from openarm_bringup import cli
 from openarm_bringup.commands import param, ros2, tf
+from openarm_bringup.ros import peer as peer_client
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF
+from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF
 
 
 @pytest.fixture

@@ -10,17 +10,17 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
-from openarm_common.convert import ns_to_stamp, stamp_to_ns
-from openarm_common.node import QOS_CLOCK, QOS_COMMAND
+from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns
+from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND
 
 NODES = {
-    "openarm_calibration.node": "CalibrationNode",
-    "openarm_calibration.publisher": "PublisherNode",
-    "openarm_grasp.node": "GraspNode",
-    "openarm_motion.node": "MotionNode",
-    "openarm_octomap.node": "OctomapNode",
-    "openarm_perception.cloud_node": "CloudNode",
-    "openarm_perception.detect_node": "DetectNode",
+    "openarm_calibration.ros.node": "CalibrationNode",
+    "openarm_calibration.ros.publisher": "PublisherNode",
+    "openarm_grasp.ros.node": "GraspNode",
+    "openarm_motion.ros.node": "MotionNode",
+    "openarm_octomap.ros.node": "OctomapNode",
+    "openarm_perception.ros.cloud_node": "CloudNode",
+    "openarm_perception.ros.detector_node": "DetectNode",
 }
 NOW = 123_000_000_000
 

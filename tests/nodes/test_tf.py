@@ -8,11 +8,11 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from openarm_common.config import Config
-from openarm_common.convert import ns_to_stamp
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import BaseNode, reliable
-from openarm_common.tf import RobotStateListener
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import ns_to_stamp
+from openarm_common.ros.node import BaseNode, reliable
+from openarm_common.ros.tf import RobotStateListener
 
 
 @pytest.mark.parametrize(("depth", "kept"), [(100, 60), (10, 10)])

@@ -17,7 +17,7 @@ class Looking:
     """A view of the graph of a test, and the newest that it has seen of each key."""
 
     def __init__(self, ros) -> None:
-        from openarm_bringup.view.page_client import GraphView
+        from openarm_bringup.view.ros.page import GraphView
 
         self.ros = ros
         self.seen: dict[str, Any] = {}
@@ -46,9 +46,9 @@ def test_a_cloud_is_made_of_depth_and_colour_of_one_stamp(ros, looking: Looking)
     from sensor_msgs.msg import CameraInfo, Image
     from tf2_msgs.msg import TFMessage
 
-    from openarm_common.cameras import Intrinsics
-    from openarm_common.convert import array_to_image, info_from_intrinsics, matrix_to_transform
-    from openarm_common.node import QOS_SENSOR, QOS_STATIC_TF
+    from openarm_common.camera.cameras import Intrinsics
+    from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform
+    from openarm_common.ros.node import QOS_SENSOR, QOS_STATIC_TF
 
     frame = "overhead_color_optical_frame"
     intrinsics = Intrinsics.from_fovy(64, 48, 60.0)
@@ -98,7 +98,7 @@ def test_what_hangs_on_a_link_and_the_way_of_a_plan_are_shown(ros, looking: Look
     from sensor_msgs.msg import JointState
     from visualization_msgs.msg import Marker, MarkerArray
 
-    from openarm_common.node import QOS_COMMAND, QOS_LATCHED
+    from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED
 
     held = Marker(type=Marker.CUBE, action=Marker.ADD, ns="red")
     held.header.frame_id = "openarm_left_hand_tcp"
@@ -122,7 +122,7 @@ def test_what_hangs_on_a_link_and_the_way_of_a_plan_are_shown(ros, looking: Look
 def test_a_message_that_can_t_be_shown_is_said_and_the_rest_goes_on(ros, looking: Looking) -> None:
     from sensor_msgs.msg import Image
 
-    from openarm_common.node import QOS_SENSOR
+    from openarm_common.ros.node import QOS_SENSOR
 
     images = ros.node.create_publisher(Image, "/overhead/color/image_raw", QOS_SENSOR)
     bad = Image(encoding="bayer", width=2, height=2, step=2, data=[0] * 4)

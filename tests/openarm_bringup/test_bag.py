@@ -11,10 +11,10 @@ from std_msgs.msg import String
 
 from openarm_bringup.bags.bag import BagWriter, definition, message_class, open_bag
 from openarm_bringup.bags.mcap import whole_chunks
-from openarm_bringup.bags.player_client import to_profile
-from openarm_bringup.bags.recorder_client import from_profile
+from openarm_bringup.bags.ros.player import to_profile
+from openarm_bringup.bags.ros.recorder import from_profile
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 
 
 def write(path: Path, count: int, size: int = 10) -> Path:

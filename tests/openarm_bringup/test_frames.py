@@ -15,8 +15,8 @@ from geometry_msgs.msg import TransformStamped
 from tf2_msgs.msg import TFMessage
 
 from openarm_bringup.commands import tf
-from openarm_bringup.peer_client import Frames
-from openarm_bringup.tree_picture import Row, lay_out, write
+from openarm_bringup.ros.peer import Frames
+from openarm_bringup.view.tree_picture import Row, lay_out, write
 from openarm_common.errors import OpenArmError
 
 ROWS = (Row(0, "world", True), Row(1, "base", True), Row(2, "arm", False), Row(1, "table <1>", True))

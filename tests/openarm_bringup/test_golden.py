@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 
 from openarm_bringup.bags import golden
 from openarm_bringup.bags.bag import BagWriter, open_bag
-from openarm_bringup.bags.bag_client import numbers_of
+from openarm_bringup.bags.ros.bag import numbers_of
 from openarm_bringup.commands import record
 from openarm_common.errors import Code, OpenArmError
 

@@ -10,7 +10,7 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import UInt8
 
 from openarm_bringup.meant import unknown
-from openarm_bringup.message_client import fill, interface, to_data
+from openarm_bringup.ros.messages import fill, interface, to_data
 from openarm_common.errors import OpenArmError
 
 

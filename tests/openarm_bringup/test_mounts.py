@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from openarm_bringup.calibration.run import CalibrationOptions, CalibrationRun
-from openarm_bringup.demo import mounts
-from openarm_calibration.client import AutoResult
-from openarm_calibration.store import CalibrationStore, StoredCalibration
-from openarm_common.cameras import load_cameras, true_mount
+from openarm_calibration.ros.client import AutoResult
+from openarm_calibration.store.store import CalibrationStore, StoredCalibration
+from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
+from openarm_evaluation.demo import mounts
 
 
 @pytest.fixture(autouse=True)

@@ -11,11 +11,11 @@ import psutil
 import pytest
 
 from openarm_bringup.commands import pick
-from openarm_bringup.detector import things_client
+from openarm_bringup.ros import things_client
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.options import Option
-from openarm_perception.attributes import Thing
+from openarm_grasp.planning.options import Option
+from openarm_perception.detection.attributes import Thing
 
 OPTIONS = (
     Option("red/x+/tilt0", "left", 0.05, {"tilt": -0.0, "width": 0.05}, 0.5, Code.OK, "chosen"),

@@ -11,12 +11,12 @@ import pytest
 
 from openarm_bringup.view import wire
 from openarm_common import se3
-from openarm_common.cameras import Intrinsics
-from openarm_common.description import SIDES, RobotDescription
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import OpenArmError
-from openarm_common.lattice import Lattice
-from openarm_common.octomap_codec import decode, encode_states
-from openarm_perception.depth import Deprojector, DepthLimits
+from openarm_common.octree.codec import decode, encode_states
+from openarm_common.octree.lattice import Lattice
+from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
 
 @pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd", "µ"])

@@ -11,14 +11,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from openarm_calibration import synthetic_session
-from openarm_calibration.board import Board, Charuco, CircleGrid, parse_board
-from openarm_calibration.board_files import png, write_board
-from openarm_calibration.centroids import refined
-from openarm_calibration.detect import detect, guess_pose
-from openarm_calibration.projection import project
+from openarm_calibration.board.board import Board, Charuco, CircleGrid, parse_board
+from openarm_calibration.board.board_files import png, write_board
+from openarm_calibration.board.centroids import refined
+from openarm_calibration.board.detect import detect, guess_pose
+from openarm_calibration.handeye.projection import project
+from openarm_calibration.synthetic import synthetic_session
 from openarm_common import se3
-from openarm_common.cameras import Intrinsics
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from openarm_calibration.board import CircleGrid
-from openarm_calibration.board_files import write_board
+from openarm_calibration.board.board import CircleGrid
+from openarm_calibration.board.board_files import write_board
 from openarm_common.resources import models_dir
 
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from openarm_calibration.bodies import Bodies, chain_poses
-from openarm_common.description import RobotDescription
+from openarm_calibration.sampling.bodies import Bodies, chain_poses
+from openarm_common.robot.description import RobotDescription
 
 POLE = """<robot name="pole"><link name="base"/>
 <link name="arm"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from openarm_calibration.board import CircleGrid
-from openarm_calibration.centroids import refined
-from openarm_calibration.detect import detect
+from openarm_calibration.board.board import CircleGrid
+from openarm_calibration.board.centroids import refined
+from openarm_calibration.board.detect import detect
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
 

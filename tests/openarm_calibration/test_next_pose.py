@@ -8,17 +8,17 @@ import math
 import numpy as np
 import pytest
 
-from openarm_calibration.board import CircleGrid
-from openarm_calibration.detect import Detection
-from openarm_calibration.next_pose import PoseSearch, SearchConfig
-from openarm_calibration.projection import project
-from openarm_calibration.refine import mount_error
-from openarm_calibration.samples import Sample, SampleSet, SessionHead
+from openarm_calibration.board.board import CircleGrid
+from openarm_calibration.board.detect import Detection
+from openarm_calibration.handeye.projection import project
+from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.sampling.next_pose import PoseSearch, SearchConfig
+from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
 from openarm_common import se3
-from openarm_common.cameras import T_LINK_OPTICAL, load_cameras, true_mount
-from openarm_common.description import RobotDescription
+from openarm_common.camera.cameras import T_LINK_OPTICAL, load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import load_scene
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import load_scene
 
 BOARD = CircleGrid()
 QUICK = SearchConfig(draws=1000, candidates=30)

@@ -8,11 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from openarm_calibration import synthetic
-from openarm_calibration.poses import advice, around, rank, robot_pose
-from openarm_calibration.problem import moved
-from openarm_calibration.refine import Noise
-from openarm_calibration.solve import SolveConfig, solve
+from openarm_calibration.handeye.problem import moved
+from openarm_calibration.handeye.refine import Noise
+from openarm_calibration.handeye.solve import SolveConfig, solve
+from openarm_calibration.sampling.poses import advice, around, rank, robot_pose
+from openarm_calibration.synthetic import synthetic
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
 

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openarm_calibration.gate import GateConfig, match
-from openarm_calibration.refine import mount_error
-from openarm_calibration.samples import without
-from openarm_calibration.session_file import load_session
-from openarm_calibration.solve import SolveConfig, solve
-from openarm_calibration.verdict import assess, estimate_delay, side_by_side
-from openarm_common.description import RobotDescription
+from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.handeye.solve import SolveConfig, solve
+from openarm_calibration.handeye.verdict import assess, estimate_delay, side_by_side
+from openarm_calibration.sampling.gate import GateConfig, match
+from openarm_calibration.sampling.samples import without
+from openarm_calibration.sampling.session_file import load_session
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot_state import RobotStateBuffer
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.robot_state import RobotStateBuffer
 
 MS = 1_000_000
 NAMES = ("openarm_right_joint1", "openarm_right_joint2")

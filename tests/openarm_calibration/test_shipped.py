@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openarm_calibration.offline import calibrate
-from openarm_calibration.refine import mount_error
-from openarm_calibration.session_file import load_session
-from openarm_calibration.store import CalibrationStore, StoredCalibration, of_these_mounts, places
+from openarm_calibration.handeye.offline import calibrate
+from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.sampling.session_file import load_session
+from openarm_calibration.store.store import CalibrationStore, StoredCalibration, of_these_mounts, places
 from openarm_common import se3
-from openarm_common.cameras import load_cameras, true_mount
-from openarm_common.description import RobotDescription
+from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.resources import config_dir
+from openarm_common.robot.description import RobotDescription
 
 SHIPPED = config_dir() / "calibration" / "mount_seed_1"
 SESSIONS = Path(__file__).parent / "data"

@@ -8,11 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from openarm_calibration import synthetic
-from openarm_calibration.closed_form import METHODS, closed_form, kronecker
-from openarm_calibration.problem import View, assemble, difference, moved
-from openarm_calibration.refine import Noise, mount_error, pixel_noise
-from openarm_calibration.solve import SolveConfig, solve
+from openarm_calibration.handeye.closed_form import METHODS, closed_form, kronecker
+from openarm_calibration.handeye.problem import View, assemble, difference, moved
+from openarm_calibration.handeye.refine import Noise, mount_error, pixel_noise
+from openarm_calibration.handeye.solve import SolveConfig, solve
+from openarm_calibration.synthetic import synthetic
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 
@@ -190,7 +190,7 @@ def test_both_set_ups_in_one_solve_share_the_robots_error_and_a_board() -> None:
         views.append(View(view.points, view.pixels, view.A, "to_hand", view.radius, 1, 1, 100 + view.pose))
         guesses.append(free)
     T = se3.inverse(overhead.X) @ wrist.Z  # the table's board from above
-    from openarm_calibration.projection import project
+    from openarm_calibration.handeye.projection import project
 
     pixels = project(synthetic.BOARD.points, synthetic.BOARD.radius, T, np.array([900.0, 900.0, 640.0, 360.0]))
     pixels = pixels + rng.normal(0.0, noise.px, pixels.shape)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openarm_calibration.store import CalibrationStore, StoredCalibration, check_mount_seed
+from openarm_calibration.store.store import CalibrationStore, StoredCalibration, check_mount_seed
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_common import se3
-from openarm_common.cameras import T_LINK_OPTICAL, Intrinsics, load_cameras, true_mount
+from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics, load_cameras, true_mount
 from openarm_common.errors import OpenArmError
 
 

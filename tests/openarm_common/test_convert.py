@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Image
 
-from openarm_common import convert, se3
-from openarm_common.cameras import Intrinsics
+from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros import convert
 
 
 def test_stamps_keep_every_nanosecond() -> None:

@@ -13,9 +13,9 @@ import yourdfpy
 from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.description import BASE_LINK, SIDES, RobotDescription, Side, mirror
 from openarm_common.errors import OpenArmError
-from openarm_sim_bridge.model import PhysicsConfig, robot_spec
+from openarm_common.robot.description import BASE_LINK, SIDES, RobotDescription, Side, mirror
+from openarm_sim_bridge.world.model import PhysicsConfig, robot_spec
 
 Array = NDArray[np.float64]
 HALF_PI = np.pi / 2

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openarm_common.distance_field import CameraMoment, DistanceFieldReader, DistanceFieldWriter
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.lattice import Lattice
+from openarm_common.octree.distance_field import CameraMoment, DistanceFieldReader, DistanceFieldWriter
+from openarm_common.octree.lattice import Lattice
 
 LATTICE = Lattice.from_bounds(0.02, (0.0, 0.0, 0.0), (0.2, 0.16, 0.12))
 S = 1_000_000_000
@@ -52,7 +52,8 @@ def test_another_process_reads_it(tmp_path: Path) -> None:
     w.begin()[...] = np.arange(LATTICE.cells, dtype=np.float32).reshape(LATTICE.shape)
     w.commit(1, 2, {})
     code = (
-        "import sys; from pathlib import Path; from openarm_common.distance_field import DistanceFieldReader as R\n"
+        "import sys; from pathlib import Path\n"
+        "from openarm_common.octree.distance_field import DistanceFieldReader as R\n"
         "f = R(Path(sys.argv[1])).latest(); print(f.version, f.distances[3, 2, 1], f.lattice.shape)"
     )
     out = subprocess.run([sys.executable, "-c", code, str(tmp_path / "f")], capture_output=True, text=True, check=True)

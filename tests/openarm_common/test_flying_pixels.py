@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from openarm_common.cameras import Intrinsics
-from openarm_common.depth_view import DepthView
-from openarm_common.flying_pixels import NOTHING_KNOWN, FlyingConfig, label_flying
-from openarm_sim_bridge.noise import DepthNoiseConfig, add_depth_noise
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.depth_view import DepthView
+from openarm_common.camera.flying_pixels import NOTHING_KNOWN, FlyingConfig, label_flying
+from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
 
 K = Intrinsics.from_fovy(640, 480, 60.0)
 NEAR, FAR = 0.2, 3.0

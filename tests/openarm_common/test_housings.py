@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from openarm_common.cameras import load_cameras
-from openarm_common.description import RobotDescription
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.housings import with_housings
 from openarm_common.errors import OpenArmError
-from openarm_common.housings import with_housings
+from openarm_common.robot.description import RobotDescription
 
 
 def test_a_housing_hangs_behind_its_lens_on_the_parent_link() -> None:

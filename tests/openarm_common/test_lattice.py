@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import OpenArmError
-from openarm_common.lattice import KEY_ZERO, Lattice
+from openarm_common.octree.lattice import KEY_ZERO, Lattice
 
 
 def test_a54_faces_on_the_lattice_stay_where_they_are() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.lockstep import Inbox, check_senders
+from openarm_common.ros.lockstep import Inbox, check_senders
 
 
 async def nothing() -> None:

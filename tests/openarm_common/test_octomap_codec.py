@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.errors import OpenArmError
-from openarm_common.lattice import Lattice
-from openarm_common.octomap_codec import OctreeEncoder, decode, read_file, write_file
+from openarm_common.octree.codec import OctreeEncoder, decode, read_file, write_file
+from openarm_common.octree.lattice import Lattice
 
 LATTICE = Lattice.from_bounds(0.02, (-0.16, -0.16, -0.08), (0.16, 0.16, 0.24), align=8)
 ENCODER = OctreeEncoder(LATTICE)

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot_state import RobotStateBuffer
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.robot_state import RobotStateBuffer
 
 MS = 1_000_000
 URDF = """<robot name="two">

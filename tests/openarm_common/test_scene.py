@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from openarm_common.config import load_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir, models_dir
-from openarm_common.scene import (
+from openarm_common.scene.scene import (
     PALETTE,
     REGION_ABS_Y,
     REGION_X,

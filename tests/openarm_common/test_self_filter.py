@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common import se3
-from openarm_common.cameras import Intrinsics, load_cameras
-from openarm_common.depth_view import DepthView
-from openarm_common.description import RobotDescription
+from openarm_common.camera.cameras import Intrinsics, load_cameras
+from openarm_common.camera.depth_view import DepthView
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.held import HeldBox
-from openarm_common.self_filter import SelfFilter, SelfFilterConfig
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.held import HeldBox
+from openarm_common.robot.self_filter import SelfFilter, SelfFilterConfig
 
 ROBOT = RobotDescription.load()
 JOINTS = {name: 0.0 for name, joint in ROBOT.joints.items() if joint.type != "fixed"}

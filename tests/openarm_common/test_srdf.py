@@ -9,9 +9,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from openarm_common.description import RobotDescription, mirror
 from openarm_common.errors import OpenArmError
 from openarm_common.resources import models_dir
+from openarm_common.robot.description import RobotDescription, mirror
 
 MINI = """<robot name="mini"><link name="base"/><link name="slide"/>
   <joint name="j1" type="prismatic"><parent link="base"/><child link="slide"/>

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 
 MINI = """<robot name="mini">
   <link name="base"><visual name="v"><geometry><sphere radius="0.1"/></geometry></visual></link>

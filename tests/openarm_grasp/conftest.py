@@ -11,14 +11,14 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import Table
-from openarm_grasp import effects as fx
+from openarm_common.scene.scene import Table
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence import Evidence
-from openarm_grasp.machine import GraspMachine
-from openarm_grasp.memory import Surroundings
-from openarm_grasp.observation import Detection, Frame
-from openarm_grasp.states import State
+from openarm_grasp.evidence.evidence import Evidence
+from openarm_grasp.evidence.observation import Detection, Frame
+from openarm_grasp.strategy import effects as fx
+from openarm_grasp.strategy.machine import GraspMachine
+from openarm_grasp.strategy.memory import Surroundings
+from openarm_grasp.strategy.states import State
 from tests.openarm_grasp.two_arms import TwoArms
 
 Fault = Callable[[fx.Effect], OpenArmError | None]

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.beside import BesideLink, Company
+from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.strategy.beside import BesideLink, Company
 
 
 class Robot:

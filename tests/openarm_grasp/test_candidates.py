@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.candidates import (
+from openarm_grasp.config import GraspConfig, HandConfig
+from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.planning.candidates import (
     USED_PENALTY,
     held_box,
     obstacle_boxes,
@@ -20,8 +22,6 @@ from openarm_grasp.candidates import (
     target_box,
     tcp_height,
 )
-from openarm_grasp.config import GraspConfig, HandConfig
-from openarm_grasp.observation import Detection
 
 TABLE = 0.40
 CONFIG = GraspConfig()

@@ -54,7 +54,7 @@ def test_impossible_tilts_are_refused(tilts):
 
 def test_a69_p16_no_source_reads_ground_truth_or_contacts_or_the_simulator():
     folder = Path(openarm_grasp.__file__).parent
-    for path in folder.glob("*.py"):
+    for path in folder.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         for word in ("ground_truth", "/sim/", "mujoco", ".contact", "qpos"):
             assert word not in text, f"{path.name} mentions {word}"

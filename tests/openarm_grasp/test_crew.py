@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import Table
-from openarm_grasp.candidates import propose
+from openarm_common.scene.scene import Table
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.crew import Crew
-from openarm_grasp.effects import GraspOutcome, GraspRequest
-from openarm_grasp.memory import Kept, Surroundings
-from openarm_grasp.observation import Detection
-from openarm_grasp.pair import PairOutcome, check_pair
+from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.planning.candidates import propose
+from openarm_grasp.strategy.crew import Crew
+from openarm_grasp.strategy.effects import GraspOutcome, GraspRequest
+from openarm_grasp.strategy.memory import Kept, Surroundings
+from openarm_grasp.strategy.pair import PairOutcome, check_pair
 
 
 @pytest.fixture

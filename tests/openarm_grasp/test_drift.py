@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from openarm_bringup.campaign.robot import SimulatedSenses
-from openarm_bringup.campaign.sets import make_task
-from openarm_bringup.campaign.trial import Trials
 from openarm_common import se3
-from openarm_common.cameras import load_cameras
+from openarm_common.camera.cameras import load_cameras
+from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.sets import make_task
+from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.drift import DriftConfig, DriftWatch
+from openarm_grasp.evidence.drift import DriftConfig, DriftWatch
 
 
 def watched(bias: tuple[float, float], noise: float, n: int = 10, seed: int = 0) -> DriftWatch:

@@ -11,8 +11,17 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import Code
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.evidence import Evidence, Grip, Sight, judge_grip, judge_lift, judge_place, judge_sight, judge_still
-from openarm_grasp.observation import Detection, Frame
+from openarm_grasp.evidence.evidence import (
+    Evidence,
+    Grip,
+    Sight,
+    judge_grip,
+    judge_lift,
+    judge_place,
+    judge_sight,
+    judge_still,
+)
+from openarm_grasp.evidence.observation import Detection, Frame
 
 HELD = HeldConfig()
 GOOD = Evidence(gap=0.0503, expected=0.05, effort=-30.0, speed=0.0)

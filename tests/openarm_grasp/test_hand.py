@@ -6,10 +6,10 @@ from __future__ import annotations
 import pytest
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot_state import RobotStateBuffer
-from openarm_grasp.hand import HandReader, Silence
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_grasp.evidence.hand import HandReader, Silence
 
 MS = 1_000_000
 

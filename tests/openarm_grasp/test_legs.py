@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code
-from openarm_grasp import effects as fx
+from openarm_grasp.strategy import effects as fx
 from tests.openarm_grasp.two_arms import OVER, TwoArms
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code
-from openarm_grasp import effects as fx
+from openarm_grasp.strategy import effects as fx
 
 
 def test_n13_a65_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(robot) -> None:

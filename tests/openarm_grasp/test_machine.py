@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code
-from openarm_grasp import effects as fx
-from openarm_grasp.states import State
+from openarm_grasp.strategy import effects as fx
+from openarm_grasp.strategy.states import State
 
 
 # --- success

@@ -8,9 +8,9 @@ from itertools import pairwise
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp import effects as fx
-from openarm_grasp.observation import Frame
-from openarm_grasp.states import State
+from openarm_grasp.evidence.observation import Frame
+from openarm_grasp.strategy import effects as fx
+from openarm_grasp.strategy.states import State
 
 
 # --- grasping

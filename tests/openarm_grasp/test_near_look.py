@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from openarm_bringup.campaign.robot import SimulatedSenses
-from openarm_bringup.campaign.tasks import Task
-from openarm_bringup.campaign.trial import Trials
 from openarm_common import se3
-from openarm_common.cameras import load_cameras
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code
-from openarm_common.scene import Scene, SceneObject
+from openarm_common.scene.scene import Scene, SceneObject
+from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.tasks import Task
+from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.effects import Frames, Outcome
-from openarm_grasp.judge_near import move_to_pregrasp
-from openarm_grasp.observation import Detection, Frame
-from openarm_grasp.states import Event
+from openarm_grasp.evidence.judge_near import move_to_pregrasp
+from openarm_grasp.evidence.observation import Detection, Frame
+from openarm_grasp.strategy.effects import Frames, Outcome
+from openarm_grasp.strategy.states import Event
 
 CUBE = SceneObject(name="red_cube", shape="box", size=(0.06, 0.06, 0.05), color="red", position=(0.27, -0.22), yaw=0.3)
 

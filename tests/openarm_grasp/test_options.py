@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from openarm_bringup.campaign.robot import SimulatedSenses
-from openarm_bringup.campaign.tasks import Task
-from openarm_bringup.campaign.trial import Trials
 from openarm_common.errors import Code
-from openarm_common.scene import Scene, SceneObject
-from openarm_grasp import effects as fx
+from openarm_common.scene.scene import Scene, SceneObject
+from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.tasks import Task
+from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence import Verdict
-from openarm_grasp.options import Option
-from openarm_grasp.performer import run_request
+from openarm_grasp.evidence.evidence import Verdict
+from openarm_grasp.planning.options import Option
+from openarm_grasp.strategy import effects as fx
+from openarm_grasp.strategy.performer import run_request
 
 
 @pytest.fixture

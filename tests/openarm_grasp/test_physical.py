@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from openarm_bringup.campaign.robot import SimulatedSenses
-from openarm_bringup.campaign.tasks import Task, endurance
-from openarm_bringup.campaign.trial import Trials
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import Scene, SceneObject
-from openarm_grasp import effects as fx
+from openarm_common.scene.scene import Scene, SceneObject
+from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.tasks import Task, endurance
+from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.effects import GraspOutcome, GraspRequest
-from openarm_grasp.performer import run_request
+from openarm_grasp.strategy import effects as fx
+from openarm_grasp.strategy.effects import GraspOutcome, GraspRequest
+from openarm_grasp.strategy.performer import run_request
 
 BOX = SceneObject(name="blue_box", shape="box", size=(0.045, 0.06, 0.07), color="blue", position=(0.26, 0.22), yaw=0.4)
 

@@ -9,7 +9,7 @@ import yaml
 from openarm_common.config import load_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-from openarm_grasp.states import TRANSITIONS, Event, State, as_text, load_transitions, mermaid
+from openarm_grasp.strategy.states import TRANSITIONS, Event, State, as_text, load_transitions, mermaid
 
 S, E = State, Event
 

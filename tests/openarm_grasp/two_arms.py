@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp import effects as fx
-from openarm_grasp.legs import run_task
-from openarm_grasp.performer import Performer
-from openarm_grasp.rehearsal import standing_at
+from openarm_common.robot.description import RobotDescription
+from openarm_grasp.planning.rehearsal import standing_at
+from openarm_grasp.strategy import effects as fx
+from openarm_grasp.strategy.legs import run_task
+from openarm_grasp.strategy.performer import Performer
 
 #: How far either arm reaches over the middle, m.
 OVER = 0.10

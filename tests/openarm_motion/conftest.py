@@ -6,12 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from openarm_common.cameras import load_cameras
-from openarm_common.description import RobotDescription
-from openarm_common.housings import with_housings
-from openarm_motion.arm import Arm
-from openarm_motion.collision import Box, box_from
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.housings import with_housings
+from openarm_common.robot.description import RobotDescription
+from openarm_motion.collision.collision import Box, box_from
 from openarm_motion.config import MotionConfig
+from openarm_motion.planning.arm import Arm
 
 SIX_JOINTS = """
 <robot name="six">

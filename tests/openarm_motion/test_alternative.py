@@ -8,12 +8,12 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code
-from openarm_motion import moves
-from openarm_motion.alternative import near_joints, near_pose
-from openarm_motion.arm import Arm
-from openarm_motion.collision import box_from
-from openarm_motion.failure import PlanFailedError
-from openarm_motion.moves import Around
+from openarm_motion.collision.collision import box_from
+from openarm_motion.planning import moves
+from openarm_motion.planning.alternative import near_joints, near_pose
+from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.failure import PlanFailedError
+from openarm_motion.planning.moves import Around
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 

@@ -11,14 +11,14 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.alternative import explained_approach
-from openarm_motion.approach import ApproachFailedError, ApproachRequest, Target, plan_approach
-from openarm_motion.arm import Arm
-from openarm_motion.cartesian import Line
-from openarm_motion.certificate import dense_times
-from openarm_motion.collision import Box, box_from
-from openarm_motion.planner import OmplPlanner, PlannedPath, PlanQuery
-from openarm_motion.trajectory import Trajectory
+from openarm_motion.collision.collision import Box, box_from
+from openarm_motion.kinematics.cartesian import Line
+from openarm_motion.planning.alternative import explained_approach
+from openarm_motion.planning.approach import ApproachFailedError, ApproachRequest, Target, plan_approach
+from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.planner import OmplPlanner, PlannedPath, PlanQuery
+from openarm_motion.timing.certificate import dense_times
+from openarm_motion.timing.trajectory import Trajectory
 
 TABLE_Z = 0.40
 UP = np.array([0.0, 0.0, 0.12])

@@ -10,14 +10,14 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion import moves
-from openarm_motion.arm import Arm
-from openarm_motion.beside import Course, first_to_arrive, least_wait
-from openarm_motion.both import BothArms
-from openarm_motion.checks import Motion
-from openarm_motion.collision import box_from
-from openarm_motion.moves import Around
-from openarm_motion.trajectory import Trajectory
+from openarm_motion.collision.collision import box_from
+from openarm_motion.planning import moves
+from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.beside import Course, first_to_arrive, least_wait
+from openarm_motion.planning.both import BothArms
+from openarm_motion.planning.moves import Around
+from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import Trajectory
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 

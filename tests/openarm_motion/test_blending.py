@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openarm_motion import blending
-from openarm_motion.arm import Arm, Situation
-from openarm_motion.blending import time_blended, time_quintic
-from openarm_motion.certificate import certify
-from openarm_motion.collision import box_from
-from openarm_motion.planner import PlannedPath
-from openarm_motion.trajectory import JointLimits, Trajectory, time_polyline
+from openarm_motion.collision.collision import box_from
+from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.planning.planner import PlannedPath
+from openarm_motion.timing import blending
+from openarm_motion.timing.blending import time_blended, time_quintic
+from openarm_motion.timing.certificate import certify
+from openarm_motion.timing.trajectory import JointLimits, Trajectory, time_polyline
 
 NAMES = tuple(f"j{i}" for i in range(3))
 LIMITS = JointLimits(np.array([2.0, 2.0, 3.0]), np.array([6.0, 8.0, 12.0]), np.array([60.0, 80.0, 120.0]))

@@ -8,10 +8,10 @@ import itertools
 import numpy as np
 import pytest
 
-from openarm_motion.arm import Arm
-from openarm_motion.both import BothArms, BothScene
-from openarm_motion.collision import Box, box_from
-from openarm_motion.planner import OmplPlanner
+from openarm_motion.collision.collision import Box, box_from
+from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.both import BothArms, BothScene
+from openarm_motion.planning.planner import OmplPlanner
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.arm import Arm
-from openarm_motion.cartesian import line_contact, line_poses, solve_line
-from openarm_motion.collision import box_from
-from openarm_motion.inverse import InverseKinematics
-from openarm_motion.kinematics import ArmKinematics
+from openarm_common.robot.description import RobotDescription
+from openarm_motion.collision.collision import box_from
+from openarm_motion.kinematics.cartesian import line_contact, line_poses, solve_line
+from openarm_motion.kinematics.inverse import InverseKinematics
+from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.planning.arm import Arm
 
 
 def down(x: float, y: float, z: float) -> np.ndarray:

@@ -8,10 +8,10 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.arm import Arm, Situation
-from openarm_motion.certificate import certify
-from openarm_motion.collision import box_from
-from openarm_motion.planner import PlannedPath, PlanQuery
+from openarm_motion.collision.collision import box_from
+from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.planning.planner import PlannedPath, PlanQuery
+from openarm_motion.timing.certificate import certify
 
 
 def across(right: Arm, home: dict[str, float]) -> PlannedPath:

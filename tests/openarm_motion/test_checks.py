@@ -8,13 +8,13 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion import moves
-from openarm_motion.arm import Arm
-from openarm_motion.checks import Motion, check_against_others, check_trajectory
-from openarm_motion.collision import Box
-from openarm_motion.memory import HeldMemory
-from openarm_motion.moves import Around
-from openarm_motion.trajectory import Trajectory
+from openarm_motion.collision.collision import Box
+from openarm_motion.planning import moves
+from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.moves import Around
+from openarm_motion.scene.memory import HeldMemory
+from openarm_motion.timing.checks import Motion, check_against_others, check_trajectory
+from openarm_motion.timing.trajectory import Trajectory
 
 
 @pytest.fixture

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription, mirror
 from openarm_common.errors import OpenArmError
-from openarm_motion.arm import Arm
-from openarm_motion.arm_links import ArmLinks
-from openarm_motion.collision import Box, Clearance, CollisionScene, Surroundings, box_from
-from openarm_motion.collision_robot import CollisionRobot
-from openarm_motion.kinematics import ArmKinematics
+from openarm_common.robot.description import RobotDescription, mirror
+from openarm_motion.collision.collision import Box, Clearance, CollisionScene, Surroundings, box_from
+from openarm_motion.collision.collision_robot import CollisionRobot
+from openarm_motion.kinematics.arm_links import ArmLinks
+from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.planning.arm import Arm
 
 BARE = Clearance(own=0.0, world=0.0, arms=0.0, hand=0.0, touch=0.0, rest=0.0)
 

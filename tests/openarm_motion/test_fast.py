@@ -10,15 +10,15 @@ import pytest
 from scipy import ndimage
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription
 from openarm_common.errors import OpenArmError
-from openarm_motion import shape_kernels as kernels
-from openarm_motion.arm import Arm
-from openarm_motion.both import BothArms
-from openarm_motion.collision import Box, CollisionScene, Surroundings, box_from
-from openarm_motion.collision_robot import CollisionRobot
-from openarm_motion.fast import DistanceMap, FastScene, cover
-from openarm_motion.kinematics import ArmKinematics
+from openarm_common.robot.description import RobotDescription
+from openarm_motion.collision import shape_kernels as kernels
+from openarm_motion.collision.collision import Box, CollisionScene, Surroundings, box_from
+from openarm_motion.collision.collision_robot import CollisionRobot
+from openarm_motion.collision.fast import DistanceMap, FastScene, cover
+from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.both import BothArms
 
 
 def turned_boxes(rng: np.random.Generator, count: int) -> list[Box]:

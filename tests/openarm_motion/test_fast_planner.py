@@ -12,12 +12,12 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion import search_kernels as kernels
-from openarm_motion.arm import Arm, Situation, segment_time
-from openarm_motion.both import BothArms
-from openarm_motion.collision import Box, box_from
-from openarm_motion.fast_planner import FastPlanner
-from openarm_motion.planner import OmplPlanner, PlanQuery
+from openarm_motion.collision.collision import Box, box_from
+from openarm_motion.planning import search_kernels as kernels
+from openarm_motion.planning.arm import Arm, Situation, segment_time
+from openarm_motion.planning.both import BothArms
+from openarm_motion.planning.fast_planner import FastPlanner
+from openarm_motion.planning.planner import OmplPlanner, PlanQuery
 
 
 def ask(arm: Arm, home: dict[str, float], start: np.ndarray, goals: np.ndarray, boxes: Sequence[Box] = ()) -> PlanQuery:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription
 from openarm_common.errors import OpenArmError
-from openarm_motion.kinematics import ArmKinematics
+from openarm_common.robot.description import RobotDescription
+from openarm_motion.kinematics.kinematics import ArmKinematics
 
 SIDES = ("left", "right")
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion import moves
-from openarm_motion.arm import Arm
-from openarm_motion.collision import Box
+from openarm_common.robot.description import RobotDescription
+from openarm_motion.collision.collision import Box
 from openarm_motion.config import LimitsConfig, MotionConfig
-from openarm_motion.moves import Around
-from openarm_motion.trajectory import Trajectory
+from openarm_motion.planning import moves
+from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.moves import Around
+from openarm_motion.timing.trajectory import Trajectory
 
 NOTHING = Around()
 T_base_table = se3.make(None, (0.0, 0.0, 0.40))

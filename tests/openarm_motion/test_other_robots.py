@@ -11,13 +11,13 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.arm import Arm, Situation
-from openarm_motion.certificate import certify
-from openarm_motion.collision import box_from
+from openarm_motion.collision.collision import box_from
+from openarm_motion.collision.fast import FastScene
+from openarm_motion.collision.mesh_boxes import boxes_about, load_robot
 from openarm_motion.config import LimitsConfig, MotionConfig
-from openarm_motion.fast import FastScene
-from openarm_motion.mesh_boxes import boxes_about, load_robot
-from openarm_motion.moves import Around, to_pose, to_pose_on_line
+from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.planning.moves import Around, to_pose, to_pose_on_line
+from openarm_motion.timing.certificate import certify
 
 DATA = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix" / "share" / "example-robot-data"
 

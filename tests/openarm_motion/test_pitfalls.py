@@ -12,12 +12,12 @@ import pytest
 import openarm_motion
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion import moves
-from openarm_motion.arm import Arm
-from openarm_motion.collision import CollisionScene as Scene
-from openarm_motion.collision import Surroundings, box_from
-from openarm_motion.moves import Around
-from openarm_motion.trajectory import Trajectory
+from openarm_motion.collision.collision import CollisionScene as Scene
+from openarm_motion.collision.collision import Surroundings, box_from
+from openarm_motion.planning import moves
+from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.moves import Around
+from openarm_motion.timing.trajectory import Trajectory
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
@@ -89,7 +89,7 @@ def test_b13_no_name_of_the_robot_is_in_the_code(right: Arm) -> None:
     description = right.description
     groups = {f"{side}_arm" for side in ("left", "right")} | {"openarm_left", "openarm_right"}
     names = {*description.joints, *description.links, *groups} - {"world"}
-    files = [p for p in Path(openarm_motion.__file__).parent.glob("*.py") if p.name not in ("config.py", "setup.py")]
+    files = [p for p in Path(openarm_motion.__file__).parent.rglob("*.py") if p.name not in ("config.py", "setup.py")]
     assert len(files) > 40
     for path in files:
         tree = ast.parse(path.read_text(encoding="utf-8"))

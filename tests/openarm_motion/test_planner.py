@@ -11,9 +11,9 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.arm import Arm, segment_time
-from openarm_motion.collision import Box, Clearance, CollisionScene, Surroundings
-from openarm_motion.planner import OmplPlanner, PlannedPath, PlanQuery, shorten
+from openarm_motion.collision.collision import Box, Clearance, CollisionScene, Surroundings
+from openarm_motion.planning.arm import Arm, segment_time
+from openarm_motion.planning.planner import OmplPlanner, PlannedPath, PlanQuery, shorten
 
 
 def query(arm: Arm, scene: CollisionScene, start: np.ndarray, goals: np.ndarray, **kwargs: object) -> PlanQuery:

@@ -9,15 +9,15 @@ import types
 import numpy as np
 import pytest
 
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.arm import Arm, Situation
-from openarm_motion.collision import Box, box_from
+from openarm_common.robot.description import RobotDescription
+from openarm_motion.collision.collision import Box, box_from
 from openarm_motion.config import MotionConfig, PlanningConfig
-from openarm_motion.fast_planner import FastPlanner
-from openarm_motion.moves import Around, to_joints
-from openarm_motion.planner import OmplPlanner, PlannedPath, PlanQuery
-from openarm_motion.planners import make_planner
+from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.planning.fast_planner import FastPlanner
+from openarm_motion.planning.moves import Around, to_joints
+from openarm_motion.planning.planner import OmplPlanner, PlannedPath, PlanQuery
+from openarm_motion.planning.planners import make_planner
 
 
 class Foreign:

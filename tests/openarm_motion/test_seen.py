@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.distance_field import CameraMoment, DistanceFieldReader, DistanceFieldWriter
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.lattice import Lattice
-from openarm_motion import moves
-from openarm_motion.arm import Arm
-from openarm_motion.collision import box_from
-from openarm_motion.fast import FastScene
-from openarm_motion.seen import Known, SeenMap, robot_bodies
-from openarm_motion.solids import Cylinder, Mesh, Sphere
+from openarm_common.octree.distance_field import CameraMoment, DistanceFieldReader, DistanceFieldWriter
+from openarm_common.octree.lattice import Lattice
+from openarm_motion.collision.collision import box_from
+from openarm_motion.collision.fast import FastScene
+from openarm_motion.collision.seen import Known, SeenMap, robot_bodies
+from openarm_motion.collision.solids import Cylinder, Mesh, Sphere
+from openarm_motion.planning import moves
+from openarm_motion.planning.arm import Arm
 
 LATTICE = Lattice.from_bounds(0.02, (-0.48, -1.0, -0.08), (1.28, 1.0, 1.36))
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))

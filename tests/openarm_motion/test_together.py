@@ -11,12 +11,20 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion import together
-from openarm_motion.arm import Arm, Situation
-from openarm_motion.both import BothArms
-from openarm_motion.certificate import dense_times
-from openarm_motion.collision import box_from
-from openarm_motion.together import BothGoals, BothPlan, delayed, joined, plan_staggered, plan_together, separation
+from openarm_motion.collision.collision import box_from
+from openarm_motion.planning import together
+from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.planning.both import BothArms
+from openarm_motion.planning.together import (
+    BothGoals,
+    BothPlan,
+    delayed,
+    joined,
+    plan_staggered,
+    plan_together,
+    separation,
+)
+from openarm_motion.timing.certificate import dense_times
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 

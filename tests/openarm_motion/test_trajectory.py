@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.errors import OpenArmError
-from openarm_motion.arm import Arm
-from openarm_motion.cartesian import solve_line
-from openarm_motion.trajectory import JointLimits, Trajectory, profile, time_path, time_polyline
+from openarm_motion.kinematics.cartesian import solve_line
+from openarm_motion.planning.arm import Arm
+from openarm_motion.timing.trajectory import JointLimits, Trajectory, profile, time_path, time_polyline
 
 NAMES = tuple(f"j{i}" for i in range(7))
 LIMITS = JointLimits(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from openarm_common.lattice import Lattice
+from openarm_common.octree.lattice import Lattice
 from openarm_octomap.distance import DistanceTransform
 
 LATTICE = Lattice.from_bounds(0.02, (0, 0, 0), (0.8, 0.6, 0.48))

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from openarm_common.description import RobotDescription
-from openarm_common.self_filter import SelfFilter, SelfFilterConfig
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.self_filter import SelfFilter, SelfFilterConfig
 from openarm_octomap.config import GridConfig
 from openarm_octomap.grid import OccupancyGrid
 from openarm_octomap.kernels import OCCUPIED, UNKNOWN

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common import se3
-from openarm_common.cameras import Intrinsics
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.octomap_codec import read_file, write_file
+from openarm_common.octree.codec import read_file, write_file
 from openarm_octomap.config import GridConfig
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
 from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN

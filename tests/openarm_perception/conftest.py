@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from openarm_common import se3
-from openarm_common.cameras import Intrinsics
+from openarm_common.camera.cameras import Intrinsics
 
 TABLE = 0.40
 RGBA = {

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_perception.attributes import Thing, kind_of, parse, resolve
+from openarm_perception.detection.attributes import Thing, kind_of, parse, resolve
 
 LABELS = ("red", "green", "blue", "box")
 

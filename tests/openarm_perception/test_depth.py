@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial import cKDTree
 
-from openarm_common.cameras import Intrinsics
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
-from openarm_perception import depth as depth_module
-from openarm_perception.depth import Deprojector, DepthLimits
+from openarm_perception.geometry import depth as depth_module
+from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
 K = Intrinsics.from_fovy(16, 12, 60.0)
 LIMITS = DepthLimits(near=0.2, far=2.0)

@@ -13,7 +13,7 @@ import pytest
 from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-from openarm_perception.detector import ColorDetector, ColorDetectorConfig, Detection2D, Detector, rank
+from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Detection2D, Detector, rank
 
 GREY = (176, 172, 165)
 RED, BLUE = (200, 25, 25), (25, 60, 205)

@@ -10,12 +10,12 @@ import pytest
 
 from benchmarks.localization import Studio, errors
 from openarm_common.resources import models_dir
-from openarm_common.scene import SHAPES, random_scene
-from openarm_perception.convert import names_of
-from openarm_perception.depth import DepthLimits
-from openarm_perception.localize import Localizer, LocalizerConfig
-from openarm_perception.looking import make_pipeline
-from openarm_perception.network import NetworkConfig, NetworkDetector
+from openarm_common.scene.scene import SHAPES, random_scene
+from openarm_perception.detection.localize import Localizer, LocalizerConfig
+from openarm_perception.detection.looking import make_pipeline
+from openarm_perception.detection.network import NetworkConfig, NetworkDetector
+from openarm_perception.geometry.depth import DepthLimits
+from openarm_perception.ros.convert import names_of
 
 FOLDER = models_dir() / "detector"
 MODELS = ("shapes_320x256", "shapes_640x480")

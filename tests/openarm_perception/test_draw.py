@@ -8,11 +8,11 @@ import pytest
 
 from openarm_common.config import load_config
 from openarm_common.resources import config_dir
-from openarm_perception.depth import DepthLimits
-from openarm_perception.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.draw import annotate
-from openarm_perception.localize import Localizer, LocalizerConfig
-from openarm_perception.pipeline import Pipeline
+from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detection.draw import annotate
+from openarm_perception.detection.localize import Localizer, LocalizerConfig
+from openarm_perception.detection.pipeline import Pipeline
+from openarm_perception.geometry.depth import DepthLimits
 
 
 @pytest.fixture(scope="module")

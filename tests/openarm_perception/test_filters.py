@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openarm_common.cameras import Intrinsics
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import OpenArmError
-from openarm_perception.depth import Deprojector, DepthLimits
-from openarm_perception.filters import (
+from openarm_perception.geometry.depth import Deprojector, DepthLimits
+from openarm_perception.geometry.filters import (
     CloudFilter,
     FilterConfig,
     drop_flying,

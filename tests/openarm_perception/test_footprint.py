@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_perception import footprint
+from openarm_perception.geometry import footprint
 
 SPACING = 0.0018
 

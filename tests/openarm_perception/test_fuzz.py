@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from openarm_common import se3
-from openarm_common.cameras import Intrinsics
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-from openarm_perception.depth import Deprojector, DepthLimits
-from openarm_perception.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.filters import CloudFilter, FilterConfig
-from openarm_perception.localize import Localizer, LocalizerConfig
-from openarm_perception.pipeline import Pipeline
-from openarm_perception.table import measure_table
+from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detection.localize import Localizer, LocalizerConfig
+from openarm_perception.detection.pipeline import Pipeline
+from openarm_perception.geometry.depth import Deprojector, DepthLimits
+from openarm_perception.geometry.filters import CloudFilter, FilterConfig
+from openarm_perception.geometry.table import measure_table
 
 LIMITS = DepthLimits(near=0.07, far=2.0)
 DETECTOR = ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))

@@ -14,10 +14,10 @@ import pytest
 from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-from openarm_perception.depth import DepthLimits
-from openarm_perception.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.localize import Localizer, LocalizerConfig
-from openarm_perception.patch import Patch
+from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detection.localize import Localizer, LocalizerConfig
+from openarm_perception.geometry.depth import DepthLimits
+from openarm_perception.geometry.patch import Patch
 
 SHAPES = [
     ("box", (0.04, 0.04, 0.04)),
@@ -240,7 +240,7 @@ def test_missing_depth_and_flat_things_are_refused_by_name(tabletop, detector, l
 def test_b05_the_way_from_pixel_to_robot_needs_no_ros() -> None:
     """The cores import neither rclpy nor messages."""
     code = (
-        "import sys; import openarm_perception.localize, openarm_perception.detector, openarm_perception.depth;"
+        "import sys; from openarm_perception.detection import detector, localize;"
         "tops = {m.split('.')[0] for m in sys.modules};"
         "bad = sorted(m for m in tops if m == 'rclpy' or m.endswith('_msgs'));"
         "sys.exit(', '.join(bad) or 0)"

@@ -10,14 +10,14 @@ import pytest
 
 from openarm_common.config import load_config
 from openarm_common.resources import config_dir
-from openarm_perception.convert import names_of
-from openarm_perception.depth import DepthLimits
-from openarm_perception.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.kinds import DetectorKind
-from openarm_perception.localize import Localizer, LocalizerConfig
-from openarm_perception.looking import make_pipeline
-from openarm_perception.network import NetworkConfig
-from openarm_perception.pipeline import Perceived, Pipeline
+from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detection.kinds import DetectorKind
+from openarm_perception.detection.localize import Localizer, LocalizerConfig
+from openarm_perception.detection.looking import make_pipeline
+from openarm_perception.detection.network import NetworkConfig
+from openarm_perception.detection.pipeline import Perceived, Pipeline
+from openarm_perception.geometry.depth import DepthLimits
+from openarm_perception.ros.convert import names_of
 from tests.openarm_perception.onnx_file import boxes, write_network
 
 LIMITS = DepthLimits(near=0.07)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from openarm_perception.matching import StampMatcher
+from openarm_perception.detection.matching import StampMatcher
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_perception.detector import rank
-from openarm_perception.network import NetworkConfig, NetworkDetector
+from openarm_perception.detection.detector import rank
+from openarm_perception.detection.network import NetworkConfig, NetworkDetector
 from tests.openarm_perception.onnx_file import boxes, write_network
 
 

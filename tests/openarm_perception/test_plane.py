@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common import se3
-from openarm_common.cameras import Intrinsics
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-from openarm_perception import plane
-from openarm_perception.depth import DepthLimits
-from openarm_perception.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.localize import Detection3D, Localizer, LocalizerConfig
+from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detection.localize import Detection3D, Localizer, LocalizerConfig
+from openarm_perception.geometry import plane
+from openarm_perception.geometry.depth import DepthLimits
 
 K = Intrinsics.from_fovy(640, 480, 60.0)
 FLAT = (0.0, 0.0, 1.0)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from benchmarks.localization import Studio, errors
-from openarm_common.description import SIDES
-from openarm_common.scene import load_scene, random_scene
+from openarm_common.robot.description import SIDES
+from openarm_common.scene.scene import load_scene, random_scene
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ import pytest
 
 from benchmarks.localization import Studio, errors
 from openarm_common import se3
-from openarm_common.depth_view import DepthView
-from openarm_common.held import HeldBox
-from openarm_common.scene import load_scene, random_scene
-from openarm_perception.convert import mask_image
-from openarm_perception.robot import CloudRobotConfig, RobotConfig, RobotFinder
+from openarm_common.camera.depth_view import DepthView
+from openarm_common.robot.held import HeldBox
+from openarm_common.scene.scene import load_scene, random_scene
+from openarm_perception.detection.robot import CloudRobotConfig, RobotConfig, RobotFinder
+from openarm_perception.ros.convert import mask_image
 
 TCP = "openarm_right_hand_tcp"
 RED = (205, 25, 25)

@@ -9,9 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.errors import Code
-from openarm_sim_bridge.actuation import End, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
-from openarm_sim_bridge.tracker import Tracker
-from openarm_sim_bridge.trajectory import JointGroup, JointTolerance, Trajectory, TrajectoryError, TrajectoryResult
+from openarm_sim_bridge.control.actuation import End, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
+from openarm_sim_bridge.control.tracker import Tracker
+from openarm_sim_bridge.control.trajectory import (
+    JointGroup,
+    JointTolerance,
+    Trajectory,
+    TrajectoryError,
+    TrajectoryResult,
+)
 
 MS = 1_000_000
 GROUP = JointGroup(("j1", "j2"), np.array([-2.0, -2.0]), np.array([2.0, 2.0]), np.array([4.0, 4.0]))

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.cameras import CameraConfig, load_cameras
+from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.cameras import SnapshotRenderer, create_gl_context, millimetres, planar_metres
-from openarm_sim_bridge.world import Snapshot
+from openarm_sim_bridge.cameras.renderer import SnapshotRenderer, create_gl_context, millimetres, planar_metres
+from openarm_sim_bridge.world.world import Snapshot
 
 CAMERA = CameraConfig(
     name="eye",
@@ -178,7 +178,7 @@ def test_without_opengl_the_error_says_what_to_install(monkeypatch: pytest.Monke
         raise ImportError("libEGL.so.1: cannot open shared object file")
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr("openarm_sim_bridge.cameras._context_class", broken)
+    monkeypatch.setattr("openarm_sim_bridge.cameras.renderer._context_class", broken)
     with pytest.raises(OpenArmError) as caught:
         SnapshotRenderer({"eye": CAMERA})
     assert caught.value.code is Code.ENVIRONMENT

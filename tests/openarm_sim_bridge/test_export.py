@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import PALETTE, load_scene
-from openarm_sim_bridge.export import VIEWS, export, render, render_png
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import PALETTE, load_scene
+from openarm_sim_bridge.world.export import VIEWS, export, render, render_png
 
 
 def test_a12_mjcf_round_trip_keeps_joints_links_and_kinematics() -> None:

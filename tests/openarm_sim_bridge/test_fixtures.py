@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
-from openarm_common.description import RobotDescription
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import load_scene, parse_scene
-from openarm_sim_bridge.model import compile_model
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import load_scene, parse_scene
+from openarm_sim_bridge.world.model import compile_model
 
 MODEL = "<mujoco><worldbody>{}</worldbody></mujoco>"
 BODY = '<body name="thing"><geom name="thing" size="0.01" contype="0" conaffinity="0" mass="0.1"/></body>'

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.actuation import End
-from openarm_sim_bridge.gripper import GripperConfig, GripperFollower, GripperGoal, GripperOutcome
-from openarm_sim_bridge.trajectory import JointGroup
+from openarm_sim_bridge.control.actuation import End
+from openarm_sim_bridge.control.gripper import GripperConfig, GripperFollower, GripperGoal, GripperOutcome
+from openarm_sim_bridge.control.trajectory import JointGroup
 
 MS = 1_000_000
 FINGER = JointGroup(("finger",), np.array([0.0]), np.array([0.044]), np.array([10.0]))

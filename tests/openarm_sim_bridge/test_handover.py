@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from openarm_common.cameras import CameraConfig
-from openarm_sim_bridge.handover import CameraReport, CameraSetup, StateReceiver, StateSender, pair
-from openarm_sim_bridge.world import Snapshot
+from openarm_common.camera.cameras import CameraConfig
+from openarm_sim_bridge.cameras.handover import CameraReport, CameraSetup, StateReceiver, StateSender, pair
+from openarm_sim_bridge.world.world import Snapshot
 
 MODEL = """<mujoco><worldbody><body name="{0}"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from openarm_common import se3
-from openarm_common.cameras import CameraConfig, load_cameras, true_mount
-from openarm_common.description import SIDES, RobotDescription
+from openarm_common.camera.cameras import CameraConfig, load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import Scene, load_scene
-from openarm_sim_bridge.model import PhysicsConfig, build_spec, compile_model, robot_spec
+from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.scene.scene import Scene, load_scene
+from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, compile_model, robot_spec
 
 Array = NDArray[np.float64]
 GEOM, BODY = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY

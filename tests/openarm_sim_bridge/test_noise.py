@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from openarm_sim_bridge.noise import ColourNoiseConfig, DepthNoiseConfig, add_colour_noise, add_depth_noise
+from openarm_sim_bridge.cameras.noise import ColourNoiseConfig, DepthNoiseConfig, add_colour_noise, add_depth_noise
 
 FOCAL = 240 / math.tan(math.radians(30))
 D435 = DepthNoiseConfig(enabled=True)

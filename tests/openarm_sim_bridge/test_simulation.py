@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.actuation import End, TrajectoryConfig, TrajectoryOutcome
-from openarm_sim_bridge.controller import RobotController
-from openarm_sim_bridge.gripper import GripperConfig
+from openarm_sim_bridge.control.actuation import End, TrajectoryConfig, TrajectoryOutcome
+from openarm_sim_bridge.control.controller import RobotController
+from openarm_sim_bridge.control.gripper import GripperConfig
+from openarm_sim_bridge.control.trajectory import JointGroup, Trajectory
 from openarm_sim_bridge.simulation import Simulation
-from openarm_sim_bridge.trajectory import JointGroup, Trajectory
-from openarm_sim_bridge.world import JointReadout, World
+from openarm_sim_bridge.world.world import JointReadout, World
 
 MODEL = """
 <mujoco><compiler angle="radian"/><option timestep="0.002" gravity="0 0 0" integrator="implicitfast"/><worldbody>

@@ -11,18 +11,18 @@ import pytest
 from pydantic import ValidationError
 from scipy.optimize import least_squares
 
-from openarm_common.cameras import load_cameras
-from openarm_common.description import RobotDescription
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.scene import Scene, SceneObject, load_scene
-from openarm_sim_bridge.actuation import TrajectoryConfig, TrajectoryOutcome
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import Scene, SceneObject, load_scene
 from openarm_sim_bridge.config import BridgeConfig
-from openarm_sim_bridge.controller import RobotController
-from openarm_sim_bridge.edges import MovingEdges
-from openarm_sim_bridge.gripper import GripperConfig, GripperGoal, GripperOutcome
-from openarm_sim_bridge.model import PhysicsConfig
-from openarm_sim_bridge.stage import Stage, with_object
-from openarm_sim_bridge.trajectory import Trajectory, TrajectoryResult
+from openarm_sim_bridge.control.actuation import TrajectoryConfig, TrajectoryOutcome
+from openarm_sim_bridge.control.controller import RobotController
+from openarm_sim_bridge.control.gripper import GripperConfig, GripperGoal, GripperOutcome
+from openarm_sim_bridge.control.trajectory import Trajectory, TrajectoryResult
+from openarm_sim_bridge.world.edges import MovingEdges
+from openarm_sim_bridge.world.model import PhysicsConfig
+from openarm_sim_bridge.world.stage import Stage, with_object
 
 
 @pytest.fixture(scope="module")

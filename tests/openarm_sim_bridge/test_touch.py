@@ -7,12 +7,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from openarm_common.cameras import load_cameras
-from openarm_common.description import RobotDescription
-from openarm_common.scene import load_scene
-from openarm_sim_bridge.model import PhysicsConfig
-from openarm_sim_bridge.stage import Stage
-from openarm_sim_bridge.touch import add_wrist_sensor, contact_wrench, hand_link, pad_links, wrist_wrench
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import load_scene
+from openarm_sim_bridge.world.model import PhysicsConfig
+from openarm_sim_bridge.world.stage import Stage
+from openarm_sim_bridge.world.touch import add_wrist_sensor, contact_wrench, hand_link, pad_links, wrist_wrench
 
 WEIGHT = 0.5 * 9.81
 BOX = (

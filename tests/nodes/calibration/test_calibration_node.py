@@ -20,12 +20,12 @@ from openarm_interfaces.srv import (
 )
 from rclpy.parameter import Parameter
 
-from openarm_calibration.node import CalibrationNode
-from openarm_calibration.refine import mount_error
-from openarm_calibration.store import CalibrationStore
-from openarm_calibration.synthetic_session import make_session
+from openarm_calibration.handeye.refine import mount_error
+from openarm_calibration.ros.node import CalibrationNode
+from openarm_calibration.store.store import CalibrationStore
+from openarm_calibration.synthetic.synthetic_session import make_session
 from openarm_common import se3
-from openarm_common.cameras import T_LINK_OPTICAL
+from openarm_common.camera.cameras import T_LINK_OPTICAL
 
 MS = 1_000_000
 

@@ -8,15 +8,15 @@ import pytest
 from rclpy.parameter import Parameter
 from tf2_msgs.msg import TFMessage
 
-from openarm_calibration.publisher import PublisherNode
-from openarm_calibration.store import CalibrationStore, StoredCalibration, default_folder
+from openarm_calibration.ros.publisher import PublisherNode
+from openarm_calibration.store.store import CalibrationStore, StoredCalibration, default_folder
 from openarm_common import se3
-from openarm_common.cameras import load_cameras, true_mount
-from openarm_common.convert import transform_to_matrix
-from openarm_common.description import RobotDescription
+from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.errors import OpenArmError
-from openarm_common.node import QOS_STATIC_TF
-from openarm_common.robot_state import RobotStateBuffer
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.ros.convert import transform_to_matrix
+from openarm_common.ros.node import QOS_STATIC_TF
 
 
 @pytest.fixture(autouse=True)

@@ -29,10 +29,10 @@ from vision_msgs.msg import Detection3D, Detection3DArray, ObjectHypothesisWithP
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common import se3
-from openarm_common.convert import matrix_to_pose, ns_to_stamp, pose_to_matrix, vector
-from openarm_common.description import RobotDescription
-from openarm_common.node import BASE_FRAME, QOS_COMMAND, QOS_LATCHED, reliable
-from openarm_grasp.node import GraspNode
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, pose_to_matrix, vector
+from openarm_common.ros.node import BASE_FRAME, QOS_COMMAND, QOS_LATCHED, reliable
+from openarm_grasp.ros.node import GraspNode
 
 ARMS = ("left", "right")
 CUBE = 0.05

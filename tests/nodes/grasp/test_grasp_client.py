@@ -9,7 +9,7 @@ import pytest
 from rclpy.task import Future
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.client import GraspClient
+from openarm_grasp.ros.client import GraspClient
 
 
 def test_the_client_picks_from_plain_python(bench):

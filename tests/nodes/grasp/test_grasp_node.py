@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.node import GraspNode
+from openarm_grasp.ros.node import GraspNode
 
 OPEN = 0.044
 

@@ -17,7 +17,7 @@ from rclpy.task import Future
 
 from openarm_bringup import cli
 from openarm_common.errors import Code
-from openarm_grasp.client import GraspClient, PairResult, Wanted
+from openarm_grasp.ros.client import GraspClient, PairResult, Wanted
 
 STATES = "DETECT TRANSFORM PLAN MOVE_TO_PREGRASP MOVE_TO_GRASP CLOSE_GRIPPER LIFT PLACE RESET IDLE"
 

@@ -7,8 +7,8 @@ import pytest
 from geometry_msgs.msg import WrenchStamped
 
 from openarm_common.config import Config
-from openarm_common.node import QOS_SENSOR, BaseNode
-from openarm_grasp.pad_client import Pads
+from openarm_common.ros.node import QOS_SENSOR, BaseNode
+from openarm_grasp.ros.pad_listener import Pads
 
 
 def test_a69_both_pads_of_a_hand_are_heard_while_listening_and_a_silent_one_says_nothing(ros) -> None:

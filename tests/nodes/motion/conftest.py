@@ -22,10 +22,16 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
 from openarm_common.config import Config
-from openarm_common.convert import matrix_to_pose, matrix_to_transform, ns_to_stamp, stamp_to_ns, trajectory_from_msg
-from openarm_common.description import RobotDescription
-from openarm_common.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF, BaseNode
-from openarm_motion.node import MotionNode
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import (
+    matrix_to_pose,
+    matrix_to_transform,
+    ns_to_stamp,
+    stamp_to_ns,
+    trajectory_from_msg,
+)
+from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF, BaseNode
+from openarm_motion.ros.node import MotionNode
 
 Result = FollowJointTrajectory.Result
 HZ = 100

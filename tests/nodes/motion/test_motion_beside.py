@@ -9,8 +9,8 @@ from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, Plan
 from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox
 
 from openarm_common import se3
-from openarm_common.convert import matrix_to_pose
-from openarm_motion.both import BothArms
+from openarm_common.ros.convert import matrix_to_pose
+from openarm_motion.planning.both import BothArms
 
 MIDDLE = (0.28, 0.0, 0.60)
 

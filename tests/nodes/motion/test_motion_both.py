@@ -9,8 +9,8 @@ from openarm_interfaces.action import MoveArms
 from openarm_interfaces.msg import ArmTarget, CollisionBox
 
 from openarm_common import se3
-from openarm_common.convert import matrix_to_pose, stamp_to_ns
-from openarm_motion.both import BothArms
+from openarm_common.ros.convert import matrix_to_pose, stamp_to_ns
+from openarm_motion.planning.both import BothArms
 
 
 def over_the_middle(bench, arm: str, **kwargs) -> ArmTarget:

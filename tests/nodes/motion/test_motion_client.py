@@ -13,8 +13,8 @@ from openarm_interfaces.msg import ArmTarget
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.client import MotionClient
-from openarm_motion.solids import Sphere, box_from
+from openarm_motion.collision.solids import Sphere, box_from
+from openarm_motion.ros.client import MotionClient
 
 
 def asked(bench, work: Callable[[MotionClient], Any]) -> Any:

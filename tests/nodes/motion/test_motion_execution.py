@@ -14,7 +14,7 @@ import numpy as np
 from control_msgs.action import FollowJointTrajectory
 from openarm_interfaces.action import ExecuteTrajectory
 
-from openarm_common.convert import (
+from openarm_common.ros.convert import (
     trajectory_from_msg,
     trajectory_to_msg,
 )
@@ -119,7 +119,7 @@ def test_a_controller_that_vanishes_ends_a_motion_within_two_seconds(bench) -> N
 
 def test_stopping_the_motion_process_on_the_way_holds_the_arm(make_bench) -> None:
     bench = make_bench(motion=False)
-    command = [sys.executable, "-m", "openarm_motion.node"]
+    command = [sys.executable, "-m", "openarm_motion.ros.node"]
     with subprocess.Popen(command, env=os.environ, stderr=subprocess.DEVNULL) as process:
         try:
             bench.ros.spin_until(bench.move_client.server_is_ready, 60.0, "the process")

@@ -14,12 +14,12 @@ from openarm_interfaces.msg import ApproachTarget, CollisionBox
 from openarm_interfaces.srv import ComputeIK
 
 from openarm_common import se3
-from openarm_common.convert import (
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import (
     matrix_to_pose,
 )
-from openarm_common.errors import Code, OpenArmError
-from openarm_motion.node import table_boxes
-from openarm_motion.planner import PlannedPath, PlanQuery
+from openarm_motion.planning.planner import PlannedPath, PlanQuery
+from openarm_motion.ros.node import table_boxes
 
 
 # --- inverse kinematics

@@ -16,10 +16,10 @@ from rclpy.parameter import Parameter
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
-from openarm_common.convert import matrix_to_pose
-from openarm_common.distance_field import CameraMoment, DistanceFieldWriter, field_path
-from openarm_common.lattice import Lattice
-from openarm_common.node import BASE_FRAME, QOS_LATCHED
+from openarm_common.octree.distance_field import CameraMoment, DistanceFieldWriter, field_path
+from openarm_common.octree.lattice import Lattice
+from openarm_common.ros.convert import matrix_to_pose
+from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED
 
 LATTICE = Lattice.from_bounds(0.02, (-0.48, -1.0, -0.08), (1.28, 1.0, 1.36))
 

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Perception, map and board detection on the messages of a bag, without a graph: the same numbers at every run.
+
+Frames are worked on in the order of their stamps, with the joint states and static transforms of the bag, by the same
+cores that the nodes run.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from tf2_msgs.msg import TFMessage
+
+from openarm_bringup.bags.bag import Bag
+from openarm_calibration.board.board import Board, CircleGrid
+from openarm_calibration.board.detect import detect
+from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
+from openarm_common.config import load_config
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import config_dir
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.ros.convert import image_to_array, intrinsics_from_info, stamp_to_ns, transform_to_matrix
+from openarm_common.ros.node import BASE_FRAME
+from openarm_common.scene.scene import load_scene
+from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
+from openarm_octomap.grid import DepthScan
+from openarm_octomap.mapper import Frame, Mapper
+from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
+from openarm_perception.detection.localize import Detection3D, Localizer, LocalizerConfig
+from openarm_perception.detection.pipeline import Pipeline
+from openarm_perception.geometry.depth import DepthLimits
+
+#: A board is looked for twice a second in each camera: it is held still for as long, and the search takes longest.
+_BOARD_PERIOD_NS = 500_000_000
+_STREAMS = ("color/image_raw", "depth/image_raw", "depth/camera_info")
+
+
+@dataclass
+class _Shot:
+    """The messages of one stamp of one camera."""
+
+    camera: CameraConfig
+    t_ns: int
+    color: Image | None = None
+    depth: Image | None = None
+    info: CameraInfo | None = None
+
+
+@dataclass
+class _Found:
+    """What the frames showed."""
+
+    frames: int = 0
+    skipped: int = 0
+    objects: dict[str, list[Detection3D]] = field(default_factory=lambda: defaultdict[str, list[Detection3D]](list))
+    boards: dict[str, list[float]] = field(default_factory=lambda: defaultdict[str, list[float]](list))
+
+
+def numbers_of(
+    bag: Bag,
+    *,
+    scene: str = "demo",
+    board: Board | None = None,
+    tell: Callable[[int, int], None] = lambda done, of: None,
+) -> dict[str, float]:
+    """Run detection, localisation, map and board detection on a bag.
+
+    Args:
+        bag: Open; with colour and depth of a camera of the suite, /joint_states and /tf_static.
+        scene: Whose table the objects stand on.
+        board: Which calibration board to look for; None is that of the suite.
+        tell: Called with the number of frames done, and of all.
+
+    Returns:
+        By name: frames used and skipped, of each label how often it was found, where last (base frame), how far from
+        where it was found first, and its mean size; cells of the map by state; frames with a board and its residual.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED, when the bag has no frame that could be used.
+    """
+    description = RobotDescription.load()
+    shots, states = _read(bag, description)
+    detector = ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))
+    table = load_scene(scene).table.top_z
+    mapper = Mapper(description, GridConfig(), FilterConfig(), FieldConfig())
+    found = _Found()
+    looked_ns: dict[str, int] = {}
+    for number, shot in enumerate(shots):
+        tell(number, len(shots))
+        limits = DepthLimits(near=shot.camera.near, far=shot.camera.far)
+        pipeline = Pipeline(detector, Localizer(LocalizerConfig(), limits, table))
+        try:
+            _work(shot, states, pipeline, mapper, found)
+        except OpenArmError:
+            found.skipped += 1
+        if shot.t_ns - looked_ns.get(shot.camera.name, shot.t_ns - _BOARD_PERIOD_NS) >= _BOARD_PERIOD_NS:
+            looked_ns[shot.camera.name] = shot.t_ns
+            _look_for(board or CircleGrid(), shot, found)
+    tell(len(shots), len(shots))
+    if not found.frames:
+        raise OpenArmError(
+            Code.NOTHING_DETECTED,
+            f"{bag.path} has no frame with colour, depth, camera_info, joint states and transforms; topics: "
+            f"{', '.join(sorted(bag.topics)) or 'none'}",
+        )
+    return _numbers(found, mapper, shots[-1].t_ns)
+
+
+def _read(bag: Bag, description: RobotDescription) -> tuple[list[_Shot], RobotStateBuffer]:
+    cameras = {name: camera for name, camera in load_cameras().items() if camera.depth}
+    topics = {f"/{name}/{stream}": (name, stream) for name in cameras for stream in _STREAMS}
+    joints: list[JointState] = []
+    shots: dict[tuple[int, str], _Shot] = {}
+    count = bag.counts.get("/joint_states", 0)
+    states = RobotStateBuffer(description, capacity=max(count, 1))
+    for record in bag.records([*topics, "/joint_states", "/tf_static"]):
+        if record.topic == "/joint_states":
+            joints.append(deserialize_message(record.data, JointState))
+        elif record.topic == "/tf_static":
+            message = deserialize_message(record.data, TFMessage)
+            for edge in message.transforms:
+                states.set_static(edge.header.frame_id, edge.child_frame_id, transform_to_matrix(edge.transform))
+        else:
+            name, stream = topics[record.topic]
+            message = deserialize_message(record.data, CameraInfo if stream.endswith("camera_info") else Image)
+            t_ns = stamp_to_ns(message.header.stamp)
+            shot = shots.setdefault((t_ns, name), _Shot(cameras[name], t_ns))
+            setattr(shot, "info" if isinstance(message, CameraInfo) else stream.partition("/")[0], message)
+    for message in sorted(joints, key=lambda joint: stamp_to_ns(joint.header.stamp)):
+        states.add_joint_state(stamp_to_ns(message.header.stamp), message.name, message.position)
+    return [shots[key] for key in sorted(shots)], states
+
+
+def _work(shot: _Shot, states: RobotStateBuffer, pipeline: Pipeline, mapper: Mapper, found: _Found) -> None:
+    if shot.depth is None or shot.color is None or shot.info is None:
+        raise OpenArmError(Code.BAD_IMAGE, "colour, depth or camera_info of a stamp is missing")
+    T_base_camera = states.lookup(BASE_FRAME, shot.camera.optical_frame, shot.t_ns)
+    joints = states.joints_at(shot.t_ns)
+    intrinsics: Intrinsics = intrinsics_from_info(shot.info)
+    depth: NDArray[np.uint16] = image_to_array(shot.depth)  # type: ignore[assignment]
+    rgb: NDArray[np.uint8] = image_to_array(shot.color)  # type: ignore[assignment]
+    for located in pipeline.run(rgb, depth, intrinsics, T_base_camera).located:
+        found.objects[f"{shot.camera.name}/{located.label}"].append(located)
+    scan = DepthScan(depth, intrinsics, T_base_camera, shot.camera.near, shot.camera.far)
+    mapper.update([Frame(shot.camera.name, shot.t_ns, scan, joints)])
+    found.frames += 1
+
+
+def _look_for(board: Board, shot: _Shot, found: _Found) -> None:
+    if shot.color is None:
+        return
+    rgb: NDArray[np.uint8] = image_to_array(shot.color)  # type: ignore[assignment]
+    try:
+        residual = detect(board, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.uint8)).residual
+    except OpenArmError:
+        return  # most frames show none
+    found.boards[shot.camera.name].append(residual)
+
+
+def _numbers(found: _Found, mapper: Mapper, t_ns: int) -> dict[str, float]:
+    numbers: dict[str, float] = {"frames": found.frames, "frames_skipped": found.skipped}
+    for label, located in found.objects.items():
+        numbers[f"detection/{label}/frames"] = len(located)
+        first, last = (located[i].T_base_object[:3, 3] * 1e3 for i in (0, -1))
+        size = np.mean([one.size for one in located], axis=0) * 1e3
+        numbers[f"detection/{label}/moved_mm"] = round(float(np.linalg.norm(last - first)), 3)
+        for axis, at, extent in zip("xyz", last, size, strict=True):
+            numbers[f"detection/{label}/{axis}_mm"] = round(float(at), 3)
+            numbers[f"detection/{label}/size_{axis}_mm"] = round(float(extent), 3)
+    for state, count in mapper.counts(t_ns).items():
+        if state != "oldest_s":
+            numbers[f"map/{state}"] = count
+    for camera, residuals in found.boards.items():
+        numbers[f"board/{camera}/frames"] = len(residuals)
+        numbers[f"board/{camera}/residual_px"] = round(float(np.sqrt(np.mean(np.square(residuals)))), 4)
+    return numbers

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration samples of a bag: images, camera_info, joint states, robot and frames as they were recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import yaml
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_msgs.msg import String
+from tf2_msgs.msg import TFMessage
+
+from openarm_bringup.bags.bag import Bag
+from openarm_calibration.board.board import Board, CircleGrid
+from openarm_calibration.config import CalibrationConfig
+from openarm_calibration.ros.photo_client import grey
+from openarm_calibration.sampling.gate import GateConfig
+from openarm_calibration.sampling.samples import SampleSet, SessionHead, setup_of
+from openarm_calibration.sampling.stills import Picker, Stretch, stretches
+from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import intrinsics_from_info, stamp_to_ns
+from openarm_common.ros.node import BASE_FRAME
+
+_IMAGES = "/color/image_raw"
+_INFOS = "/color/camera_info"
+
+
+@dataclass(frozen=True)
+class BagOptions:
+    """What a bag does not say.
+
+    Args:
+        camera: Whose images are used; empty: the only one there is.
+        board: Which board is looked for; None is the suite's.
+        carrier: Link that holds the board when the camera stands; empty is the node's parameter.
+        mount_seed: Of simulated mounts; None is what the bag says of itself.
+        gate: When the robot stands.
+    """
+
+    camera: str = ""
+    board: Board | None = None
+    carrier: str = ""
+    mount_seed: int | None = None
+    gate: GateConfig = field(default_factory=GateConfig)
+
+
+@dataclass
+class _Small:
+    """All of a bag but its images."""
+
+    robot: RobotDescription
+    parents: dict[str, str]
+    states: list[tuple[int, Mapping[str, float]]]
+    optics: dict[int, Intrinsics]
+
+
+def samples_of(bag: Bag, options: BagOptions) -> tuple[SampleSet, list[Stretch]]:
+    """Take a sample of each stand of the robot in a bag.
+
+    Returns:
+        The samples, and what became of all images.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when the bag lacks a topic or the camera; BAD_IMAGE, for a camera that is not
+            rectified; NO_TRANSFORM, when nothing says which link carries the camera.
+    """
+    camera = _camera(bag, options.camera)
+    small = _small(bag, camera)
+    optics = next(iter(small.optics.values()))
+    head = _head(bag, camera, optics, small, options)
+    samples = SampleSet(head, small.robot)
+    images = f"/{camera}{_IMAGES}"
+    # The first bytes of a message are its stamp; the pixels are looked at in a second pass, where they are wanted.
+    stamps = [_stamp(record.data) for record in bag.records([images])]
+    found = stretches(stamps, small.states, samples.joint_names, small.robot, options.gate)
+    picker = Picker(samples, found)
+    for record in bag.records([images]):
+        t_ns = _stamp(record.data)
+        if picker.wants(t_ns):
+            picker.offer(t_ns, grey(deserialize_message(record.data, Image)), small.optics.get(t_ns, optics))
+    return samples, found
+
+
+def _camera(bag: Bag, name: str) -> str:
+    """The camera whose images are used."""
+    there = sorted(topic[1 : -len(_IMAGES)] for topic, count in bag.counts.items() if topic.endswith(_IMAGES) and count)
+    if name and name not in there:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT, f"{bag.path} has no images of camera {name!r}; cameras: {', '.join(there) or 'none'}"
+        )
+    if not name and len(there) != 1:
+        expected = "give one by --camera" if there else f"expected a topic /NAME{_IMAGES} of sensor_msgs/msg/Image"
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"{bag.path} has images of {len(there)} cameras: {', '.join(there) or 'none'}; {expected}",
+        )
+    camera = name or there[0]
+    needed = (f"/{camera}{_INFOS}", "/joint_states")
+    missing = [topic for topic in needed if not bag.counts.get(topic)]
+    if missing:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"{bag.path} has no {' and no '.join(missing)}; `openarm record --profile camera` records what is needed",
+        )
+    return camera
+
+
+def _small(bag: Bag, camera: str) -> _Small:
+    info = f"/{camera}{_INFOS}"
+    urdf = ""
+    parents: dict[str, str] = {}
+    states: list[tuple[int, Mapping[str, float]]] = []
+    optics: dict[int, Intrinsics] = {}
+    for record in bag.records([info, "/joint_states", "/tf_static", "/robot_description"]):
+        if record.topic == "/joint_states":
+            message = deserialize_message(record.data, JointState)
+            states.append((stamp_to_ns(message.header.stamp), dict(zip(message.name, message.position, strict=False))))
+        elif record.topic == "/tf_static":
+            for edge in deserialize_message(record.data, TFMessage).transforms:
+                parents[edge.child_frame_id] = edge.header.frame_id
+        elif record.topic == "/robot_description":
+            urdf = deserialize_message(record.data, String).data
+        else:
+            told = deserialize_message(record.data, CameraInfo)
+            optics[stamp_to_ns(told.header.stamp)] = intrinsics_from_info(told)
+    states.sort(key=lambda state: state[0])
+    # what the bag says of the robot holds, also where this suite knows the robot otherwise
+    robot = RobotDescription.from_urdf(urdf) if urdf else RobotDescription.load()
+    return _Small(robot, parents, states, optics)
+
+
+def _head(bag: Bag, camera: str, optics: Intrinsics, small: _Small, options: BagOptions) -> SessionHead:
+    configured = load_cameras()
+    base = BASE_FRAME if BASE_FRAME in small.robot.links else small.robot.root
+    parent = _parent(small, camera, base, configured)
+    setup = setup_of(small.robot, parent)
+    simulated = camera not in configured or configured[camera].mount_error
+    seed = options.mount_seed if options.mount_seed is not None else _seed(bag)
+    return SessionHead(
+        camera=camera, setup=setup, parent=parent, base=base,
+        carrier=(options.carrier or CalibrationConfig().carrier) if setup == "to_hand" else parent,
+        intrinsics=(optics.width, optics.height, optics.fx, optics.fy, optics.cx, optics.cy),
+        board=(options.board or CircleGrid()).model_dump(), mount_seed=seed if simulated else None,
+    )  # fmt: skip
+
+
+def _parent(small: _Small, camera: str, base: str, configured: Mapping[str, CameraConfig]) -> str:
+    """Link that carries a camera: by /tf_static of the bag, or by the configuration where that is silent of it."""
+    links, frame = small.robot.links, f"{camera}_link"
+    if frame not in small.parents and camera in configured:
+        frame = configured[camera].parent
+    above = _ancestors(small.parents, base)
+    for ancestor in (frame, *_ancestors(small.parents, frame)):
+        if ancestor in links:
+            return ancestor
+        if ancestor in above:  # such as `world`: the camera stands where the robot does
+            return base
+    raise OpenArmError(
+        Code.NO_TRANSFORM,
+        f"nothing says which link carries {camera!r}: /tf_static of the bag does not tie '{camera}_link' to a link of"
+        f" its robot; links: {', '.join(links)}",
+    )
+
+
+def _ancestors(parents: Mapping[str, str], frame: str) -> list[str]:
+    """Frames above one, the nearest first."""
+    out: list[str] = []
+    while frame in parents and parents[frame] not in out:
+        frame = parents[frame]
+        out.append(frame)
+    return out
+
+
+def _seed(bag: Bag) -> int | None:
+    """Mount seed of the simulation that a bag was recorded from, by the parameters it carries."""
+    try:
+        nodes: Any = yaml.safe_load(bag.custom.get("parameters", ""))
+        seed = nodes["mujoco_bridge"]["ros__parameters"]["mount_seed"]
+    except (yaml.YAMLError, KeyError, TypeError):
+        return None  # of a real robot, or recorded by something else
+    return seed if isinstance(seed, int) and seed >= 0 else None
+
+
+def _stamp(data: bytes) -> int:
+    """Stamp of a serialized message that begins with a header, ns."""
+    order = "little" if data[1] & 1 else "big"
+    seconds, nanoseconds = (int.from_bytes(data[k : k + 4], order, signed=k == 4) for k in (4, 8))
+    return seconds * 10**9 + nanoseconds

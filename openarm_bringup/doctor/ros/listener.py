@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Listens to a graph that runs, for `openarm doctor`."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
+from openarm_bringup.doctor.graph import RATES, Heard
+from openarm_bringup.ros.messages import interface
+from openarm_bringup.ros.peer import Peer
+from openarm_bringup.supervision.runs import RunRecord
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.node import QOS_COMMAND, offered_qos
+
+#: Long enough for two rounds of /diagnostics, s.
+_LISTEN_S = 2.5
+
+
+def listen(run: RunRecord) -> Heard:
+    """Listen to the graph of a run for a few seconds."""
+    try:
+        return _listen(run)
+    except OpenArmError as error:
+        if error.code != Code.NOT_READY:
+            raise
+        return Heard({}, {}, [])  # that nobody is heard is what doctor says of its nodes
+
+
+def _listen(run: RunRecord) -> Heard:
+    os.environ["ROS_DOMAIN_ID"] = str(run.domain)
+    if run.discovery != "system_default":
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = run.discovery.upper()
+    counts: dict[str, int] = {}
+    said: dict[str, tuple[bool, str]] = {}
+
+    def count(topic: str) -> Any:
+        def take(_: bytes) -> None:
+            counts[topic] += 1
+
+        return take
+
+    def note(message: DiagnosticArray) -> None:
+        for status in message.status:
+            good = status.level in (DiagnosticStatus.OK, DiagnosticStatus.STALE)  # stale: it has said nothing yet
+            said[status.name.partition(":")[0]] = (good, status.message)
+
+    with Peer() as peer:
+        names = [name for name, _ in peer.node.get_node_names_and_namespaces() if not name.startswith("_")]
+        for topic, kind in peer.topics().items():
+            if topic in RATES:
+                counts[topic] = 0
+                profile = offered_qos(peer.node, topic, 200)
+                peer.node.create_subscription(interface(kind), topic, count(topic), profile, raw=True)
+        peer.node.create_subscription(DiagnosticArray, "/diagnostics", note, QOS_COMMAND)
+        began = peer.node.get_clock().now()
+        peer.spin_until(lambda: False, _LISTEN_S)
+        seconds = (peer.node.get_clock().now() - began).nanoseconds * 1e-9
+    return Heard({topic: n / seconds for topic, n in counts.items()}, said, names)

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clients of a running graph: peers, messages of any type, detected objects."""

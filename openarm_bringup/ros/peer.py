@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node for the length of one command: it looks at a graph, listens and asks, and waits with deadlines."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import rclpy
+from numpy.typing import NDArray
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from tf2_msgs.msg import TFMessage
+
+from openarm_bringup.meant import unknown
+from openarm_bringup.ros.messages import to_data
+from openarm_bringup.supervision import runs
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import transform_to_matrix
+from openarm_common.ros.node import QOS_STATIC_TF, QOS_TF, offered_qos
+
+#: Others are known after this long without news, s; while nobody is, or one that is known to run is not, they may come.
+_QUIET_S = 0.6
+_DISCOVERY_S = 8.0
+#: How long to wait for anybody, where no supervisor of this machine has said that there is a graph, s.
+_ANYBODY_S = 4.0
+#: Services that every node has.
+_OF_ALL_NODES = ("rcl_interfaces/srv/", "type_description_interfaces/srv/")
+_ANSWER_S = 5.0
+
+
+class Peer:
+    """A node and its executor; a context manager. Inside, those who run are known.
+
+    Raises:
+        OpenArmError: NOT_READY, on entering, when nobody runs.
+    """
+
+    def __init__(self) -> None:
+        self._context = Context()
+        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        name = f"_openarm_cli_{os.getpid()}"  # hidden, as those of ros2cli
+        self.node: Any = rclpy.create_node(
+            name, context=self._context, use_global_arguments=False, start_parameter_services=False, enable_rosout=False
+        )
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def __enter__(self) -> Peer:
+        began = changed = time.monotonic()
+        before: Any = None
+        domain = self._context.get_domain_id()
+        there = {f"/{name}" for run in runs.running() if run.domain == domain for name in run.ready_nodes}
+        while (now := time.monotonic()) - began < (_DISCOVERY_S if there else _ANYBODY_S):
+            known = (self.nodes(), self.topics(), self.services())
+            if known != before:
+                before, changed = known, now
+            elif now - changed > _QUIET_S and known[0] and (there <= set(known[0]) or now - began > _DISCOVERY_S / 2):
+                break
+            self._executor.spin_once(timeout_sec=0.05)
+        if not self.nodes():
+            self.__exit__()
+            reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+            raise OpenArmError(
+                Code.NOT_READY,
+                f"no node is heard in domain {domain} (ROS_AUTOMATIC_DISCOVERY_RANGE={reach}); start a graph with "
+                "`openarm up`, or set both as they are set where it runs (--domain N says the domain, too)",
+            )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown(timeout_sec=1.0)
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+    def spin_until(self, condition: Callable[[], Any], seconds: float) -> bool:
+        """Work on what arrives until a condition holds; returns whether it did in time."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return False
+            self._executor.spin_once(timeout_sec=min(left, 0.1))
+        return True
+
+    def result(self, future: Any, seconds: float, what: str) -> Any:
+        """Wait for a future.
+
+        Raises:
+            OpenArmError: TIMEOUT, saying what was waited for.
+        """
+        if not self.spin_until(future.done, seconds):
+            raise OpenArmError(Code.TIMEOUT, f"{what}: no answer within {seconds:g} s")
+        return future.result()
+
+    def nodes(self) -> list[str]:
+        """Full names of the nodes, without hidden ones."""
+        found = self.node.get_node_names_and_namespaces()
+        return sorted({f"{space.rstrip('/')}/{name}" for name, space in found if not name.startswith("_")})
+
+    def topics(self) -> dict[str, str]:
+        """Type by topic, without those of actions."""
+        return {name: kinds[0] for name, kinds in self.node.get_topic_names_and_types() if "/_action/" not in name}
+
+    def services(self) -> dict[str, str]:
+        """Type by service, without those of actions and of nodes that are hidden, as this one."""
+        found = self.node.get_service_names_and_types()
+        return {name: kinds[0] for name, kinds in found if "/_action/" not in name and "/_openarm_cli" not in name}
+
+    def actions(self) -> dict[str, str]:
+        """Type by action."""
+        end = "/_action/feedback"
+        return {
+            name.removesuffix(end): kinds[0].removesuffix("_FeedbackMessage")
+            for name, kinds in self.node.get_topic_names_and_types()
+            if name.endswith(end)
+        }
+
+    def offered(self, topic: str) -> QoSProfile:
+        """The quality of service with which everything of a topic is heard."""
+        return offered_qos(self.node, topic, 100)
+
+    def action_client(self, kind: Any, name: str) -> Any:
+        """A client of an action whose server answers.
+
+        Raises:
+            OpenArmError: NOT_READY, when it does not.
+        """
+        client: Any = ActionClient(self.node, kind, name)
+        if not self.spin_until(client.server_is_ready, _ANSWER_S):
+            raise OpenArmError(Code.NOT_READY, f"{name} does not answer")
+        return client
+
+    def parameters(self, node: str) -> ParametersOf:
+        """The parameters of a node.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT for an unknown node, NOT_READY when it does not answer.
+        """
+        return ParametersOf(self, find("node", node, dict.fromkeys(self.nodes(), ""))[0])
+
+    def frames(self, seconds: float) -> Frames:
+        """What is told on /tf and /tf_static within a time."""
+        frames = Frames()
+        for topic, static, qos in (("/tf_static", True, QOS_STATIC_TF), ("/tf", False, QOS_TF)):
+
+            def add(message: TFMessage, info: Mapping[str, Any], static: bool = static) -> None:
+                frames.add(message, info["publication_sequence_number"], static)
+
+            self.node.create_subscription(TFMessage, topic, add, qos)
+        self.spin_until(lambda: False, seconds)
+        return frames
+
+
+class Frames:
+    """The tree of frames as it is heard.
+
+    Attributes:
+        edges: Parent, pose in it and whether it is fixed, of each frame.
+        clashes: What is wrong with a frame that more than one tells of, by its name.
+    """
+
+    def __init__(self) -> None:
+        self.edges: dict[str, tuple[str, NDArray[np.float64], bool]] = {}
+        self.clashes: dict[str, str] = {}
+        self._last: dict[str, int] = {}
+
+    def add(self, message: TFMessage, number: int, static: bool) -> None:
+        """Take a message; `number` counts those of its publisher, so a frame that two tell of goes back in it."""
+        for edge in message.transforms:
+            name, parent = edge.child_frame_id, edge.header.frame_id
+            T = transform_to_matrix(edge.transform)
+            if name in self.edges:
+                before, T_before, was_static = self.edges[name]
+                if before != parent:
+                    self.clashes[name] = f"hangs below {before} and below {parent}"
+                elif was_static != static:
+                    self.clashes[name] = "is told on /tf and on /tf_static"
+                elif number <= self._last[name] and (not static or not np.array_equal(T, T_before)):
+                    self.clashes[name] = f"is told by two on {'/tf_static' if static else '/tf'}"
+            self.edges[name] = (parent, T, static)
+            self._last[name] = number
+
+
+class ParametersOf:
+    """The parameters of a node that runs.
+
+    Args:
+        peer: Who asks.
+        node: Full name.
+    """
+
+    def __init__(self, peer: Peer, node: str) -> None:
+        self.node = node
+        self._peer = peer
+        self._client = AsyncParameterClient(peer.node, node)
+        if not peer.spin_until(self._client.services_are_ready, _ANSWER_S):
+            raise OpenArmError(Code.NOT_READY, f"{node} does not answer for its parameters")
+        self.names: list[str] = sorted(peer.result(self._client.list_parameters(), _ANSWER_S, node).result.names)
+
+    def check(self, name: str) -> None:
+        """Refuse a name that the node does not have.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, saying which was perhaps meant.
+        """
+        if name not in self.names:
+            raise unknown(f"parameter of {self.node}", name, self.names)
+
+    def get(self, names: list[str]) -> dict[str, Any]:
+        """Values by name."""
+        answer = self._peer.result(self._client.get_parameters(names), _ANSWER_S, self.node)
+        values = (to_data(parameter_value_to_python(value)) for value in answer.values)
+        return dict(zip(names, values, strict=True))
+
+    def set(self, name: str, value: Any) -> tuple[bool, str]:
+        """Set one; returns whether the node took it, and why not."""
+        future = self._client.set_parameters([Parameter(name, value=value)])
+        result = self._peer.result(future, _ANSWER_S, self.node).results[0]
+        return result.successful, result.reason
+
+
+def plain(known: dict[str, str]) -> dict[str, str]:
+    """Leave out the services that every node has."""
+    return {name: kind for name, kind in known.items() if not kind.startswith(_OF_ALL_NODES)}
+
+
+def find(what: str, name: str, known: dict[str, str]) -> tuple[str, str]:
+    """Return the full name of a topic, service or action, and its type; the leading slash may be left out.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, saying which was perhaps meant.
+    """
+    full = name if name.startswith("/") else f"/{name}"
+    if full not in known:
+        raise unknown(what, full, plain(known))
+    return full, known[full]

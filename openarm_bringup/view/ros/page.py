@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A page's side of the graph: a thread that looks at the wanted layers, and what can be asked of the robot."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import rclpy
+from action_msgs.srv import CancelGoal
+from openarm_interfaces.action import Pick
+from openarm_interfaces.srv import ResetWorld
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from openarm_bringup.view.ros.layers import Layer, makers
+from openarm_bringup.view.server import Item, Order, Reset
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.errors import OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.client import BackgroundNode
+
+#: Camera whose cloud is shown.
+CLOUD_CAMERA = "overhead"
+_TICK_S = 0.02
+_PICK_S = 900.0
+_ANSWER_S = 30.0
+
+
+class GraphView:
+    """Looks at the graph and asks it; a context manager.
+
+    Args:
+        on_item: Gets all that is new, in a thread of this object.
+        on_end: Gets what ended that thread too early.
+        timeout: Longest wait for a server to be there, s.
+    """
+
+    def __init__(
+        self, on_item: Callable[[Item], object], on_end: Callable[[BaseException], object], *, timeout: float = 3.0
+    ) -> None:
+        self.description = RobotDescription.load()
+        self.cameras = tuple(load_cameras().values())
+        self._on_item, self._on_end = on_item, on_end
+        self._makers = makers(self.description, self.cameras, CLOUD_CAMERA)
+        self._wanted: frozenset[str] = frozenset()
+        self._ask = BackgroundNode("openarm_view", timeout=timeout)
+        self._context = Context()
+        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node: Node = rclpy.create_node(
+            "openarm_view_layers", context=self._context, use_global_arguments=False, start_parameter_services=False
+        )
+        self._ended = threading.Event()
+        self._stop_picking = threading.Event()
+        self._picking = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="view", daemon=True)
+
+    def __enter__(self) -> GraphView:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._stop_picking.set()
+        self._thread.join(timeout=5.0)
+        self._picking.acquire(timeout=5.0)  # until the grasp that was asked for here knows that it is cancelled
+        self._node.destroy_node()
+        self._context.try_shutdown()
+        self._ask.close()
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of all that can be looked at."""
+        return tuple(self._makers)
+
+    def want(self, layers: frozenset[str]) -> None:
+        """Look at these layers from now on, and at no others."""
+        self._wanted = layers
+
+    def pick(self, order: Order) -> dict[str, Any]:
+        """Ask for a grasp; returns its result when it has ended.
+
+        Raises:
+            OpenArmError: NOT_READY, when no grasp node answers; BUSY; TIMEOUT.
+        """
+        goal = Pick.Goal(label=order.label, arm=order.arm, dry_run=order.dry_run)
+        with self._picking:
+            result = self._ask.do(Pick, "/grasp/pick", goal, timeout=_PICK_S, stop=self._stop_picking)
+        names = ("success", "outcome", "code", "message", "label", "arm", "attempts", "duration")
+        return {name: getattr(result, name) for name in names}
+
+    def cancel(self) -> tuple[bool, str]:
+        """Ask for the end of the grasp that runs, whoever has asked for it by the action.
+
+        Raises:
+            OpenArmError: NOT_READY, when no grasp node answers.
+        """
+        # An empty goal id and stamp: all goals.
+        answer = self._ask.call(CancelGoal, "/grasp/pick/_action/cancel_goal", CancelGoal.Request(), _ANSWER_S)
+        if answer.goals_canceling:
+            return True, "cancelled; the arm holds where it is"
+        return False, "no grasp runs that was asked for by /grasp/pick"
+
+    def reset(self, order: Reset) -> tuple[bool, str]:
+        """Put the simulation back to its start.
+
+        Raises:
+            OpenArmError: NOT_READY, when there is no simulation.
+        """
+        request = ResetWorld.Request(scene=order.scene, seed=order.seed)
+        answer = self._ask.call(ResetWorld, "/sim/reset_world", request, _ANSWER_S)
+        return answer.success, answer.message
+
+    def _run(self) -> None:
+        open_layers: dict[str, _Open] = {}
+        try:
+            while not self._ended.wait(_TICK_S):
+                wanted = self._wanted
+                for name in open_layers.keys() - wanted:
+                    open_layers.pop(name).layer.close()
+                for name in wanted - open_layers.keys():
+                    open_layers[name] = _Open(self._makers[name](self._node))
+                now = time.monotonic()
+                for name, one in open_layers.items():
+                    if now >= one.due:
+                        one.due = now + one.layer.period
+                        self._look(name, one)
+        except BaseException as error:  # handed to the server, which ends with it
+            self._on_end(error)
+        finally:
+            for one in open_layers.values():
+                one.layer.close()
+
+    def _look(self, name: str, one: _Open) -> None:
+        fault = ""
+        try:
+            for key, payload in one.layer.look():
+                self._on_item(Item(name, key, payload))
+        except OpenArmError as error:  # one message that can't be shown
+            fault = error.message
+        fault = fault or one.layer.fault
+        if fault != one.fault:
+            one.fault = fault
+            self._on_item(Item.of_fault(name, fault))
+
+
+@dataclass
+class _Open:
+    layer: Layer
+    due: float = 0.0
+    fault: str = ""

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board in a grey image: its marks, in an order that is checked.
+
+Pixels are (u, v) with the centre of the top-left pixel at (0, 0). The pose of the board in the optical frame,
+`T_camera_board` (4, 4), is a starting point for least squares.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_calibration.board.board import Board, Charuco, CircleGrid
+from openarm_calibration.board.centroids import mapped, refined
+from openarm_calibration.handeye.projection import fit_poses
+from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.errors import Code, OpenArmError
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+#: A plane's image is a homography but for distortion and the eccentricity of the circles, px rms.
+MOST_RESIDUAL = 0.5
+_FEWEST_CORNERS = 8
+#: Of the circles that must be seen well; with fewer it may be another board.
+_LEAST_SHARE = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Marks of a board in an image.
+
+    Args:
+        ids: (n,) which marks, in ascending order.
+        pixels: (n, 2).
+        residual: Rms distance from a plane's image, px.
+    """
+
+    ids: NDArray[np.int64]
+    pixels: Array
+    residual: float
+
+
+def detect(board: Board, image: Grey) -> Detection:
+    """Find a board.
+
+    Args:
+        board: Which.
+        image: (h, w) grey.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED, saying what was seen instead; BAD_IMAGE, for an image that is not grey.
+    """
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise OpenArmError(Code.BAD_IMAGE, f"detection needs a grey 8-bit image, got {image.dtype} {image.shape}")
+    return _circles(board, image) if isinstance(board, CircleGrid) else _corners(board, image)
+
+
+def _circles(board: CircleGrid, image: Grey) -> Detection:
+    seen = 0
+    size = (board.columns, board.rows)
+    # A far board is looked for in an enlarged image; the contours of small blobs are too coarse otherwise.
+    for zoom in (1, 2, 3):
+        large = image if zoom == 1 else cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+        blobs = _blob_detector(large.shape[0] * large.shape[1], len(board.points))
+        for flags in (
+            cv2.CALIB_CB_ASYMMETRIC_GRID,
+            cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING,
+        ):
+            found, centres = cv2.findCirclesGrid(large, size, flags=flags, blobDetector=blobs)
+            if not found:
+                continue  # on failure there may be a part of a grid, which is no use
+            pixels = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
+            # the resized image's pixel k covers (k + 0.5) / zoom - 0.5
+            pixels = (pixels + 0.5) / zoom - 0.5
+            ordered = _ordered(board, pixels)
+            if zoom < 3 and _diameter(board, ordered) * zoom < 9.0:
+                break
+            ids, exact, residual = _refined(board, image, ordered)
+            if len(ids) >= _LEAST_SHARE * len(ordered) and residual <= MOST_RESIDUAL:
+                return Detection(ids, exact, residual)
+            if np.isfinite(residual) and residual <= MOST_RESIDUAL:
+                raise OpenArmError(
+                    Code.NOTHING_DETECTED,
+                    f"only {len(ids)} of {len(ordered)} circles of {board.label} are whole, with white around them; is"
+                    " something before the board, or its edge at that of the image?",
+                )
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"{len(pixels)} circles do not lie on a plane as {board.label} does: {residual:.2f} px rms, expected at"
+                f" most {MOST_RESIDUAL} px; is it this board, flat, and is the image sharp?",
+            )
+        seen = max(seen, len(blobs.detect(large)))
+    raise OpenArmError(
+        Code.NOTHING_DETECTED,
+        f"no {board.label}: {seen} dark blobs seen, {len(board.points)} circles expected; is all of the board in the"
+        " image, lit, sharp and not tilted by more than 60°?",
+    )
+
+
+def _blob_detector(area: int, circles: int) -> cv2.SimpleBlobDetector:
+    """For circles of any size that fits: OpenCV's own limits are 80 px of diameter and 10 px of distance."""
+    params = cv2.SimpleBlobDetector.Params()
+    params.filterByArea = True
+    params.minArea = 12.0
+    params.maxArea = area / circles
+    params.minDistBetweenBlobs = 3.0
+    params.filterByCircularity = False
+    params.filterByInertia = True
+    params.minInertiaRatio = 0.08
+    params.filterByConvexity = True
+    params.minConvexity = 0.8
+    params.minThreshold, params.maxThreshold, params.thresholdStep = 40.0, 220.0, 12.0
+    return cv2.SimpleBlobDetector.create(params)
+
+
+def _diameter(board: CircleGrid, pixels: Array) -> float:
+    """Of a circle in the image, px, by the area that the marks cover."""
+    hull = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32)))
+    outline = cv2.contourArea(cv2.convexHull(board.points[:, :2].astype(np.float32)))
+    return board.diameter * float(np.sqrt(hull / outline))
+
+
+def _ordered(board: CircleGrid, pixels: Array) -> Array:
+    """The order of the marks in which they are the image of the board's front.
+
+    The grid finder may start at either end. A mirrored order fits a plane as well, and is told by its chirality.
+    """
+    grid = pixels.reshape(board.rows, board.columns, 2)
+    candidates = [grid, grid[::-1, ::-1], grid[::-1], grid[:, ::-1]]
+    best, least = pixels, np.inf
+    for candidate in candidates:
+        flat = candidate.reshape(-1, 2)
+        H = homography(board.points[:, :2], flat)
+        residual = _homography_residual(H, board.points[:, :2], flat)
+        if np.linalg.det(H[:2, :2] - np.outer(H[:2, 2], H[2, :2]) / H[2, 2]) > 0.0 and residual < least:
+            best, least = flat, residual
+    return np.ascontiguousarray(best)
+
+
+def _refined(board: CircleGrid, image: Grey, rough: Array) -> tuple[NDArray[np.int64], Array, float]:
+    """Marks by their grey values: which, where, and their residual, px rms.
+
+    A blob beside a circle is moved to where the others want it; a mark that still is off is left out, and so is one
+    that something else comes near to.
+    """
+    plane = board.points[:, :2]
+    H = _robust_homography(plane, rough)
+    wanted = mapped(H, plane)
+    astray = np.linalg.norm(rough - wanted, axis=1) > 0.5 + 0.05 * _diameter(board, rough)
+    exact, sure = refined(image, np.where(astray[:, None], wanted, rough), plane, board.radius, H)
+    if np.count_nonzero(sure) < 4:
+        return np.flatnonzero(sure), exact[sure], 0.0
+    away = np.linalg.norm(mapped(_robust_homography(plane[sure], exact[sure]), plane) - exact, axis=1)
+    ids = np.flatnonzero(sure & (away <= 6.0 * float(np.median(away[sure])) + 0.1))
+    plane, exact = plane[ids], exact[ids]
+    return ids, exact, _homography_residual(homography(plane, exact), plane, exact) if len(ids) >= 4 else np.inf
+
+
+def _corners(board: Charuco, image: Grey) -> Detection:
+    detector = cv2.aruco.CharucoDetector(board.board)
+    corners, ids, markers, _ = detector.detectBoard(image)
+    count = 0 if ids is None else len(ids)  # pyright: ignore[reportUnnecessaryComparison] - None without a board
+    if count < _FEWEST_CORNERS:
+        raise OpenArmError(
+            Code.NOTHING_DETECTED,
+            f"{count} corners and {len(markers or ())} markers of {board.label}, at least {_FEWEST_CORNERS} corners are"
+            " needed; is the board in the image, sharp, and of this size and dictionary?",
+        )
+    order = np.argsort(ids.ravel())
+    index = ids.ravel()[order].astype(np.int64)
+    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)[order]
+    marks = board.points[index, :2]
+    if np.linalg.matrix_rank(marks - marks.mean(axis=0), tol=1e-6) < 2:
+        raise OpenArmError(Code.NOTHING_DETECTED, f"{count} corners of {board.label} lie on one line; show more of it")
+    H = homography(marks, pixels)
+    residual = _homography_residual(H, marks, pixels)
+    mirrored = np.linalg.det(H[:2, :2] - np.outer(H[:2, 2], H[2, :2]) / H[2, 2]) <= 0.0
+    if residual > MOST_RESIDUAL or mirrored:
+        why = "the image is mirrored" if mirrored else f"{residual:.2f} px rms, expected at most {MOST_RESIDUAL} px"
+        raise OpenArmError(Code.NOTHING_DETECTED, f"{count} corners do not lie as on {board.label}: {why}")
+    return Detection(index, pixels, residual)
+
+
+def _robust_homography(plane: Array, pixels: Array) -> Array:
+    """As `homography`, with up to half of the marks in wrong places."""
+    H, _ = cv2.findHomography(plane, pixels, cv2.LMEDS)
+    if H is None:  # pyright: ignore[reportUnnecessaryComparison] - None for marks in a heap
+        return homography(plane, pixels)
+    return H.astype(np.float64)
+
+
+def homography(plane: Array, pixels: Array) -> Array:
+    """Homography (3, 3) from plane points (n, 2) to pixels (n, 2), by normalised least squares."""
+    A, b = _normaliser(plane), _normaliser(pixels)
+    x, u = mapped(A, plane), mapped(b, pixels)
+    one, zero = np.ones((len(x), 1)), np.zeros((len(x), 3))
+    p = np.concatenate([x, one], axis=1)
+    rows = np.concatenate(
+        [np.concatenate([p, zero, -u[:, :1] * p], axis=1), np.concatenate([zero, p, -u[:, 1:] * p], axis=1)]
+    )
+    H = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    H = np.linalg.inv(b) @ H @ A
+    return H / H[2, 2]
+
+
+def _normaliser(points: Array) -> Array:
+    middle, spread = points.mean(axis=0), max(float(points.std()), 1e-12)
+    return np.array([[1 / spread, 0, -middle[0] / spread], [0, 1 / spread, -middle[1] / spread], [0, 0, 1.0]])
+
+
+def _homography_residual(H: Array, plane: Array, pixels: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum((mapped(H, plane) - pixels) ** 2, axis=1))))
+
+
+def guess_pose(points: Array, pixels: Array, radius: float, intrinsics: Intrinsics) -> tuple[Array, float]:
+    """Pose of a flat board and the rms residual, px.
+
+    Args:
+        points: (n, 3) marks in the board frame, m, z = 0.
+        pixels: (n, 2).
+        radius: Of the circles, m.
+        intrinsics: Of the camera.
+
+    Returns:
+        (4, 4) T_camera_board, refined, the better of the two that a plane allows.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED, when there is none in front of the camera.
+    """
+    count, turns, shifts, _ = cv2.solvePnPGeneric(
+        points, pixels.reshape(-1, 1, 2), intrinsics.matrix, None, flags=cv2.SOLVEPNP_IPPE
+    )
+    best: tuple[Array, float] | None = None
+    row = np.array([[intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]])
+    offsets = np.array([0, len(points)], dtype=np.int64)
+    for k in range(count):
+        T = se3.make(cv2.Rodrigues(turns[k])[0], np.ravel(shifts[k]))
+        if T[2, 3] <= 0.0:
+            continue
+        pose, cost = fit_poses(
+            np.ascontiguousarray(points), np.ascontiguousarray(pixels), offsets, np.array([radius]), T[None], row
+        )
+        rms = float(np.sqrt(cost[0] / (2 * len(points))))
+        if np.isfinite(rms) and (best is None or rms < best[1]):
+            best = pose[0], rms
+    if best is None:
+        raise OpenArmError(Code.NOTHING_DETECTED, "the marks have no pose in front of the camera; are the ids right?")
+    return best

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hand-eye estimation: closed forms, refinement, observability, verdict."""

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether poses determine the mounts, and if not, why and what to add.
+
+Two looks: at the robot's motion before anything is solved (too few poses, no rotation, one axis), and at the
+information matrix afterwards, scaled to 1 mm and 0.1°, whose smallest eigenvalue says how well the worst direction is
+known. Angles in degrees where a name says so, else rad.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_calibration.handeye.problem import Problem
+from openarm_calibration.handeye.refine import Estimate
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+
+Array = NDArray[np.float64]
+
+#: Fewer can't determine twelve unknowns.
+FEWEST = 3
+#: Rotations below this tell nothing from the robot's own errors, rad.
+_NO_ROTATION = math.radians(0.5)
+_NO_SECOND_AXIS = math.radians(0.4)
+_NO_TRANSLATION = 0.003  # m
+#: Named as small or as near to one axis when a solution turns out too uncertain, rad.
+_SMALL_ROTATION = math.radians(15.0)
+_SMALL_SECOND_AXIS = math.radians(10.0)
+_WORST_CONDITION = 1e12
+#: No arm in order is off by so much from pose to pose, m and rad.
+_BAD_ARM = (1.5e-3, math.radians(0.15))
+#: Six columns of a mount in units of 1 mm and 0.1°.
+UNITS = np.array([1e-3] * 3 + [math.radians(0.1)] * 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How far the robot moved between its poses.
+
+    Args:
+        poses: How many.
+        rotation: Largest angle between two poses, rad.
+        second: Largest angle between two poses about axes across the main one, rad.
+        translation: Largest distance between two poses, m.
+        axis: (3,) main rotation axis in the gripper's frame.
+    """
+
+    poses: int
+    rotation: float
+    second: float
+    translation: float
+    axis: Array
+
+
+def motion(A: Array) -> Motion:
+    """Describe the motion of robot poses A (n, 4, 4)."""
+    n = len(A)
+    logs = [se3.log_so3(A[i, :3, :3].T @ A[j, :3, :3]) for i in range(n) for j in range(i + 1, n)]
+    if not logs:
+        return Motion(n, 0.0, 0.0, 0.0, np.array([0.0, 0.0, 1.0]))
+    w = np.array(logs)
+    axis = np.linalg.eigh(w.T @ w)[1][:, -1]
+    across = np.linalg.norm(w - np.outer(w @ axis, axis), axis=1)
+    apart = np.linalg.norm(A[:, None, :3, 3] - A[None, :, :3, 3], axis=-1)
+    rotation = float(np.linalg.norm(w, axis=1).max())
+    return Motion(n, rotation, float(across.max()), float(apart.max()), axis)
+
+
+def require_motion(problem: Problem) -> None:
+    """Refuse views that can't determine the mounts, before anything is solved.
+
+    Raises:
+        OpenArmError: DEGENERATE, with the name of what is wrong and what to add.
+    """
+    if not (np.isfinite(problem.A).all() and np.isfinite(problem.pixels).all() and np.isfinite(problem.free).all()):
+        raise OpenArmError(Code.INVALID_ARGUMENT, "a pose or a pixel is not a finite number; remove that sample")
+    for camera in range(problem.cameras):
+        mine = (problem.camera == camera) & (problem.kind < 2)
+        if not mine.any():
+            if (problem.camera == camera).any():
+                continue  # tied by fixed views to a board that another camera sees
+            raise OpenArmError(Code.DEGENERATE, "too few poses: a camera has no view at all; take samples with it")
+        for board in np.unique(problem.board[mine]):
+            chosen = mine & (problem.board == board)
+            seen = motion(problem.A[chosen][np.unique(problem.pose[chosen], return_index=True)[1]])
+            fault = _fault(seen)
+            if fault:
+                raise OpenArmError(Code.DEGENERATE, fault)
+
+
+def _fault(seen: Motion) -> str:
+    degrees, millimetres = math.degrees(seen.rotation), seen.translation * 1e3
+    if seen.poses < FEWEST:
+        return (
+            f"too few poses: {seen.poses}, at least {FEWEST} that differ in rotation are needed"
+            " (10 to 15 for a good result)"
+        )
+    if seen.rotation < _NO_ROTATION and seen.translation < _NO_TRANSLATION:
+        return (
+            f"identical poses: the {seen.poses} poses are within {millimetres:.1f} mm and {degrees:.2f}°;"
+            " move the arm between samples, with rotations of 30° or more"
+        )
+    if seen.rotation < _NO_ROTATION:
+        return (
+            f"pure translation: the {seen.poses} poses turn by {degrees:.2f}° at most, so the offset of the camera is"
+            " not determined; rotate the hand by 30° or more about two different axes"
+        )
+    if seen.second < _NO_SECOND_AXIS:
+        return (
+            f"one rotation axis: all rotations (up to {degrees:.0f}°) are about the gripper's {_name(seen.axis)};"
+            f" rotate by 15° or more about a second axis, such as {_other(seen.axis)}"
+        )
+    return ""
+
+
+def require_accuracy(problem: Problem, estimate: Estimate, most_translation: float, most_rotation: float) -> None:
+    """Refuse an answer that is less certain than asked for.
+
+    Args:
+        problem: The views.
+        estimate: Whose information and covariance have the cameras' mounts first.
+        most_translation: Largest standard deviation of a mount's position (of the vector), m.
+        most_rotation: The same of its rotation, rad.
+
+    Raises:
+        OpenArmError: DEGENERATE, with the deviation, its cause, and what to add.
+    """
+    mounts = 6 * (problem.cameras + problem.boards)
+    units = np.tile(UNITS, problem.cameras + problem.boards)
+    scaled = estimate.information[:mounts, :mounts] * np.outer(units, units)
+    values: Array = np.linalg.eigvalsh(scaled).astype(np.float64) if np.isfinite(scaled).all() else np.zeros(1)
+    singular = not values[0] > 0.0 or values[-1] > _WORST_CONDITION * values[0]
+    if not singular:
+        covariance = estimate.covariance()[:mounts, :mounts] / np.outer(units, units)
+        for camera in range(problem.cameras):
+            block = covariance[6 * camera : 6 * camera + 6, 6 * camera : 6 * camera + 6]
+            t = math.sqrt(max(np.trace(block[:3, :3]), 0.0)) * UNITS[0]
+            r = math.sqrt(max(np.trace(block[3:, 3:]), 0.0)) * UNITS[3]
+            if t > most_translation or r > most_rotation:
+                seen = motion(problem.A[(problem.camera == camera) & (problem.kind < 2)])
+                raise OpenArmError(
+                    Code.DEGENERATE,
+                    f"{_cause(seen, estimate)}: the predicted error is {t * 1e3:.2g} mm and {math.degrees(r):.2g}°,"
+                    f" more than {most_translation * 1e3:g} mm or {math.degrees(most_rotation):g}°;"
+                    f" {_advice(seen, estimate)}",
+                )
+    else:
+        seen = motion(problem.A[problem.kind < 2])
+        raise OpenArmError(
+            Code.DEGENERATE,
+            f"{_cause(seen, estimate)}: some direction of the mounts is not determined"
+            f" (condition {condition(values):.1e}, at most {_WORST_CONDITION:.0e} is accepted);"
+            f" {_advice(seen, estimate)}",
+        )
+
+
+def condition(values: Array) -> float:
+    """Condition number of eigenvalues in ascending order; infinite when singular."""
+    return float(values[-1] / values[0]) if values[0] > 0.0 else math.inf
+
+
+def condition_number(problem: Problem, information: Array) -> float:
+    """Condition number of the information on the mounts, in units of 1 mm and 0.1°."""
+    mounts = problem.cameras + problem.boards
+    units = np.tile(UNITS, mounts)
+    scaled = information[: 6 * mounts, : 6 * mounts] * np.outer(units, units)
+    return condition(np.linalg.eigvalsh(scaled).astype(np.float64))
+
+
+def _cause(seen: Motion, estimate: Estimate) -> str:
+    if seen.rotation < _SMALL_ROTATION:
+        return f"rotations too small (up to {math.degrees(seen.rotation):.1f}°)"
+    if seen.second < _SMALL_SECOND_AXIS:
+        return (
+            f"nearly one rotation axis (up to {math.degrees(seen.second):.1f}° across the gripper's {_name(seen.axis)})"
+        )
+    if seen.poses < 6:
+        return f"too few poses ({seen.poses})"
+    if _contradicting(estimate):
+        noise = estimate.noise
+        return (
+            f"{seen.poses} poses that contradict each other, as if the robot were off by"
+            f" {noise.translation * 1e3:.1f} mm and {math.degrees(noise.rotation):.2f}°"
+        )
+    return f"{seen.poses} poses that are too noisy or too far from the board"
+
+
+def _advice(seen: Motion, estimate: Estimate) -> str:
+    if seen.rotation < _SMALL_ROTATION:
+        return "rotate the hand by 30° or more between samples, about two different axes"
+    if seen.second < _SMALL_SECOND_AXIS:
+        return f"rotate by 15° or more about {_other(seen.axis)} too"
+    if seen.poses >= 6 and _contradicting(estimate):
+        return "check the intrinsics in camera_info, the size of the board, and that it did not move"
+    return "add poses, nearer to the board and with larger rotations"
+
+
+def _contradicting(estimate: Estimate) -> bool:
+    """Whether the robot's errors, as estimated, are larger than those of any arm in order."""
+    return estimate.noise.translation > _BAD_ARM[0] or estimate.noise.rotation > _BAD_ARM[1]
+
+
+def _name(axis: Array) -> str:
+    k = int(np.argmax(np.abs(axis)))
+    if abs(axis[k]) > math.cos(math.radians(20.0)):
+        return f"{'xyz'[k]} axis"
+    return f"axis ({axis[0]:.2f}, {axis[1]:.2f}, {axis[2]:.2f})"
+
+
+def _other(axis: Array) -> str:
+    return f"its {'xyz'[int(np.argmin(np.abs(axis)))]} axis"

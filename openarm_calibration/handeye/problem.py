@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The hand-eye problem: views of boards by cameras, and how its unknowns move a view.
+
+A view sees `T_camera_board = X⁻¹ B Z`, where X is the mount of the camera and Z that of the board, each on what
+carries it, and B comes from the robot's pose A = T_base_gripper:
+
+* ``in_hand``: the gripper carries the camera, the base the board; X = T_gripper_camera, Z = T_base_board, B = A⁻¹.
+* ``to_hand``: the base carries the camera, the gripper the board; X = T_base_camera, Z = T_gripper_board, B = A.
+* ``fixed``: the base carries both; B is the identity. Such a view ties a camera to a board that another one sees.
+
+Every camera is the optical frame. A change of a mount or of A is six numbers: the translation in the parent's axes
+(m), then the rotation vector in its own axes (rad): `(p, R) → (p + d, R exp(w))`. All of them move the view by a
+twist in the camera's frame, so that a view counts only by its 6×6 normal equations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_calibration.handeye.projection import COLUMNS, fit_poses
+from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+Setup = Literal["in_hand", "to_hand", "fixed"]
+SETUPS: tuple[Setup, ...] = ("in_hand", "to_hand", "fixed")
+#: Unknowns beside the mounts: scale of the board (true over stated), delay of the images (s), intrinsics (px).
+Extra = Literal["scale", "delay", "intrinsics"]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One board in one image.
+
+    Args:
+        points: (n, 3) marks in the board frame, m.
+        pixels: (n, 2) where they were detected.
+        A: (4, 4) T_base_gripper at the stamp of the image, as the robot says; not used when `fixed`.
+        setup: Which of camera and board the gripper carries.
+        radius: Of the circles, m; 0 for corner points.
+        camera: Index of the camera.
+        board: Index of the board mount.
+        pose: Number of the robot pose; views of the same one share its error.
+        name: What the view is called in reports.
+        rate: (6,) how fast A changes, in its own six numbers a second; zero at rest.
+    """
+
+    points: Array
+    pixels: Array
+    A: Array
+    setup: Setup
+    radius: float = 0.0
+    camera: int = 0
+    board: int = 0
+    pose: int = 0
+    name: str = ""
+    rate: Array = field(default_factory=lambda: np.zeros(6))
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Views in the form that the solver reads; made by `assemble`, cut by `subset`."""
+
+    views: tuple[View, ...]
+    intrinsics: tuple[Intrinsics, ...]
+    free: Array  # (n, 4, 4) T_camera_board of each view by itself
+    free_cost: Array  # (n,) its sum of squared residuals, px²
+    points: Array
+    pixels: Array
+    offsets: Indices
+    radii: Array
+    A: Array
+    kind: Indices  # index into SETUPS
+    camera: Indices
+    board: Indices
+    pose: Indices
+    rate: Array
+
+    def __len__(self) -> int:
+        """Views."""
+        return len(self.views)
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.intrinsics)
+
+    @property
+    def boards(self) -> int:
+        """Number of board mounts."""
+        return int(self.board.max()) + 1
+
+    @property
+    def marks(self) -> Indices:
+        """(n,) marks of each view."""
+        return np.diff(self.offsets)
+
+    def camera_rows(self) -> Array:
+        """(n, 4) fx, fy, cx, cy of each view's camera."""
+        rows = np.array([[k.fx, k.fy, k.cx, k.cy] for k in self.intrinsics])
+        return rows[self.camera]
+
+    def subset(self, keep: Sequence[int] | Indices | NDArray[np.bool_]) -> Problem:
+        """The problem with some of its views (indices or a mask); the per-view fits are kept."""
+        chosen = np.arange(len(self))[np.asarray(keep)]
+        views = tuple(self.views[i] for i in chosen)
+        return _pack(views, self.intrinsics, self.free[chosen], self.free_cost[chosen])
+
+    def with_intrinsics(self, intrinsics: Sequence[Intrinsics]) -> Problem:
+        """The same views by cameras of other intrinsics."""
+        return assemble(self.views, intrinsics, list(self.free))
+
+    def with_poses(self, A: Array) -> Problem:
+        """The same views with other robot poses (n, 4, 4)."""
+        views = tuple(replace(view, A=a) for view, a in zip(self.views, A, strict=True))
+        return _pack(views, self.intrinsics, self.free, self.free_cost)
+
+
+def assemble(views: Sequence[View], intrinsics: Sequence[Intrinsics], guesses: Sequence[Array]) -> Problem:
+    """Make a problem of views.
+
+    Args:
+        views: At least one.
+        intrinsics: Of each camera.
+        guesses: (4, 4) T_camera_board of each view, near enough for least squares (see `detect.guess_pose`).
+    """
+    raw = _pack(tuple(views), tuple(intrinsics), np.array(guesses), np.zeros(len(views)))
+    free, cost = fit_poses(raw.points, raw.pixels, raw.offsets, raw.radii, raw.free, raw.camera_rows())
+    return replace(raw, free=free, free_cost=cost)
+
+
+def _pack(views: tuple[View, ...], intrinsics: tuple[Intrinsics, ...], free: Array, cost: Array) -> Problem:
+    _, pose = np.unique([view.pose for view in views], return_inverse=True)
+    return Problem(
+        views,
+        intrinsics,
+        np.ascontiguousarray(free),
+        cost,
+        points=np.ascontiguousarray(np.concatenate([view.points for view in views])),
+        pixels=np.ascontiguousarray(np.concatenate([view.pixels for view in views])),
+        offsets=np.concatenate([[0], np.cumsum([len(view.points) for view in views])]).astype(np.int64),
+        radii=np.array([view.radius for view in views], dtype=np.float64),
+        A=np.array([view.A for view in views], dtype=np.float64),
+        kind=np.array([SETUPS.index(view.setup) for view in views], dtype=np.int64),
+        camera=np.array([view.camera for view in views], dtype=np.int64),
+        board=np.array([view.board for view in views], dtype=np.int64),
+        pose=np.asarray(pose, dtype=np.int64).reshape(-1),
+        rate=np.array([view.rate for view in views], dtype=np.float64),
+    )
+
+
+# --- transforms, batched over (..., 4, 4)
+def inverses(T: Array) -> Array:
+    """Inverse of rigid transforms."""
+    R = T[..., :3, :3].swapaxes(-1, -2)
+    out = np.zeros_like(T)
+    out[..., :3, :3] = R
+    out[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def exps(w: Array) -> Array:
+    """Rotations (n, 3, 3) of rotation vectors (n, 3)."""
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    K = skews(w)
+    small = angle < 1e-8
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0, np.sin(safe) / safe)
+    b = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    return np.eye(3) + a * K + b * (K @ K)
+
+
+def skews(v: Array) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def moved(T: Array, change: Array) -> Array:
+    """Transforms (..., 4, 4) changed by six numbers (..., 6) each: `(p + d, R exp(w))`."""
+    out = T.copy()
+    out[..., :3, :3] = T[..., :3, :3] @ exps(change[..., 3:])
+    out[..., :3, 3] = T[..., :3, 3] + change[..., :3]
+    return out
+
+
+def difference(T_from: Array, T_to: Array) -> Array:
+    """The six numbers (6,) that change `T_from` into `T_to`."""
+    w = se3.log_so3(T_from[:3, :3].T @ T_to[:3, :3])
+    return np.concatenate([T_to[:3, 3] - T_from[:3, 3], w])
+
+
+def chain(problem: Problem, X: Array, Z: Array, correction: Array) -> tuple[Array, Array]:
+    """Predict `T_camera_board` and B of each view.
+
+    Args:
+        problem: The views.
+        X: (cameras, 4, 4).
+        Z: (boards, 4, 4).
+        correction: (n, 6) of A.
+
+    Returns:
+        (n, 4, 4) T_camera_board and (n, 4, 4) B.
+    """
+    A = moved(problem.A, correction)
+    kind = problem.kind[:, None, None]
+    B = np.where(kind == 0, inverses(A), np.where(kind == 1, A, np.eye(4)))
+    return inverses(X)[problem.camera] @ B @ Z[problem.board], B
+
+
+def sensitivity(problem: Problem, X: Array, Z: Array, T: Array, B: Array) -> tuple[Array, Array, Array]:
+    """How the view (camera-frame twist) moves with its camera's mount, its board's mount and A; each (n, 6, 6)."""
+    RX = X[problem.camera][:, :3, :3]
+    RXt = RX.swapaxes(1, 2)
+    n = len(problem)
+    by_X, by_Z, by_A = np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
+    by_X[:, :3, :3] = -RXt
+    by_X[:, 3:, 3:] = -np.eye(3)
+    RT = T[:, :3, :3]
+    by_Z[:, :3, :3] = RXt @ B[:, :3, :3]
+    by_Z[:, :3, 3:] = skews(T[:, :3, 3]) @ RT
+    by_Z[:, 3:, 3:] = RT
+    X_inverse = inverses(X)[problem.camera]
+    inside, outside = problem.kind == 0, problem.kind == 1
+    by_A[inside, :3, :3] = -(RXt @ B[:, :3, :3])[inside]  # B is A⁻¹: its rotation is that of A transposed
+    by_A[inside, :3, 3:] = -(skews(X_inverse[:, :3, 3]) @ RXt)[inside]
+    by_A[inside, 3:, 3:] = -RXt[inside]
+    Q = X_inverse @ B
+    by_A[outside, :3, :3] = RXt[outside]
+    by_A[outside, :3, 3:] = (skews(Q[:, :3, 3]) @ Q[:, :3, :3])[outside]
+    by_A[outside, 3:, 3:] = Q[outside, :3, :3]
+    return by_X, by_Z, by_A
+
+
+def parameter_count(problem: Problem, extras: Sequence[Extra]) -> int:
+    """Columns of `design`."""
+    return 6 * (problem.cameras + problem.boards) + sum(_width(problem, extra) for extra in extras)
+
+
+def _width(problem: Problem, extra: Extra) -> int:
+    return 4 * problem.cameras if extra == "intrinsics" else 1
+
+
+def design(problem: Problem, X: Array, Z: Array, T: Array, B: Array, extras: Sequence[Extra]) -> tuple[Array, Array]:
+    """How the unknowns move each view.
+
+    Columns: six for each camera's X, six for each board's Z, then the extras in their order.
+
+    Returns:
+        (n, COLUMNS, parameters) and, for the corrections of A, (n, 6, 6).
+    """
+    by_X, by_Z, by_A = sensitivity(problem, X, Z, T, B)
+    n = len(problem)
+    G = np.zeros((n, COLUMNS, parameter_count(problem, extras)))
+    index = np.arange(n)
+    for k in range(6):
+        G[index, :6, 6 * problem.camera + k] = by_X[:, :, k]
+        G[index, :6, 6 * (problem.cameras + problem.board) + k] = by_Z[:, :, k]
+    column = 6 * (problem.cameras + problem.boards)
+    for extra in extras:
+        if extra == "scale":
+            G[:, 6, column] = 1.0
+        elif extra == "delay":
+            # an image that is `delay` old shows A as it was: A(t - delay)
+            G[:, :6, column] = -(by_A @ problem.rate[:, :, None])[:, :, 0]
+        else:
+            for k in range(4):
+                G[index, 7 + k, column + 4 * problem.camera + k] = 1.0
+        column += _width(problem, extra)
+    return G, by_A

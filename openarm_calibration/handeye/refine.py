@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint maximum-likelihood refinement over reprojection, with the robot's own errors as unknowns with a prior.
+
+Each robot pose has a correction of six numbers (see `problem`) that costs `|d|²/translation² + |w|²/rotation²`, and is
+eliminated from the normal equations by its Schur complement. What remains is Gauss-Newton on the mounts (and extras),
+whose information matrix is at once the inverse covariance of the answer. The spread of the robot's errors, when not
+given, is that of the largest restricted likelihood: the one that does not count the unknowns' freedom as accuracy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from openarm_calibration.handeye.likelihood import FLOOR_ROTATION, FLOOR_TRANSLATION, averaged, robot_spread
+from openarm_calibration.handeye.problem import Array, Extra, Problem, chain, design, moved
+from openarm_calibration.handeye.projection import normal_equations
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+
+_LOWEST_PX = 1e-3
+#: Errors of a small arm, m and rad: only the centre of a wide prior.
+TYPICAL_ROBOT = (4e-4, 8e-4)
+_ITERATIONS = 30
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations by axis.
+
+    Args:
+        px: Of a detected mark, pixels.
+        translation: Of the robot's pose, m; 0 is an exact robot.
+        rotation: Of the robot's pose, rad.
+    """
+
+    px: float
+    translation: float = 0.0
+    rotation: float = 0.0
+
+    @property
+    def prior(self) -> Array:
+        """(6, 6) inverse covariance of a correction of A."""
+        t = max(self.translation, FLOOR_TRANSLATION)
+        r = max(self.rotation, FLOOR_ROTATION)
+        return np.diag([t**-2.0] * 3 + [r**-2.0] * 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where the refinement ended.
+
+    Args:
+        X: (cameras, 4, 4) mounts of the cameras (optical frames).
+        Z: (boards, 4, 4) mounts of the boards.
+        correction: (poses, 6) of the robot's poses.
+        noise: That was used, or found.
+        information: (parameters, parameters), columns as `problem.design`.
+        cost: Of the views and the corrections, in units of the noise.
+        converged: Whether the last step was small.
+        scale: Of the board.
+        delay: Of the images, s.
+        intrinsics: (cameras, 4) changes of fx, fy, cx, cy, px.
+        extras: Which of these were free.
+        spread: (parameters, parameters) covariance where the robot's spread was estimated.
+    """
+
+    X: Array
+    Z: Array
+    correction: Array
+    noise: Noise
+    information: Array
+    cost: float
+    converged: bool
+    scale: float = 1.0
+    delay: float = 0.0
+    intrinsics: Array | None = None
+    extras: tuple[Extra, ...] = ()
+    spread: Array | None = None
+
+    def covariance(self) -> Array:
+        """(parameters, parameters) of the unknowns; with an estimated robot it counts the doubt about its spread too.
+
+        Raises:
+            OpenArmError: DEGENERATE, when it does not exist.
+        """
+        return invert_scaled(self.information) if self.spread is None else self.spread
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """The problem linearised: sums over the robot poses, with the corrections not yet eliminated.
+
+    `y` is the residual of the views with all corrections taken out, seen as a twist; `M` weighs it.
+    """
+
+    GMG: Array  # (p, p)
+    GMy: Array  # (p,)
+    yMy: float
+    KMK: Array  # (poses, 6, 6)
+    KMG: Array  # (poses, 6, p)
+    KMy: Array  # (poses, 6)
+    cost: float  # of the views alone, in units of the pixel noise
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Unknowns where the problem is linearised."""
+
+    X: Array
+    Z: Array
+    correction: Array
+    scale: float
+    delay: float
+    intrinsics: Array
+
+
+def linearise(problem: Problem, state: State, px: float, extras: Sequence[Extra]) -> tuple[Linear, Array]:
+    """Normal equations at a state; also the (n, 6, 6) effect of corrections on each view."""
+    correction = state.correction[problem.pose]
+    shifted = correction - state.delay * problem.rate if state.delay else correction
+    T, B = chain(problem, state.X, state.Z, shifted)
+    rows = problem.camera_rows() + state.intrinsics[problem.camera]
+    squares, slopes, costs = normal_equations(
+        problem.points, problem.pixels, problem.offsets, problem.radii, T, rows, state.scale
+    )
+    weight = px**-2.0
+    M, b = squares * weight, slopes * weight
+    G, K = design(problem, state.X, state.Z, T, B, extras)
+    K = np.where((problem.kind == 2)[:, None, None], 0.0, K)
+    Mk = M[:, :, :6] @ K
+    My = b + (Mk @ correction[:, :, None])[:, :, 0]
+    poses = int(problem.pose.max()) + 1
+    Kt = K.swapaxes(1, 2)
+    KMK, KMG, KMy = np.zeros((poses, 6, 6)), np.zeros((poses, 6, G.shape[2])), np.zeros((poses, 6))
+    np.add.at(KMK, problem.pose, Kt @ Mk[:, :6])
+    np.add.at(KMG, problem.pose, Mk.swapaxes(1, 2) @ G)
+    np.add.at(KMy, problem.pose, (Kt @ My[:, :6, None])[:, :, 0])
+    GMG = np.einsum("nip,niq->pq", G, M @ G, optimize=False)
+    GMy = np.einsum("nip,ni->p", G, My)
+    Kd = (K @ correction[:, :, None])[:, :, 0]
+    # b = M y - M K d, and |r|² changes by the same quadratic, so yMy follows from the residual at d
+    cost = float(costs.sum() * weight)
+    yMy = cost + float(np.sum(Kd * (2.0 * b[:, :6] + (M[:, :6, :6] @ Kd[:, :, None])[:, :, 0])))
+    return Linear(GMG, GMy, yMy, KMK, KMG, KMy, cost), K
+
+
+def eliminate(linear: Linear, prior: Array) -> tuple[Array, Array, Array]:
+    """Information (p, p), right-hand side (p,), and (poses, 6, 6) inverse of the corrections' block."""
+    V: Array = np.linalg.inv(linear.KMK + prior).astype(np.float64)
+    VG = V @ linear.KMG
+    information = linear.GMG - np.einsum("gip,giq->pq", linear.KMG, VG)
+    right = linear.GMy - np.einsum("gip,gi->p", VG, linear.KMy)
+    return (information + information.T) / 2.0, right, V
+
+
+def refine(
+    problem: Problem,
+    X: Array,
+    Z: Array,
+    noise: Noise,
+    *,
+    extras: Sequence[Extra] = (),
+    estimate_robot: bool = False,
+    iterations: int = _ITERATIONS,
+) -> Estimate:
+    """Refine mounts to the maximum of the likelihood.
+
+    Args:
+        problem: The views.
+        X: (cameras, 4, 4) to start from.
+        Z: (boards, 4, 4) to start from.
+        noise: Standard deviations; those of the robot are a starting point when they are to be estimated.
+        extras: More unknowns: scale, delay, intrinsics.
+        estimate_robot: Whether the spread of the robot's errors is found from the data.
+        iterations: At most.
+
+    Raises:
+        OpenArmError: INTERNAL, when the start is no description of the views (a mark behind the camera).
+    """
+    state = State(X, Z, np.zeros((int(problem.pose.max()) + 1, 6)), 1.0, 0.0, np.zeros((problem.cameras, 4)))
+    linear, _ = linearise(problem, state, noise.px, extras)
+    if not np.isfinite(linear.cost):
+        raise OpenArmError(
+            Code.INTERNAL, "the refinement starts with a mark behind the camera; the closed form it came from is wrong"
+        )
+    converged, damping, settled = False, 0.0, 0
+    for count in range(iterations):
+        if estimate_robot and count >= 2 and settled < 4:
+            found = restricted_likelihood(linear, noise, whole=count == 2)
+            settled = settled + 1 if _near(found, noise) else 0
+            noise = found
+        prior = noise.prior
+        cost = linear.cost + _prior_cost(state.correction, prior)
+        while True:
+            information, right, V = eliminate(linear, prior)
+            scale = np.sqrt(np.maximum(np.diag(information), 1e-30))
+            normed = information / np.outer(scale, scale) + damping * np.eye(len(scale))
+            step = np.linalg.lstsq(normed, right / scale, rcond=1e-14)[0] / scale
+            correction = (V @ (linear.KMy - (linear.KMG @ step))[:, :, None])[:, :, 0]
+            trial = _stepped(problem, state, step, correction, extras)
+            ahead, _ = linearise(problem, trial, noise.px, extras)
+            reached = ahead.cost + _prior_cost(correction, prior)
+            if reached <= cost * (1.0 + 1e-9) + 1e-9 or damping > 1e3:
+                break
+            damping = max(10.0 * damping, 1e-4)
+        if damping > 1e3:
+            break
+        state, linear = trial, ahead
+        damping = damping * 0.1 if damping > 1e-6 else 0.0
+        small = float(np.abs(step[: 6 * (problem.cameras + problem.boards)]).max()) < 1e-9
+        if (small or cost - reached < 1e-9 * max(reached, 1.0)) and (not estimate_robot or settled >= 1):
+            converged = True
+            break
+    spread: Array | None = None
+    if estimate_robot:
+        full, both = _joined(linear)
+        spread = averaged(full, linear.KMK, both, TYPICAL_ROBOT)
+    information, _, _ = eliminate(linear, noise.prior)
+    total = linear.cost + _prior_cost(state.correction, noise.prior)
+    return Estimate(
+        state.X, state.Z, state.correction, noise, information, total, converged,
+        state.scale, state.delay, state.intrinsics, tuple(extras), spread,
+    )  # fmt: skip
+
+
+def information_at(problem: Problem, X: Array, Z: Array, noise: Noise) -> Array:
+    """Information (parameters, parameters) on the mounts at given mounts: its inverse is the Cramér-Rao bound."""
+    state = State(X, Z, np.zeros((int(problem.pose.max()) + 1, 6)), 1.0, 0.0, np.zeros((problem.cameras, 4)))
+    return eliminate(linearise(problem, state, noise.px, ())[0], noise.prior)[0]
+
+
+def _stepped(problem: Problem, state: State, step: Array, correction: Array, extras: Sequence[Extra]) -> State:
+    cameras, boards = problem.cameras, problem.boards
+    X = moved(state.X, step[: 6 * cameras].reshape(cameras, 6))
+    Z = moved(state.Z, step[6 * cameras : 6 * (cameras + boards)].reshape(boards, 6))
+    out = replace(state, X=X, Z=Z, correction=correction)
+    column = 6 * (cameras + boards)
+    for extra in extras:
+        if extra == "scale":
+            out = replace(out, scale=state.scale + float(step[column]))
+            column += 1
+        elif extra == "delay":
+            out = replace(out, delay=state.delay + float(step[column]))
+            column += 1
+        else:
+            out = replace(out, intrinsics=state.intrinsics + step[column : column + 4 * cameras].reshape(cameras, 4))
+            column += 4 * cameras
+    return out
+
+
+def _prior_cost(correction: Array, prior: Array) -> float:
+    return float(np.sum((correction @ prior) * correction))
+
+
+def _near(a: Noise, b: Noise) -> bool:
+    small_t, small_r = 10 * FLOOR_TRANSLATION, 10 * FLOOR_ROTATION
+    return (
+        abs(a.translation - b.translation) < 0.02 * b.translation + small_t
+        and abs(a.rotation - b.rotation) < 0.02 * b.rotation + small_r
+    )
+
+
+def restricted_likelihood(linear: Linear, noise: Noise, *, whole: bool) -> Noise:
+    """The robot's spread of the largest restricted likelihood; near `noise`, or in the whole range."""
+    full, both = _joined(linear)
+    found = robot_spread(full, linear.KMK, both, (noise.translation, noise.rotation), whole=whole)
+    return Noise(noise.px, *found)
+
+
+def _joined(linear: Linear) -> tuple[Array, Array]:
+    full = np.block([[linear.GMG, linear.GMy[:, None]], [linear.GMy[None, :], np.array([[linear.yMy]])]])
+    return full, np.concatenate([linear.KMG, linear.KMy[:, :, None]], axis=2)
+
+
+def pixel_noise(problem: Problem) -> float:
+    """Spread of the marks, px by axis: from fits of each view by itself, so that no robot error enters.
+
+    Views whose own fit is far worse than the usual one are left out.
+    """
+    freedom = 2.0 * problem.marks - 6.0
+    usable = freedom > 0
+    if not usable.any():
+        return 0.3
+    variance = problem.free_cost[usable] / freedom[usable]
+    good = variance <= 6.0 * np.median(variance)
+    pooled = problem.free_cost[usable][good].sum() / freedom[usable][good].sum()
+    return max(float(np.sqrt(pooled)), _LOWEST_PX)
+
+
+def invert_scaled(information: Array) -> Array:
+    """Inverse of a symmetric positive matrix whose columns differ in unit.
+
+    Raises:
+        OpenArmError: DEGENERATE, when it is singular.
+    """
+    diagonal = np.diag(information)
+    if not (np.isfinite(information).all() and (diagonal > 0.0).all()):
+        raise OpenArmError(Code.DEGENERATE, "the views say nothing of some unknown; add poses that differ in rotation")
+    scale = np.sqrt(diagonal)
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if values[0] <= 1e-14 * values[-1]:
+        raise OpenArmError(Code.DEGENERATE, "the views leave an unknown free; add poses that differ in rotation")
+    return (vectors / values) @ vectors.T / np.outer(scale, scale)
+
+
+def mount_error(T_estimated: Array, T_true: Array) -> tuple[float, float]:
+    """Distance of the origins, m, and angle, rad, between two mounts."""
+    offset = float(np.linalg.norm(T_estimated[:3, 3] - T_true[:3, 3]))
+    return offset, se3.angle_between(T_true[:3, :3], T_estimated[:3, :3])

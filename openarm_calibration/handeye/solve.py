@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From views to mounts: start, outliers, refinement, refusals.
+
+The order: refuse motions that determine nothing; a quick closed form; the refinement; a test of each robot pose
+against what the others predict for it. Where a pose fails, or the start looks spoiled, small random subsets vote for a
+clean one, and poses are taken out and let in again until the set stands still. m and rad.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy import stats
+
+from openarm_calibration.handeye.closed_form import Mounts, initial, kronecker
+from openarm_calibration.handeye.observability import FEWEST, condition_number, require_accuracy, require_motion
+from openarm_calibration.handeye.problem import Extra, Problem, Setup, chain
+from openarm_calibration.handeye.projection import normal_equations
+from openarm_calibration.handeye.refine import Estimate, Noise, pixel_noise, refine
+from openarm_calibration.handeye.residuals import PoseTest, pose_tests
+from openarm_common import se3
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+#: With fewer poses the others can't tell which one is wrong; a clean set would lose poses by chance.
+_FEWEST_TO_REJECT = 7
+
+
+class SolveConfig(Config):
+    """How a calibration is solved."""
+
+    px: float | None = Field(default=None, gt=0.0, description="spread of a mark, px; None: estimated")
+    robot_translation: float | None = Field(
+        default=None, ge=0.0, description="of the robot's position, m; None: estimated"
+    )
+    robot_rotation: float | None = Field(
+        default=None, ge=0.0, description="of the robot's rotation, rad; None: estimated"
+    )
+    extras: tuple[Extra, ...] = Field(default=(), description="more unknowns: scale, delay, intrinsics")
+    reject_outliers: bool = Field(default=True, description="leave poses out that the others contradict")
+    false_alarm: float = Field(default=1e-3, gt=0.0, lt=0.5, description="chance that a clean set loses a pose")
+    most_translation: float = Field(default=0.003, gt=0.0, description="largest predicted error that is an answer, m")
+    most_rotation: float = Field(default=math.radians(0.5), gt=0.0, description="the same of the rotation, rad")
+    seed: int = Field(default=0, ge=0, description="of the subsets that vote")
+
+
+@dataclass(frozen=True, eq=False)
+class Outlier:
+    """A view that was left out."""
+
+    name: str
+    index: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Mounts with what they rest on.
+
+    Args:
+        problem: All views.
+        used: (n,) which views the estimate rests on.
+        estimate: The refinement.
+        outliers: The other views, with reasons.
+        tests: Each robot pose against the prediction of the others.
+        condition: Condition number of the information, in units of 1 mm and 0.1°.
+    """
+
+    problem: Problem
+    used: Mask
+    estimate: Estimate
+    outliers: tuple[Outlier, ...]
+    tests: tuple[PoseTest, ...]
+    condition: float
+
+    def mount_covariance(self, camera: int = 0) -> Array:
+        """(6, 6) covariance of a camera's mount: position in the parent's axes (m), rotation in its own (rad)."""
+        block = slice(6 * camera, 6 * camera + 6)
+        return self.estimate.covariance()[block, block]
+
+    def sigma(self, camera: int = 0) -> tuple[float, float]:
+        """Predicted error of a camera's mount: standard deviation of position (m) and rotation (rad) as vectors."""
+        covariance = self.mount_covariance(camera)
+        return math.sqrt(np.trace(covariance[:3, :3])), math.sqrt(np.trace(covariance[3:, 3:]))
+
+
+def solve(problem: Problem, config: SolveConfig | None = None) -> Solution:
+    """Solve for all mounts of a problem.
+
+    Raises:
+        OpenArmError: DEGENERATE, when the views do not determine the mounts to the accuracy asked for, with the cause
+            and what to add; INVALID_ARGUMENT, for numbers that are not finite.
+    """
+    config = config or SolveConfig()
+    require_motion(problem)
+    px = config.px or pixel_noise(problem)
+    usable, blurred = _sharp(problem, px)
+    try:
+        used, estimate, tests = _robust(problem, usable, px, config)
+    except np.linalg.LinAlgError as error:
+        raise OpenArmError(Code.DEGENERATE, f"the {len(problem)} views leave an unknown free; add poses") from error
+    require_motion(problem.subset(used))
+    require_accuracy(problem.subset(used), estimate, config.most_translation, config.most_rotation)
+    contradicted = [
+        Outlier(problem.views[i].name or str(i), int(i), _reason(tests[int(problem.pose[i])]))
+        for i in np.flatnonzero(usable & ~used)
+    ]
+    outliers = tuple(sorted((*blurred, *contradicted), key=lambda outlier: outlier.index))
+    return Solution(problem, used, estimate, outliers, tests, condition_number(problem, estimate.information))
+
+
+def _sharp(problem: Problem, px: float) -> tuple[Mask, list[Outlier]]:
+    """Views whose marks fit a board by themselves."""
+    freedom = np.maximum(2.0 * problem.marks - 6.0, 1.0)
+    rms = np.sqrt(problem.free_cost / freedom)
+    usable = np.isfinite(rms) & (rms < 4.0 * max(px, float(np.median(rms))) + 0.05)
+    bad = [
+        Outlier(
+            problem.views[i].name or str(i), int(i),
+            f"its marks do not lie on the board: {rms[i]:.2f} px, the usual is {float(np.median(rms)):.2f} px",
+        )
+        for i in np.flatnonzero(~usable)
+    ]  # fmt: skip
+    return usable, bad
+
+
+def _reason(test: PoseTest) -> str:
+    return (
+        f"the other samples contradict it by {test.translation * 1e3:.1f} mm and {math.degrees(test.rotation):.2f}°"
+        f" (distance {test.distance:.1f}, expected below {test.limit:.1f}):"
+        " a wrong robot pose, a moved board or a late stamp"
+    )
+
+
+def _robust(
+    problem: Problem, usable: Mask, px: float, config: SolveConfig
+) -> tuple[Mask, Estimate, tuple[PoseTest, ...]]:
+    used = usable.copy()
+    estimate = _refine(problem, used, px, config, None)
+    limit = _limit(problem, used, config)
+    tests = pose_tests(problem, used, estimate, limit, usable)
+    if not config.reject_outliers or _poses(problem, used) < _FEWEST_TO_REJECT:
+        return used, estimate, tests
+    suspect = any(tests[p].distance > limit for p in problem.pose[usable]) or _spoiled(problem, used, estimate)
+    if not suspect:
+        return used, estimate, tests
+    used = _consensus(problem, usable, config)
+    start: Estimate | None = None
+    seen: set[bytes] = set()
+    for _ in range(8):
+        estimate = _refine(problem, used, px, config, start)
+        tests = pose_tests(problem, used, estimate, _limit(problem, used, config), usable)
+        passing = np.array([tests[p].distance <= tests[p].limit for p in problem.pose])
+        wanted = usable & passing
+        if np.array_equal(wanted, used) or wanted.tobytes() in seen or _poses(problem, wanted) < FEWEST:
+            break
+        seen.add(wanted.tobytes())
+        used, start = wanted, estimate
+    return used, estimate, tests
+
+
+def _refine(problem: Problem, used: Mask, px: float, config: SolveConfig, start: Estimate | None) -> Estimate:
+    part = problem.subset(used)
+    given = config.robot_translation is not None and config.robot_rotation is not None
+    noise = Noise(px, config.robot_translation or 0.0, config.robot_rotation or 0.0) if given else Noise(px, 1e-4, 1e-4)
+    X, Z = (start.X, start.Z) if start is not None else starting_mounts(part)
+    return refine(part, X, Z, noise, extras=config.extras, estimate_robot=not given)
+
+
+def _limit(problem: Problem, used: Mask, config: SolveConfig) -> float:
+    """Largest squared distance by number that a clean pose of this set has."""
+    poses = _poses(problem, used)
+    chance = 1.0 - config.false_alarm / max(poses, 1)
+    if config.robot_translation is not None and config.robot_rotation is not None:
+        return float(stats.chi2.ppf(chance, 6)) / 6.0
+    # the spread itself was estimated from so many numbers
+    return float(stats.f.ppf(chance, 6, max(6 * poses - 18, 4)))
+
+
+def _poses(problem: Problem, used: Mask) -> int:
+    return len(np.unique(problem.pose[used]))
+
+
+def _spoiled(problem: Problem, used: Mask, estimate: Estimate) -> bool:
+    """Whether a few views carry most of the residual that the robot's estimated spread explains away."""
+    rms = _reprojection(problem, estimate.X, estimate.Z)[used]
+    return bool(rms.max() > 4.0 * np.median(rms) and rms.max() > 3.0 * estimate.noise.px)
+
+
+def _reprojection(problem: Problem, X: Array, Z: Array) -> Array:
+    """(n,) rms of each view without corrections, px."""
+    T, _ = chain(problem, X, Z, np.zeros((len(problem), 6)))
+    _, _, cost = normal_equations(
+        problem.points, problem.pixels, problem.offsets, problem.radii, T, problem.camera_rows(), 1.0
+    )
+    return np.sqrt(cost / (2.0 * problem.marks))
+
+
+def starting_mounts(problem: Problem) -> tuple[Array, Array]:
+    """Closed-form mounts of all cameras and boards, (cameras, 4, 4) and (boards, 4, 4).
+
+    Raises:
+        OpenArmError: DEGENERATE, when a camera or board is tied to nothing, or the closed form has no answer.
+    """
+    X: dict[int, Array] = {}
+    Z: dict[int, Array] = {}
+    pairs, counts = np.unique(
+        np.stack([problem.camera, problem.board], axis=1)[problem.kind < 2], axis=0, return_counts=True
+    )
+    for camera, board in pairs[np.argsort(-counts)]:
+        if camera in X and board in Z:
+            continue
+        mounts: Mounts = initial(problem, int(camera), int(board))
+        X.setdefault(int(camera), mounts.X)
+        Z.setdefault(int(board), mounts.Z)
+    for _ in range(problem.cameras + problem.boards):  # fixed views hand a mount on
+        for i in np.flatnonzero(problem.kind == 2):
+            camera, board = int(problem.camera[i]), int(problem.board[i])
+            if camera in X and board not in Z:
+                Z[board] = X[camera] @ problem.free[i]
+            elif board in Z and camera not in X:
+                X[camera] = Z[board] @ se3.inverse(problem.free[i])
+    missing = [f"camera {k}" for k in range(problem.cameras) if k not in X]
+    missing += [f"board {k}" for k in range(problem.boards) if k not in Z]
+    if missing:
+        raise OpenArmError(Code.DEGENERATE, f"too few poses: no view ties {', '.join(missing)} to the robot")
+    return np.array([X[k] for k in range(problem.cameras)]), np.array([Z[k] for k in range(problem.boards)])
+
+
+def _consensus(problem: Problem, usable: Mask, config: SolveConfig) -> Mask:
+    """Views that agree with the best of many small subsets, for each camera and board."""
+    rng = np.random.default_rng(config.seed)
+    keep = usable.copy()
+    moving = usable & (problem.kind < 2)
+    for camera, board in np.unique(np.stack([problem.camera, problem.board], axis=1)[moving], axis=0):
+        mine = np.flatnonzero(moving & (problem.camera == camera) & (problem.board == board))
+        if len(mine) <= FEWEST + 1:
+            continue
+        part = problem.subset(mine)
+        setup: Setup = "in_hand" if part.kind[0] == 0 else "to_hand"
+        best, agreement = math.inf, np.zeros(len(mine))
+        for _ in range(80):
+            picked = rng.choice(len(mine), size=4 if len(mine) > 6 else 3, replace=False)
+            try:
+                mounts = kronecker(setup, part.A[picked], part.free[picked])
+            except OpenArmError:
+                continue  # a subset may be degenerate; another one is drawn
+            X = np.broadcast_to(mounts.X, (problem.cameras, 4, 4))
+            Z = np.broadcast_to(mounts.Z, (part.boards, 4, 4))
+            rms = np.where(np.isfinite(r := _reprojection(part, X, Z)), r, 1e6)
+            score = float(np.quantile(rms, 0.7))
+            if score < best:
+                best, agreement = score, rms
+        inside = agreement <= 2.5 * best
+        if inside.sum() >= FEWEST:
+            keep[mine] = inside
+    return keep

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is the result right? Held-out error, scale, delay, drift, and a grade against stated limits.
+
+Held-out errors come from solving without some poses and predicting them: px in the image, mm at the board's distance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from openarm_calibration.handeye.closed_form import METHODS, closed_form
+from openarm_calibration.handeye.problem import Problem, Setup, chain
+from openarm_calibration.handeye.projection import project
+from openarm_calibration.handeye.refine import mount_error, refine
+from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
+from openarm_calibration.sampling.samples import SampleSet
+from openarm_common.config import Config
+from openarm_common.errors import OpenArmError
+
+Array = NDArray[np.float64]
+Grade = Literal["pass", "warn", "fail"]
+
+
+class Limits(Config):
+    """When a calibration passes; beyond three times a limit it fails, between the two it is a warning."""
+
+    translation: float = Field(default=0.5e-3, gt=0.0, description="predicted error of the position, m")
+    rotation: float = Field(default=math.radians(0.05), gt=0.0, description="predicted error of the rotation, rad")
+    held_out: float = Field(default=1e-3, gt=0.0, description="rms error at the board of poses that were left out, m")
+    scale: float = Field(default=0.003, gt=0.0, description="of the board against what is stated")
+    focal: float = Field(default=0.005, gt=0.0, description="of the focal length against the camera's info")
+    samples: int = Field(default=10, ge=3, description="fewer are a warning")
+    drift: float = Field(default=2e-3, gt=0.0, description="distance from the stored calibration, m")
+
+
+@dataclass(frozen=True)
+class Held:
+    """Error of poses that the answer did not see."""
+
+    px: float
+    metres: float
+    by_name: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that is looked at.
+
+    Args:
+        name: What, in a word or two.
+        ratio: Over its limit; above 1 is a warning, above 3 a failure.
+        text: The figure in a sentence.
+    """
+
+    name: str
+    ratio: float
+    text: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Grade, why, the figures (SI units, px), and everything that was looked at."""
+
+    grade: Grade
+    reasons: tuple[str, ...]
+    figures: dict[str, Any]
+    checks: tuple[Check, ...] = ()
+
+
+def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
+    """Leave poses out in turn (`folds` groups; as many as poses is leave-one-out) and predict them.
+
+    Poses whose absence leaves too few to solve are not counted.
+    """
+    used = np.flatnonzero(solution.used)
+    poses = np.unique(problem.pose[used])
+    folds = max(2, min(folds, len(poses)))
+    squares: dict[str, tuple[float, float]] = {}
+    for fold in range(folds):
+        out = np.isin(problem.pose[used], poses[fold::folds])
+        if len(np.unique(problem.pose[used[~out]])) < 3:
+            continue
+        estimate = refine(
+            problem.subset(used[~out]), solution.estimate.X, solution.estimate.Z, solution.estimate.noise,
+            extras=solution.estimate.extras,
+        )  # fmt: skip
+        left = problem.subset(used[out])
+        T, _ = chain(left, estimate.X, estimate.Z, np.zeros((len(left), 6)))
+        rows = left.camera_rows()
+        if estimate.intrinsics is not None:
+            rows = rows + estimate.intrinsics[left.camera]
+        for k, view in enumerate(left.views):
+            away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
+            px = float(np.mean(np.sum(away**2, axis=1)))
+            squares[view.name or str(k)] = px, px * float(T[k, 2, 3] / rows[k, 0]) ** 2
+    if not squares:
+        return Held(math.nan, math.nan, {})
+    px2, m2 = np.mean(list(squares.values()), axis=0)
+    by_name = {name: (math.sqrt(a), math.sqrt(b)) for name, (a, b) in squares.items()}
+    return Held(math.sqrt(px2), math.sqrt(m2), by_name)
+
+
+def side_by_side(problem: Problem, solution: Solution) -> dict[str, dict[str, float] | str]:
+    """Every closed form beside the refinement: distance from it (m, rad) and rms reprojection (px)."""
+    part = problem.subset(solution.used)
+    setup: Setup = part.views[0].setup
+    out: dict[str, dict[str, float] | str] = {}
+    for method in METHODS:
+        try:
+            mounts = closed_form(method, setup, part.A, part.free)
+        except OpenArmError as error:
+            out[method] = error.message
+            continue
+        offset, angle = mount_error(mounts.X, solution.estimate.X[0])
+        px = _rms(part, mounts.X[None], mounts.Z[None])
+        out[method] = {"translation": offset, "rotation": angle, "px": px}
+    out["REFINED"] = {"translation": 0.0, "rotation": 0.0, "px": _rms(part, solution.estimate.X, solution.estimate.Z)}
+    return out
+
+
+def _rms(problem: Problem, X: Array, Z: Array) -> float:
+    T, _ = chain(problem, X, Z, np.zeros((len(problem), 6)))
+    rows = problem.camera_rows()
+    away = [project(view.points, view.radius, T[k], rows[k]) - view.pixels for k, view in enumerate(problem.views)]
+    return float(np.sqrt(np.mean(np.concatenate(away) ** 2)))
+
+
+def estimate_delay(samples: SampleSet, config: SolveConfig | None = None, rounds: int = 4) -> tuple[float, float]:
+    """How old the images are at their stamps, with its standard deviation, s; needs samples of a moving robot.
+
+    The deviation is infinite when the robot stood in all samples.
+    """
+    config = config or SolveConfig(most_translation=0.1, most_rotation=0.2, reject_outliers=False)
+    delay, sigma = 0.0, math.inf
+    for _ in range(rounds):
+        problem = samples.problem(delay)
+        if not np.abs(problem.rate).max() > 1e-4:
+            return 0.0, math.inf
+        estimate = solve(problem, config.model_copy(update={"extras": ("delay",)})).estimate
+        delay += estimate.delay
+        sigma = math.sqrt(float(estimate.covariance()[-1, -1]))
+        if abs(estimate.delay) < 1e-5:
+            break
+    return delay, sigma
+
+
+def assess(problem: Problem, solution: Solution, limits: Limits | None = None, stored: Array | None = None) -> Verdict:
+    """Grade a solution of one camera.
+
+    Args:
+        problem: All views.
+        solution: Of them.
+        limits: None is the defaults.
+        stored: (4, 4) the mount X in use until now, for the drift.
+    """
+    limits = limits or Limits()
+    sigma_t, sigma_r = solution.sigma()
+    one_out, folds = held_out(problem, solution, len(problem)), held_out(problem, solution, 5)
+    scale, scale_sigma = _scale(solution)
+    focal, focal_sigma = _focal(solution)
+    poses = len(np.unique(problem.pose[solution.used]))
+    figures: dict[str, Any] = {
+        "sigma_translation": sigma_t, "sigma_rotation": sigma_r,
+        "px": solution.estimate.noise.px,
+        "robot_translation": solution.estimate.noise.translation, "robot_rotation": solution.estimate.noise.rotation,
+        "condition": solution.condition, "samples": poses,
+        "reprojection_px": _rms(problem.subset(solution.used), solution.estimate.X, solution.estimate.Z),
+        "leave_one_out_px": one_out.px, "leave_one_out": one_out.metres,
+        "five_fold_px": folds.px, "five_fold": folds.metres,
+        "scale": scale, "scale_sigma": scale_sigma, "focal": focal, "focal_sigma": focal_sigma,
+        "by_sample": {name: {"px": px, "metres": m} for name, (px, m) in one_out.by_name.items()},
+        "influence": {v.name: solution.tests[int(problem.pose[k])].influence for k, v in enumerate(problem.views)},
+        "outliers": {outlier.name: outlier.reason for outlier in solution.outliers},
+    }  # fmt: skip
+    checks = [
+        Check("position", sigma_t / limits.translation, f"predicted error of the position {sigma_t * 1e3:.3f} mm"),
+        Check("rotation", sigma_r / limits.rotation, f"predicted error of the rotation {math.degrees(sigma_r):.4f}°"),
+    ]
+    if not math.isnan(one_out.metres):
+        told = f"held-out error {one_out.metres * 1e3:.3f} mm at the board"
+        checks.append(Check("held out", one_out.metres / limits.held_out, told))
+    beyond = max(abs(scale - 1.0) - 3.0 * scale_sigma, 0.0)
+    told = f"the board seems {abs(scale - 1.0) * 100:.2f} % off its stated size"
+    checks.append(Check("board size", beyond / limits.scale, told))
+    away = max(abs(focal - 1.0) - 3.0 * focal_sigma, 0.0)
+    told = f"the focal length seems {(focal - 1.0) * 100:+.2f} % off what camera_info says"
+    told += "; are these its intrinsics?" if away > limits.focal else ""
+    checks.append(Check("focal length", away / limits.focal, told))
+    share = len(solution.outliers) / max(len(problem), 1)
+    told = f"{len(solution.outliers)} of {len(problem)} samples contradict the others"
+    checks.append(Check("contradictions", share / 0.1, told))
+    told = f"{poses} poses, {limits.samples} are wanted"
+    checks.append(Check("poses", 1.5 if poses < limits.samples else 0.0, told))
+    if stored is not None:
+        offset, angle = mount_error(solution.estimate.X[0], stored)
+        figures |= {"drift": offset, "drift_rotation": angle}
+        # a drift is no fault of this result: it is told, never more than a warning
+        told = f"the camera is {offset * 1e3:.1f} mm and {math.degrees(angle):.2f}° from what is stored"
+        checks.append(Check("drift", min(offset / limits.drift, 2.0), told))
+    reasons = tuple(check.text for check in checks if check.ratio > 1.0)
+    worst = max(check.ratio for check in checks)
+    grade: Grade = "fail" if worst > 3.0 else "warn" if worst > 1.0 else "pass"
+    return Verdict(grade, reasons, figures, tuple(checks))
+
+
+def _focal(solution: Solution) -> tuple[float, float]:
+    """Focal length over the one that the camera states, when the intrinsics are free, and its deviation.
+
+    The larger distance of fx and fy; of several cameras the first.
+    """
+    part = solution.problem.subset(solution.used)
+    now, stated = solution.estimate, part.intrinsics[0]
+    estimate = refine(part, now.X, now.Z, now.noise, extras=("intrinsics",))
+    if estimate.intrinsics is None:
+        return 1.0, math.inf
+    try:
+        covariance = estimate.covariance()
+    except OpenArmError:
+        return 1.0, math.inf  # views that do not tell it
+    first = 6 * (part.cameras + part.boards)
+    both = [
+        (float(estimate.intrinsics[0, k]) / f, math.sqrt(float(covariance[first + k, first + k])) / f)
+        for k, f in enumerate((stated.fx, stated.fy))
+    ]
+    change, sigma = max(both, key=lambda pair: abs(pair[0]) - 3.0 * pair[1])
+    return 1.0 + change, sigma
+
+
+def _scale(solution: Solution) -> tuple[float, float]:
+    """Scale of the board when it is free, and its deviation."""
+    part = solution.problem.subset(solution.used)
+    now = solution.estimate
+    estimate = refine(part, now.X, now.Z, now.noise, extras=("scale",))
+    return estimate.scale, math.sqrt(float(estimate.covariance()[-1, -1]))

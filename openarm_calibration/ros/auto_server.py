@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Action /calibration/auto: moves the arm from pose to pose by /motion/move, takes a sample at each, and solves."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from openarm_interfaces.action import AutoCalibrate, MoveArm
+from openarm_interfaces.msg import CollisionBox
+from rclpy.action import ActionClient, ActionServer, CancelResponse
+from rclpy.action.server import ServerGoalHandle
+
+from openarm_calibration.handeye.offline import Result
+from openarm_calibration.handeye.verdict import estimate_delay
+from openarm_calibration.ros.convert import fill
+from openarm_calibration.ros.photo_client import wait_until
+from openarm_calibration.sampling.next_pose import PoseSearch, Proposal
+from openarm_calibration.sampling.samples import Sample, without
+from openarm_calibration.sampling.session_file import session_path
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import matrix_to_pose, vector
+
+if TYPE_CHECKING:
+    from openarm_calibration.ros.session_node import SessionNode
+
+Array = NDArray[np.float64]
+
+#: What says that a pose can't be had, while another one may.
+_ELSEWHERE = frozenset({Code.IN_COLLISION, Code.NO_PLAN, Code.UNREACHABLE, Code.LIMITS})
+#: What says that a pose gave no sample, while another one may.
+_NO_SAMPLE = frozenset({Code.NOTHING_DETECTED, Code.STALE_DATA, Code.MOVING})
+#: Proposals of one search, and poses without a sample in a row before it is given up.
+_AT_ONCE, _MISSES = 15, 6
+#: Longest wait for a server to answer, s of wall clock.
+_ANSWER = 5.0
+#: Images of the moving arm that the delay needs, and are enough.
+_FEWEST_MOVING, _ENOUGH_MOVING = 4, 16
+
+
+class AutoCalibrator:
+    """Serves the action.
+
+    Args:
+        node: That has the samples, the solver and the store.
+    """
+
+    def __init__(self, node: SessionNode) -> None:
+        self._node = node
+        self._config = node.config.auto
+        self._mover = ActionClient(node, MoveArm, "/motion/move")
+        self._server = ActionServer(
+            node, AutoCalibrate, "/calibration/auto", self._execute, cancel_callback=lambda _: CancelResponse.ACCEPT
+        )
+
+    async def _execute(self, handle: ServerGoalHandle) -> AutoCalibrate.Result:
+        begin = time.monotonic()
+        result = AutoCalibrate.Result()
+        try:
+            with self._node.work("calibrating by itself"):
+                run = _Run(self._node, self._mover, handle, result)
+                await run.sample()
+                await run.solve()
+            result.success, result.code = True, Code.OK.value
+            handle.succeed()
+        except OpenArmError as error:
+            result.code, result.message = error.code.value, error.message
+            if error.code == Code.CANCELLED and handle.is_cancel_requested:
+                handle.canceled()
+            else:
+                handle.abort()
+        result.samples = len(self._node.samples)
+        result.duration = time.monotonic() - begin
+        return result
+
+
+class _Run:
+    """One goal."""
+
+    def __init__(
+        self, node: SessionNode, mover: ActionClient, handle: ServerGoalHandle, result: AutoCalibrate.Result
+    ) -> None:
+        self._node, self._mover, self._handle, self._result = node, mover, handle, result
+        self._goal: AutoCalibrate.Goal = handle.request
+        self._config = config = node.config.auto
+        node.use(self._goal.camera or node.camera.name)
+        self._poses = int(self._goal.poses) or config.poses
+        self._enough_t = self._goal.sigma_translation or config.sigma_translation
+        self._enough_r = self._goal.sigma_rotation or config.sigma_rotation
+        standing = node.samples.head.setup == "to_hand"
+        place = (config.on_hand if standing else config.on_table).pose
+        self._standing = standing
+        self._search = PoseSearch(node.description, node.camera.T_parent_optical, place, config.search)
+
+    # --- taking samples
+    async def sample(self) -> None:
+        """Take samples until the result is certain enough, or the budget is spent.
+
+        Raises:
+            OpenArmError: CANCELLED; what keeps the arm or the camera from working.
+        """
+        if self._search.belief.Z is None:
+            await self._first()
+        missed = 0
+        while len(self._node.samples) < self._poses:
+            proposal = await self._next()
+            self._tell("sampling", "")
+            try:
+                await self._take()
+            except OpenArmError as error:
+                if error.code not in _NO_SAMPLE:
+                    raise
+                missed += 1
+                self._miss(proposal, error)
+                if missed >= _MISSES:
+                    raise OpenArmError(
+                        error.code, f"{missed} poses in a row gave no sample; of the last: {error.message}"
+                    ) from error
+                continue
+            missed = 0
+            belief = await self._node.in_thread(self._search.learn, self._node.samples)
+            certain = belief.sigma_translation < self._enough_t and belief.sigma_rotation < self._enough_r
+            if certain and len(self._node.samples) >= min(self._config.fewest, self._poses):
+                break
+
+    async def _first(self) -> None:
+        """A sample where the arm stands: shows where the board is."""
+        self._tell("sampling", "where the arm stands, to see where the board is")
+        try:
+            await self._take()
+        except OpenArmError as error:
+            if error.code != Code.NOTHING_DETECTED:
+                raise
+            key = "on_hand" if self._standing else "on_table"
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"nobody said where the board is (parameter auto.{key}.position), and it is not in view:"
+                f" {error.message}",
+            ) from error
+        await self._node.in_thread(self._search.learn, self._node.samples)
+
+    async def _next(self) -> Proposal:
+        """Move to the most telling pose that the arm gets to.
+
+        Raises:
+            OpenArmError: What the planner said of the last one, when it gets to none; CANCELLED and the like at once.
+        """
+        fault: OpenArmError | None = None
+        tried = 0
+        while tried < self._config.tries:
+            self._tell("looking", "for the most telling pose")
+            state = await self._node.photographer.state()
+            for proposal in await self._node.in_thread(self._search.propose, self._node.samples, state, _AT_ONCE):
+                self._tell("moving", f"try {tried + 1}: the arm did not get to the one before" if tried else "")
+                tried += 1
+                try:
+                    await self._move(proposal.q, self._config.velocity_scale, self._stopped)
+                except OpenArmError as error:
+                    if error.code not in _ELSEWHERE:
+                        raise
+                    fault = error
+                    self._search.refuse(proposal)
+                    continue
+                return proposal
+        last = fault.message if fault is not None else "none was proposed"
+        raise OpenArmError(Code.NO_PLAN, f"the arm gets to none of {tried} poses; of the last: {last}")
+
+    async def _take(self) -> Sample:
+        """Take a sample as soon as the arm stands."""
+        until = time.monotonic() + self._config.settle_timeout
+        while True:
+            self._check()
+            try:
+                return await self._node.take()
+            except OpenArmError as error:
+                if error.code != Code.MOVING or time.monotonic() > until:
+                    raise
+
+    def _miss(self, proposal: Proposal, error: OpenArmError) -> None:
+        self._search.refuse(proposal)
+        posture = ", ".join(f"{q:.2f}" for q in proposal.q)
+        self._result.missed.append(f"({posture}): {error.message}")
+        self._node.get_logger().info(f"no sample at ({posture}): {error.message}")
+
+    # --- the arm
+    async def _move(self, q: Array, scale: float, stopped: Callable[[], bool]) -> None:
+        """Move to a posture.
+
+        Raises:
+            OpenArmError: As /motion/move, or NOT_READY without it; CANCELLED, with the arm at rest.
+        """
+        if not await wait_until(self._node, self._mover.server_is_ready, _ANSWER):
+            raise OpenArmError(Code.NOT_READY, "no action /motion/move: is the graph up (openarm up calibrate)?")
+        goal = MoveArm.Goal(arm=self._config.arm, kind=MoveArm.Goal.JOINTS, joint_positions=q.tolist())
+        goal.velocity_scale = scale
+        self._surround(goal)
+        sent = self._mover.send_goal_async(goal)
+        if not await wait_until(self._node, sent.done, _ANSWER):
+            raise OpenArmError(Code.TIMEOUT, f"/motion/move did not answer within {_ANSWER:g} s")
+        accepted = sent.result()
+        if accepted is None or not accepted.accepted:
+            raise OpenArmError(Code.BUSY, "/motion/move refused the goal")
+        ended = accepted.get_result_async()
+        in_time = await wait_until(self._node, lambda: ended.done() or stopped(), self._config.move_timeout)
+        if not ended.done():
+            accepted.cancel_goal_async()  # the motion node brings the arm to rest
+            await wait_until(self._node, ended.done, _ANSWER)
+            self._check()
+            if not in_time:
+                raise OpenArmError(Code.TIMEOUT, f"a motion took longer than {self._config.move_timeout:g} s")
+            return  # somebody else's reason to stop
+        answer: MoveArm.Result = ended.result().result
+        if not answer.success:
+            self._check()
+            if answer.code not in Code.__members__:
+                raise OpenArmError(
+                    Code.INTERNAL, "/motion/move ended without an answer; see the log of the motion node"
+                )
+            raise OpenArmError(Code(answer.code), answer.message)
+
+    def _surround(self, goal: MoveArm.Goal) -> None:
+        """Let the planner know of the board."""
+        Z = self._search.belief.Z
+        if Z is None:
+            return
+        thick = self._config.plate
+        box = CollisionBox(id="calibration board", size=vector((*self._node.samples.board.size, thick)))
+        T_carrier_box = Z @ se3.make(None, (0.0, 0.0, thick / 2.0))  # the board's z points into it
+        if not self._standing:
+            box.pose = matrix_to_pose(T_carrier_box)
+            goal.obstacles = [box]
+            return
+        description = self._node.description
+        tool, carrier = description.tcp_link(self._config.arm), self._node.samples.head.carrier
+        anyhow = dict.fromkeys(description.joints, 0.0)  # the two are fixed to each other
+        T_tool_carrier = se3.inverse(description.link_pose(tool, anyhow)) @ description.link_pose(carrier, anyhow)
+        box.pose = matrix_to_pose(T_tool_carrier @ T_carrier_box)
+        goal.attached = [box]
+
+    # --- solving
+    async def solve(self) -> None:
+        """Solve, judge, and do with the result what was asked."""
+        goal, result, node = self._goal, self._result, self._node
+        self._tell("solving", f"{len(node.samples)} samples")
+        if goal.session:
+            node.samples.save(session_path(goal.session))
+        solved: Result = await node.solve()
+        fill(result, solved, node.camera.link_frame)
+        if goal.measure_delay:
+            result.delay, result.delay_sigma = await self._delay()
+        if goal.save:
+            result.path = str(node.save())
+            result.message += f"; stored in {result.path}"
+
+    async def _delay(self) -> tuple[float, float]:
+        """Age of the images at their stamps, s, and its predicted error: from a slow motion to a far pose.
+
+        Raises:
+            OpenArmError: NOTHING_DETECTED, when the moving arm was seen too rarely.
+        """
+        node = self._node
+        here = node.samples.samples[-1].joints
+        names = node.samples.joint_names
+
+        def away(sample: Sample) -> float:
+            return max(abs(sample.joints[name] - here[name]) for name in names)
+
+        far = max(node.samples.samples, key=away)
+        both = without(node.samples, (), node.description)
+        begun, ended, seen = len(both), False, 0
+
+        async def follow() -> None:
+            nonlocal ended
+            try:
+                q = np.array([far.joints[name] for name in names])
+                await self._move(
+                    q, self._config.delay_velocity_scale, lambda: self._stopped() or seen >= _ENOUGH_MOVING
+                )
+            finally:
+                ended = True
+
+        executor = node.executor
+        if executor is None:
+            raise OpenArmError(Code.INTERNAL, "the node has no executor")
+        motion = executor.create_task(follow)
+        while not ended and seen < _ENOUGH_MOVING:
+            self._tell("delay", f"{seen} images of the moving arm")
+            try:
+                view = await node.look(moving=True)
+            except OpenArmError as error:
+                if error.code not in _NO_SAMPLE:
+                    raise
+                continue
+            if view.matched.speed > node.config.gate.max_speed:
+                both.take(view.t_ns, view.matched, view.detection)
+                seen = len(both) - begun
+        await motion
+        self._check()
+        if seen < _FEWEST_MOVING:
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"{seen} images of the moving arm showed the board, at least {_FEWEST_MOVING} are needed for the delay;"
+                " lower auto.delay_velocity_scale",
+            )
+        return await node.in_thread(estimate_delay, both)
+
+    # --- telling
+    def _stopped(self) -> bool:
+        return bool(self._handle.is_cancel_requested)
+
+    def _check(self) -> None:
+        if self._stopped():
+            raise OpenArmError(Code.CANCELLED, f"cancelled after {len(self._node.samples)} samples; the arm stands")
+
+    def _tell(self, stage: str, message: str) -> None:
+        self._check()
+        belief = self._search.belief
+        feedback = AutoCalibrate.Feedback(stage=stage, message=message, poses=self._poses)
+        feedback.pose = min(len(self._node.samples) + 1, self._poses)
+        if belief.solved:
+            feedback.sigma_translation, feedback.sigma_rotation = belief.sigma_translation, belief.sigma_rotation
+        self._handle.publish_feedback(feedback)

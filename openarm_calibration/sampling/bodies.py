@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many postures at once: where a link is; whether the robot hides something from a camera, or is in its own way.
+
+Hiding and contact go by boxes around the collision shapes. This sorts postures out before a planner is asked, fast and
+roughly: for contact the boxes are a little smaller than the shapes, for sight a little larger. Root frame, m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_calibration.handeye.problem import exps
+from openarm_common.robot.description import RobotDescription
+
+Array = NDArray[np.float64]
+
+#: Added to half edges for sight, and taken off for contact.
+_SKIN = 0.004
+#: A cylinder's box for contact: between the one inside and the one around it.
+_CYLINDER = 0.85
+
+
+def chain_poses(description: RobotDescription, link: str, q: Array) -> Array:
+    """Poses (n, 4, 4) of a link for the movable joints of its chain (n, joints), rad or m."""
+    T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    column = 0
+    for joint in description.chain(link):
+        T = T @ joint.T_parent_joint
+        if joint.type == "fixed":
+            continue
+        motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
+        along = q[:, column, None] * joint.axis
+        if joint.type == "prismatic":
+            motion[:, :3, 3] = along
+        else:
+            motion[:, :3, :3] = exps(along)
+        T = T @ motion
+        column += 1
+    return np.array(T)
+
+
+class Bodies:
+    """The collision shapes of a robot.
+
+    Args:
+        description: The robot.
+    """
+
+    def __init__(self, description: RobotDescription) -> None:
+        shapes = [(name, shape) for name, link in description.links.items() for shape in link.collision]
+        self._links = [name for name, _ in shapes]
+        self._T_link_shape: Array = np.array([shape.T_link_primitive for _, shape in shapes]).reshape(-1, 4, 4)
+        half: list[tuple[float, float, float]] = []
+        small: list[tuple[float, float, float]] = []
+        for _, shape in shapes:
+            if shape.kind == "box":
+                x, y, z = (edge / 2.0 for edge in shape.size)
+                half.append((x, y, z))
+                small.append((x, y, z))
+            else:
+                r, h = shape.size[0], shape.size[1] / 2.0
+                half.append((r, r, h))
+                small.append((_CYLINDER * r, _CYLINDER * r, h))
+        self._large: Array = np.array(half).reshape(-1, 3) + _SKIN
+        self._small: Array = np.maximum(np.array(small).reshape(-1, 3) - _SKIN, 1e-4)
+        allowed = description.allowed_collisions
+        pairs = [
+            (i, j)
+            for i in range(len(shapes))
+            for j in range(i + 1, len(shapes))
+            if self._links[i] != self._links[j] and frozenset((self._links[i], self._links[j])) not in allowed
+        ]
+        self._one, self._other = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+
+    def place(self, links: Mapping[str, Array]) -> Array:
+        """(n, 4, 4) poses of the shapes for poses (4, 4) of the links."""
+        return np.array([links[name] for name in self._links]).reshape(-1, 4, 4) @ self._T_link_shape
+
+    def touching(self, shapes: Array) -> bool:
+        """Whether two shapes of different links overlap that may not; `shapes` from `place`."""
+        a, b = shapes[self._one], shapes[self._other]
+        h, k = self._small[self._one], self._small[self._other]
+        Ra, Rb = a[:, :3, :3], b[:, :3, :3]
+        apart = b[:, :3, 3] - a[:, :3, 3]
+        near = np.linalg.norm(apart, axis=1) < np.linalg.norm(h, axis=1) + np.linalg.norm(k, axis=1)
+        if not near.any():
+            return False
+        Ra, Rb, apart, h, k = Ra[near], Rb[near], apart[near], h[near], k[near]
+        # separating axes: the faces' normals, and the products of the edges
+        edges = np.cross(Ra.swapaxes(1, 2)[:, :, None], Rb.swapaxes(1, 2)[:, None]).reshape(-1, 9, 3)
+        axes = np.concatenate([Ra.swapaxes(1, 2), Rb.swapaxes(1, 2), edges], axis=1)
+        reach = np.abs(axes @ Ra) @ h[:, :, None] + np.abs(axes @ Rb) @ k[:, :, None]
+        separated = np.abs(axes @ apart[:, :, None]) > reach
+        return bool((~separated.any(axis=(1, 2))).any())
+
+    def hidden(self, shapes: Array, eye: Array, points: Array) -> bool:
+        """Whether a shape lies between the eye (3,) and any of the points (n, 3); `shapes` from `place`."""
+        inverse = shapes[:, :3, :3].swapaxes(1, 2)
+        start = (inverse @ (eye - shapes[:, :3, 3])[:, :, None])[:, None, :, 0]
+        ends = (points[None] - shapes[:, None, :3, 3]) @ shapes[:, :3, :3]
+        way = ends - start
+        way = np.where(np.abs(way) < 1e-12, 1e-12, way)
+        half = self._large[:, None]
+        one, other = (-half - start) / way, (half - start) / way
+        enter, leave = np.minimum(one, other).max(axis=2), np.maximum(one, other).min(axis=2)
+        return bool(((enter <= leave) & (leave > 0.0) & (enter < 1.0)).any())

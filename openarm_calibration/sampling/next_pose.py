@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where to look from next, among postures that an arm can take: what drives automatic calibration.
+
+Postures are drawn in joint space, at random and around those that showed the board, so that each is reachable; kept are
+those in which all of the board would be in the image, large enough and not behind the robot; and of these the ones that
+take most off the predicted error of the camera's mount, with what both mounts are known to by now (twelve unknowns).
+Whether the way there is free is for the planner to say. m, rad, px.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from openarm_calibration.handeye.observability import UNITS
+from openarm_calibration.handeye.problem import View, assemble, inverses
+from openarm_calibration.handeye.projection import project
+from openarm_calibration.handeye.refine import Noise, information_at, invert_scaled, mount_error
+from openarm_calibration.handeye.solve import SolveConfig, solve
+from openarm_calibration.sampling.bodies import Bodies, chain_poses
+from openarm_calibration.sampling.poses import visible
+from openarm_calibration.sampling.samples import SampleSet
+from openarm_common import se3
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+
+Array = NDArray[np.float64]
+
+#: Before the board was seen, its place is known as a person measures it, 1 cm and a few degrees: px of the image.
+_RULER = 45.0
+#: Postures drawn over the whole range to find a first one.
+_FIRST_DRAWS = 20_000
+#: Drawn at once.
+_BATCH = 250
+#: Of postures that tell about equally much the nearest is taken.
+_AS_GOOD = 1.1
+#: Postures that are enough for the first pose; finding them takes long.
+_ENOUGH = 24
+#: Postures that differ less count as the same, rad.
+_NEIGHBOUR = 0.08
+
+
+class SearchConfig(Config):
+    """How the next pose is searched for."""
+
+    draws: int = Field(default=5000, ge=250, le=100_000, description="postures drawn for each choice")
+    candidates: int = Field(default=100, ge=5, le=5000, description="of them compared by what they tell")
+    step: float = Field(default=0.6, gt=0.0, le=3.0, description="of each joint from a posture that shows the board")
+    margin: float = Field(default=12.0, ge=0.0, le=200.0, description="kept from the edge of the image, px")
+    smallest: float = Field(default=9.0, ge=2.0, description="diameter of a mark in the image, px")
+    joint_margin: float = Field(default=0.06, ge=0.0, le=0.5, description="kept from the joints' limits, rad")
+    mount_translation: float = Field(default=0.02, gt=0.0, description="error of the nominal mount that is expected, m")
+    mount_rotation: float = Field(default=0.05, gt=0.0, description="the same of its rotation, rad")
+    px: float = Field(default=0.1, gt=0.0, description="spread of a mark that poses are chosen for, px")
+    robot_translation: float = Field(default=1e-4, gt=0.0, description="spread of the robot, m")
+    robot_rotation: float = Field(default=2e-4, gt=0.0, description="spread of the robot, rad")
+    seed: int = Field(default=1, ge=0, description="of random postures")
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """What is known of the mounts.
+
+    Args:
+        X: (4, 4) mount of the camera (optical frame).
+        Z: (4, 4) mount of the board; None before it was seen or told.
+        sigma_translation: Predicted error of X, m; infinite before it was solved for.
+        sigma_rotation: Predicted error of X, rad; infinite before it was solved for.
+    """
+
+    X: Array
+    Z: Array | None
+    sigma_translation: float = math.inf
+    sigma_rotation: float = math.inf
+
+    @property
+    def solved(self) -> bool:
+        """Whether the samples determine the mounts."""
+        return math.isfinite(self.sigma_translation)
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A posture, and what a sample there would leave of the error.
+
+    Args:
+        q: (n,) positions of the joints that move camera or board, in the order of `SampleSet.joint_names`.
+        sigma_translation: Predicted error of the position with it, m.
+        sigma_rotation: The same of the rotation, rad.
+    """
+
+    q: Array
+    sigma_translation: float
+    sigma_rotation: float
+
+
+class PoseSearch:
+    """Remembers which postures show the board, and proposes the next.
+
+    Args:
+        description: The robot.
+        nominal: (4, 4) T_parent_optical of the camera as mounted on paper.
+        board: (4, 4) mount of the board, roughly; None when nobody told.
+        config: Of the search.
+    """
+
+    def __init__(
+        self, description: RobotDescription, nominal: Array, board: Array | None, config: SearchConfig | None = None
+    ) -> None:
+        self.belief = Belief(nominal, board)
+        self._description = description
+        self._nominal = nominal
+        self._config = config or SearchConfig()
+        self._rng = np.random.default_rng(self._config.seed)
+        self._bodies = Bodies(description)
+        self._known: list[Array] = []
+        self._refused: list[Array] = []
+
+    def learn(self, samples: SampleSet) -> Belief:
+        """Update what is known after a sample was taken.
+
+        Raises:
+            OpenArmError: NOT_READY, without samples.
+        """
+        if not len(samples):
+            raise OpenArmError(Code.NOT_READY, "nothing can be learnt without a sample; take one first")
+        self._known.append(_vector(samples, samples.samples[-1].joints))
+        first = samples.samples[0]
+        A = samples.pose(first.joints)
+        B = se3.inverse(A) if samples.head.setup == "in_hand" else A
+        before = Belief(self._nominal, se3.inverse(B) @ self._nominal @ first.T_camera_board)
+        try:
+            solution = solve(samples.problem(), SolveConfig(most_translation=0.02, most_rotation=0.05))
+        except OpenArmError as error:
+            if error.code != Code.DEGENERATE:
+                raise
+            self.belief = before  # not enough of them yet
+            return before
+        X, Z = solution.estimate.X[0], solution.estimate.Z[0]
+        offset, angle = mount_error(X, self._nominal)
+        credible = offset < 5.0 * self._config.mount_translation and angle < 5.0 * self._config.mount_rotation
+        self.belief = Belief(X, Z, *solution.sigma()) if credible else before
+        return self.belief
+
+    def refuse(self, proposal: Proposal) -> None:
+        """A posture that can't be had, or did not show the board, is not proposed again, nor its neighbours."""
+        self._refused.append(proposal.q)
+
+    def propose(self, samples: SampleSet, state: Mapping[str, float], most: int = 12) -> list[Proposal]:
+        """The next poses, best first.
+
+        Args:
+            samples: So far.
+            state: Joints as they are now; those that it lacks are taken as 0.
+            most: How many.
+
+        Raises:
+            OpenArmError: NOT_READY, when nobody said where the board is; UNREACHABLE, when no posture shows it.
+        """
+        Z = self.belief.Z
+        if Z is None:
+            raise OpenArmError(Code.NOT_READY, "where the board is must be told, or seen, before poses are chosen")
+        whole = {**dict.fromkeys(self._description.joints, 0.0), **state}
+        found, shadowed = self._showing(samples, Z, whole)
+        if not found:
+            raise OpenArmError(
+                Code.UNREACHABLE,
+                f"no posture of {samples.head.carrier!r} shows all of {samples.board.label} to {samples.head.camera!r}"
+                f" ({shadowed} would, were the robot not in the way); move the board, or use a smaller one",
+            )
+        told = self._told(samples, Z, found)
+        here = _vector(samples, state)
+        out: list[Proposal] = []
+        while told and len(out) < most:
+            limit = _AS_GOOD * min(score for score, _ in told)
+            near = [k for k, (score, _) in enumerate(told) if score <= limit]
+            best = min(near, key=lambda k: float(np.abs(told[k][1].q - here).max()))
+            out.append(told.pop(best)[1])
+        return out
+
+    # --- parts
+    def _showing(
+        self, samples: SampleSet, Z: Array, state: Mapping[str, float]
+    ) -> tuple[list[tuple[Array, Array]], int]:
+        """Postures that show the board, with T_camera_board (4, 4); and in how many the robot hides it.
+
+        Until one is found they are drawn from the whole range, then around those that are known.
+        """
+        config, rng = self._config, self._rng
+        lower, upper = self._description.limits(samples.joint_names)
+        low, high = lower + config.joint_margin, upper - config.joint_margin
+        margin = config.margin if self.belief.solved else _RULER
+        pool, refused = list(self._known), np.array(self._refused)
+        wanted = config.candidates if pool else _ENOUGH
+        width, height = (edge / 2.0 for edge in samples.board.size)
+        corners = np.array([[x, y, 0.0] for x in (-width, width) for y in (-height, height)])
+        plate = np.concatenate([samples.board.points, corners])
+        out: list[tuple[Array, Array]] = []
+        shadowed, left = 0, config.draws + (0 if pool else _FIRST_DRAWS)
+        while left > 0 and len(out) < wanted:
+            left -= _BATCH
+            if pool:
+                # small changes as often as large ones: what can be seen may be a narrow part of what can be reached
+                size = config.step * 10.0 ** rng.uniform(-1.0, 0.0, (_BATCH, 1))
+                centres = np.array(pool)[rng.integers(len(pool), size=_BATCH)]
+                drawn = np.clip(centres + rng.uniform(-size, size, centres.shape), low, high)
+            else:
+                drawn = rng.uniform(low, high, (_BATCH, len(low)))
+            if len(refused):
+                drawn = drawn[np.abs(drawn[:, None] - refused).max(axis=2).min(axis=1) > _NEIGHBOUR]
+            views = self._views(samples, drawn, Z)
+            for k in np.flatnonzero(self._centred(samples, views)):
+                q, T = drawn[k], views[k]
+                if not self._seen(samples, T, margin):
+                    continue
+                links = self._description.link_poses({**state, **_joints(samples, q)})
+                shapes = self._bodies.place(links)
+                if self._bodies.touching(shapes):
+                    continue
+                eye = links[samples.head.parent] @ self.belief.X
+                if self._bodies.hidden(shapes, eye[:3, 3], se3.apply(eye @ T, plate)):
+                    shadowed += 1
+                    continue
+                out.append((q, T))
+                pool.append(q)
+                if len(out) == wanted:
+                    break
+        return out, shadowed
+
+    def _views(self, samples: SampleSet, q: Array, Z: Array) -> Array:
+        """T_camera_board (n, 4, 4) at postures (n, joints)."""
+        head = samples.head
+        in_hand = head.setup == "in_hand"
+        moving = chain_poses(self._description, head.parent if in_hand else head.carrier, q)
+        standing = self._description.link_pose(head.base if in_hand else head.parent, {})
+        A = se3.inverse(standing) @ moving
+        return se3.inverse(self.belief.X) @ (inverses(A) if in_hand else A) @ Z
+
+    def _centred(self, samples: SampleSet, views: Array) -> NDArray[np.bool_]:
+        """(n,) in which views (n, 4, 4) the middle of the board is in the image, and its marks are large enough."""
+        optics = samples.head.optics
+        pixels = optics.project(views[:, :3, 3])
+        inside = (pixels > 0.0).all(axis=1) & (pixels < (optics.width, optics.height)).all(axis=1)
+        large = optics.fx * samples.board.diameter / np.maximum(views[:, 2, 3], 1e-6) > self._config.smallest
+        return inside & large
+
+    def _seen(self, samples: SampleSet, T: Array, margin: float) -> bool:
+        """Whether all marks are in the image, so far from its edge."""
+        optics = samples.head.optics
+        row = np.array([optics.fx, optics.fy, optics.cx - margin, optics.cy - margin])
+        size = (round(optics.width - 2 * margin), round(optics.height - 2 * margin))
+        return visible(samples.board, T, row, size)
+
+    def _told(self, samples: SampleSet, Z: Array, found: list[tuple[Array, Array]]) -> list[tuple[float, Proposal]]:
+        """What each posture leaves of the error: a score, smaller is better."""
+        config, optics, board = self._config, samples.head.optics, samples.board
+        noise = Noise(config.px, config.robot_translation, config.robot_rotation)
+        row = np.array([optics.fx, optics.fy, optics.cx, optics.cy])
+        X_all, Z_all = self.belief.X[None], Z[None]
+        wide = np.array([config.mount_translation] * 3 + [config.mount_rotation] * 3)
+        # of the board nothing is taken for granted: a metre and a radian
+        before: Array = np.diag(np.concatenate([wide, np.ones(6)]) ** -2.0)
+        if len(samples):
+            before = before + information_at(samples.problem(), X_all, Z_all, noise)
+        out: list[tuple[float, Proposal]] = []
+        for q, T in found:
+            pixels = project(board.points, board.radius, T, row)
+            view = View(board.points, pixels, samples.pose(_joints(samples, q)), samples.head.setup, board.radius)
+            gain = information_at(assemble([view], [optics], [T]), X_all, Z_all, noise)
+            variance = np.diag(invert_scaled(before + gain))[:6]
+            sigma_t, sigma_r = math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum())
+            out.append((float(np.sum(variance / UNITS**2)), Proposal(q, sigma_t, sigma_r)))
+        return out
+
+
+def _joints(samples: SampleSet, q: Array) -> dict[str, float]:
+    return dict(zip(samples.joint_names, q.tolist(), strict=True))
+
+
+def _vector(samples: SampleSet, joints: Mapping[str, float]) -> Array:
+    return np.array([joints[name] for name in samples.joint_names])

@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of one camera and board, and the session file that keeps them.
+
+A session is one NPZ file without pickles: the head (camera, board, who carries what) as JSON, and of each sample the
+marks, the joint states with both stamps, and the image. It can be solved again without robot or ROS. Robot poses are
+recomputed from the joints by the description that reads it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from openarm_calibration.board.board import Board, parse_board
+from openarm_calibration.board.detect import Detection, guess_pose
+from openarm_calibration.handeye.problem import Problem, View, assemble, difference
+from openarm_common import se3
+from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+
+Array = NDArray[np.float64]
+#: Half the step of the derivative of the robot's pose by time, s.
+_RATE_STEP_NS = 10_000_000
+
+
+class SessionHead(Config):
+    """What a session is about."""
+
+    camera: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="name of the camera")
+    setup: Literal["in_hand", "to_hand"] = Field(description="whether the arm carries the camera or the board")
+    parent: str = Field(min_length=1, description="link that carries the camera")
+    carrier: str = Field(min_length=1, description="link that moves: the camera's parent, or what carries the board")
+    base: str = Field(default="openarm_body_link0", min_length=1, description="base frame")
+    intrinsics: tuple[int, int, float, float, float, float] = Field(description="width, height, fx, fy, cx, cy")
+    board: dict[str, Any] = Field(description="keys of the board")
+    mount_seed: int | None = Field(default=None, description="of the simulated mounts")
+    created: str = Field(default="", description="when, as ISO 8601")
+
+    @property
+    def optics(self) -> Intrinsics:
+        """Intrinsics of the camera."""
+        return Intrinsics(*self.intrinsics)
+
+    @property
+    def target(self) -> Board:
+        """The board."""
+        return parse_board(self.board, "session:board")
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One image of the board with the robot at its stamp.
+
+    Args:
+        name: Unique in the session.
+        t_image_ns: Stamp of the image.
+        t_joints_ns: Stamp of the nearest joint state.
+        joints: Positions at the stamp of the image, rad or m.
+        speed: Of the fastest joint, rad/s.
+        detection: Marks of the board.
+        T_camera_board: (4, 4) by the marks alone.
+        png: The image; may be empty.
+        track: Joint states around the image.
+    """
+
+    name: str
+    t_image_ns: int
+    t_joints_ns: int
+    joints: Mapping[str, float]
+    speed: float
+    detection: Detection
+    T_camera_board: Array
+    png: bytes = b""
+    track: tuple[tuple[int, Mapping[str, float]], ...] = field(default=())
+
+
+class SampleSet:
+    """The samples of one session.
+
+    Args:
+        head: What the session is about.
+        description: The robot; its forward kinematics turn joints into poses.
+    """
+
+    def __init__(self, head: SessionHead, description: RobotDescription) -> None:
+        for what, link in (("parent", head.parent), ("carrier", head.carrier), ("base", head.base)):
+            if link not in description.links:
+                links = ", ".join(description.links)
+                raise OpenArmError(Code.CONFIG_INVALID, f"session:{what}: no link {link!r}; links: {links}")
+        self.head = head
+        self.board = head.target
+        self._description = description
+        self._samples: list[Sample] = []
+        self._taken = 0
+
+    def __len__(self) -> int:
+        """Samples."""
+        return len(self._samples)
+
+    @property
+    def samples(self) -> tuple[Sample, ...]:
+        """In the order they were taken."""
+        return tuple(self._samples)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joints that move the camera against the board."""
+        return moving_joints(self.head, self._description)
+
+    def take(
+        self, t_image_ns: int, matched: Any, detection: Detection, image: NDArray[np.uint8] | None = None
+    ) -> Sample:
+        """Make a sample and add it.
+
+        Args:
+            t_image_ns: Stamp of the image.
+            matched: `gate.Matched`.
+            detection: Of the board in the image.
+            image: To keep, (h, w) grey.
+
+        Raises:
+            OpenArmError: NOTHING_DETECTED, when the marks have no pose.
+        """
+        T, _ = guess_pose(self.board.points[detection.ids], detection.pixels, self.board.radius, self.head.optics)
+        png = b"" if image is None else cv2.imencode(".png", image)[1].tobytes()
+        self._taken += 1
+        sample = Sample(
+            f"s{self._taken:03d}", t_image_ns, matched.t_joints_ns, dict(matched.joints), matched.speed, detection, T,
+            png, matched.track,
+        )  # fmt: skip
+        self._samples.append(sample)
+        return sample
+
+    def add(self, sample: Sample) -> None:
+        """Add a sample; its name must be new.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when it is taken.
+        """
+        if any(sample.name == other.name for other in self._samples):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"there is a sample {sample.name!r} already")
+        self._samples.append(sample)
+        self._taken = max(self._taken, len(self._samples))
+
+    def remove(self, name: str) -> Sample:
+        """Remove a sample by its name; an empty name is the last.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing the names.
+        """
+        for k, sample in enumerate(self._samples):
+            if sample.name == name or (not name and k == len(self._samples) - 1):
+                return self._samples.pop(k)
+        names = ", ".join(s.name for s in self._samples) or "none"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"no sample {name!r}; samples: {names}")
+
+    def pose(self, joints: Mapping[str, float]) -> Array:
+        """A (4, 4): T_base_parent when the arm carries the camera, else T_parent_carrier."""
+        link = self._description.link_pose
+        if self.head.setup == "in_hand":
+            return se3.inverse(link(self.head.base, joints)) @ link(self.head.parent, joints)
+        return se3.inverse(link(self.head.parent, joints)) @ link(self.head.carrier, joints)
+
+    def pose_at(self, sample: Sample, t_ns: int) -> Array:
+        """A (4, 4) at a stamp near a sample's, by its track; at the sample's own joints without one."""
+        times = [t for t, _ in sample.track]
+        if len(times) < 2 or not times[0] <= t_ns <= times[-1]:
+            return self.pose(sample.joints)
+        names = list(sample.joints)
+        values = np.array([[state[name] for name in names] for _, state in sample.track])
+        at = [float(np.interp(t_ns, times, column)) for column in values.T]
+        return self.pose(dict(zip(names, at, strict=True)))
+
+    def problem(self, delay_s: float = 0.0) -> Problem:
+        """The hand-eye problem of all samples, whose images are assumed to be `delay_s` old at their stamps.
+
+        Raises:
+            OpenArmError: DEGENERATE, without samples.
+        """
+        if not self._samples:
+            raise OpenArmError(Code.DEGENERATE, "too few poses: no samples; take at least 3, better 10 to 15")
+        views: list[View] = []
+        for k, sample in enumerate(self._samples):
+            t_ns = sample.t_image_ns - round(delay_s * 1e9)
+            early, late = (self.pose_at(sample, t_ns + step) for step in (-_RATE_STEP_NS, _RATE_STEP_NS))
+            A = self.pose_at(sample, t_ns) if delay_s else self.pose(sample.joints)
+            rate = difference(early, late) / (2e-9 * _RATE_STEP_NS)
+            points = self.board.points[sample.detection.ids]
+            view = View(points, sample.detection.pixels, A, self.head.setup, self.board.radius, pose=k, rate=rate)
+            views.append(replace(view, name=sample.name))
+        return assemble(views, [self.head.optics], [sample.T_camera_board for sample in self._samples])
+
+    def mount(self, X: Array) -> Array:
+        """T_parent_link of the camera for a solved X (4, 4) of its optical frame."""
+        return X @ se3.inverse(T_LINK_OPTICAL)
+
+    # --- session file
+    def _text(self) -> str:
+        """All but marks and images, as JSON."""
+        listed = [
+            {
+                "name": sample.name, "t_image_ns": sample.t_image_ns, "t_joints_ns": sample.t_joints_ns,
+                "joints": dict(sample.joints), "speed": sample.speed, "residual": sample.detection.residual,
+                "track": [[t, dict(state)] for t, state in sample.track],
+            }
+            for sample in self._samples
+        ]  # fmt: skip
+        return json.dumps({"format": 1, "head": self.head.model_dump(mode="json"), "samples": listed})
+
+    def digest(self) -> str:
+        """Hash of the session as it is now, as `save` returns it."""
+        return hashlib.sha256(self._text().encode()).hexdigest()
+
+    def save(self, path: Path) -> str:
+        """Write the session and return its hash.
+
+        Raises:
+            OpenArmError: ENVIRONMENT, when it can't be written; INVALID_ARGUMENT, for a name that is not .npz.
+        """
+        if path.suffix != ".npz":
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"session file {path}: expected a name that ends in .npz")
+        text = self._text()
+        arrays: dict[str, NDArray[Any]] = {}
+        for k, sample in enumerate(self._samples):
+            arrays[f"ids_{k}"] = sample.detection.ids
+            arrays[f"pixels_{k}"] = sample.detection.pixels
+            arrays[f"pose_{k}"] = sample.T_camera_board
+            arrays[f"png_{k}"] = np.frombuffer(sample.png, dtype=np.uint8)
+        arrays["head"] = np.frombuffer(text.encode(), dtype=np.uint8)
+        stream = io.BytesIO()
+        np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
+                file.write(stream.getvalue())
+            os.replace(file.name, path)
+        except OSError as error:
+            raise OpenArmError(Code.ENVIRONMENT, f"can't write {path}: {error.strerror}") from error
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def moving_joints(head: SessionHead, description: RobotDescription) -> tuple[str, ...]:
+    """Names of the joints between the base and what the arm carries."""
+    link = head.parent if head.setup == "in_hand" else head.carrier
+    return tuple(joint.name for joint in description.chain(link) if joint.type != "fixed")
+
+
+def setup_of(description: RobotDescription, parent: str) -> Literal["in_hand", "to_hand"]:
+    """Whether a camera on a link moves with the arm, or stands and looks at a board that the arm carries."""
+    moves = any(joint.type != "fixed" for joint in description.chain(parent))
+    return "in_hand" if moves else "to_hand"
+
+
+def without(samples: SampleSet, names: Sequence[str], description: RobotDescription) -> SampleSet:
+    """A copy without some samples."""
+    out = SampleSet(samples.head, description)
+    for sample in samples.samples:
+        if sample.name not in names:
+            out.add(sample)
+    return out

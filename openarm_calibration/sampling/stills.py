@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples from a recording: where the robot stood, which image of each stand is taken, and why others are not.
+
+The gate is that of the node (`gate.match`). Of the images of one stand one is enough: they show the same but for their
+noise. Stamps in ns, joint positions in rad.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_calibration.board.detect import detect
+from openarm_calibration.sampling.gate import GateConfig, Matched, match
+from openarm_calibration.sampling.samples import SampleSet
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.robot_state import RobotStateBuffer
+
+State = tuple[int, Mapping[str, float]]
+
+#: Images with joints nearer to each other than this are of one stand, rad.
+SAME_POSTURE = 0.01
+#: Joint states after an image that the gate may look at.
+_AHEAD_NS = 1_000_000_000
+#: Of the images of a stand: which are looked at until one shows the board, as shares of their number.
+_TRIES = (0.5, 0.75, 0.999)
+
+
+@dataclass
+class Stretch:
+    """Images one after the other of which the gate says the same.
+
+    Args:
+        stamps: Of the images.
+        robot: At each, where the gate accepts them.
+        code: OK, or the gate's.
+        reason: Why no image of it is taken, as far as is known; of the first image.
+        sample: Name of the sample that was taken.
+    """
+
+    stamps: list[int]
+    robot: list[Matched]
+    code: Code
+    reason: str
+    sample: str = ""
+
+    @property
+    def tries(self) -> dict[int, Matched]:
+        """Images to look at, and the robot at each."""
+        if self.code != Code.OK:
+            return {}
+        chosen = {int(share * len(self.stamps)) for share in _TRIES}
+        return {self.stamps[k]: self.robot[k] for k in sorted(chosen)}
+
+
+def stretches(
+    stamps: Iterable[int], states: Sequence[State], names: tuple[str, ...], robot: RobotDescription, gate: GateConfig
+) -> list[Stretch]:
+    """Divide the images of a recording by what the gate says of them.
+
+    Args:
+        stamps: Of the images.
+        states: Joint states in the order of their stamps.
+        names: Joints that move camera or board.
+        robot: Their robot.
+        gate: When it stands.
+    """
+    # states enter as if the images were live, so that the gate looks at a few seconds and not at all of an hour
+    buffer = RobotStateBuffer(robot, capacity=2000)
+    out: list[Stretch] = []
+    fed = 0
+    for t_ns in sorted(stamps):
+        while fed < len(states) and states[fed][0] <= t_ns + _AHEAD_NS:
+            t, joints = states[fed]
+            buffer.add_joint_state(t, tuple(joints), tuple(joints.values()))
+            fed += 1
+        try:
+            matched = match(buffer, t_ns, names, gate)
+        except OpenArmError as error:
+            if not out or out[-1].code != error.code:
+                out.append(Stretch([], [], error.code, error.message))
+        else:
+            if not out or out[-1].code != Code.OK or _far(out[-1].robot[0], matched, names):
+                out.append(Stretch([], [], Code.OK, ""))
+            out[-1].robot.append(matched)
+        out[-1].stamps.append(t_ns)
+    return out
+
+
+def _far(a: Matched, b: Matched, names: Sequence[str]) -> bool:
+    return any(abs(a.joints[name] - b.joints[name]) > SAME_POSTURE for name in names)
+
+
+class Picker:
+    """Takes a sample of each stand from the images that are offered to it.
+
+    Args:
+        samples: Grows.
+        found: The recording's stretches; told what became of them.
+    """
+
+    def __init__(self, samples: SampleSet, found: Sequence[Stretch]) -> None:
+        self.samples = samples
+        self._open = {t: (stretch, matched) for stretch in found for t, matched in stretch.tries.items()}
+
+    def wants(self, t_ns: int) -> bool:
+        """Whether the image of this stamp is one to look at."""
+        return t_ns in self._open and not self._open[t_ns][0].sample
+
+    def offer(self, t_ns: int, image: NDArray[np.uint8], optics: Intrinsics) -> None:
+        """Look at an image (h, w), grey, and take it if it shows the board."""
+        stretch, matched = self._open[t_ns]
+        try:
+            if optics != self.samples.head.optics:
+                raise OpenArmError(Code.BAD_IMAGE, f"the intrinsics changed: fx {optics.fx:.2f} here")
+            sample = self.samples.take(t_ns, matched, detect(self.samples.board, image), image)
+        except OpenArmError as error:
+            stretch.reason = stretch.reason or error.message
+        else:
+            stretch.sample, stretch.reason = sample.name, ""
+
+
+def rows(found: Sequence[Stretch]) -> list[dict[str, Any]]:
+    """What `--json` writes of a recording; seconds from its first image."""
+    if not found:
+        return []
+    first = found[0].stamps[0]
+    return [
+        {
+            "from_s": round((stretch.stamps[0] - first) * 1e-9, 3),
+            "to_s": round((stretch.stamps[-1] - first) * 1e-9, 3),
+            "images": len(stretch.stamps),
+            "sample": stretch.sample,
+            "code": str(stretch.code if stretch.code != Code.OK or stretch.sample else Code.NOTHING_DETECTED),
+            "reason": stretch.reason,
+        }
+        for stretch in found
+    ]
+
+
+def told(found: Sequence[Stretch]) -> str:
+    """Lines for a terminal: each stand, and the images between them together."""
+    lines: list[str] = []
+    between: Counter[Code] = Counter()
+    why: dict[Code, str] = {}
+    for stretch, row in zip(found, rows(found), strict=True):
+        if stretch.code != Code.OK:
+            between[stretch.code] += len(stretch.stamps)
+            why.setdefault(stretch.code, stretch.reason)
+            continue
+        span = f"{row['from_s']:8.2f} to {row['to_s']:8.2f} s"
+        lines.append(f"  {span} {row['images']:5d} images  {stretch.sample or stretch.reason}")
+    lines += [f"  {count:5d} images not used, {code}, such as: {why[code]}" for code, count in between.items()]
+    return "\n".join(["stands of the robot, and the sample of each", *lines])

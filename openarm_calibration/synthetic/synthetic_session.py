@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sessions with a known mount on the arm's own kinematics, and pictures of boards, for tests; m, rad, px."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_calibration.board.board import Board, CircleGrid
+from openarm_calibration.board.detect import Detection
+from openarm_calibration.handeye.projection import project
+from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
+from openarm_common import se3
+from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics, load_cameras, true_mount
+from openarm_common.robot.description import RobotDescription
+
+Array = NDArray[np.float64]
+
+BOARD = CircleGrid()
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Samples and the true mount (optical frame)."""
+
+    samples: SampleSet
+    X: Array
+    description: RobotDescription
+
+
+def photograph(board: Board, T_camera_board: Array, optics: Intrinsics, *, mirrored: bool = False) -> Array:
+    """Grey picture (h, w) of a board alone, 16 samples a pixel; 0 to 255."""
+    scale, zoom = 4000.0, 4
+    w, h = board.size
+    to_board = np.array([[1 / scale, 0, 0.5 / scale - w / 2], [0, 1 / scale, 0.5 / scale - h / 2], [0, 0, 1]])
+    K = optics.matrix
+    K[:2] *= zoom
+    K[:2, 2] += (zoom - 1) / 2
+    H = K @ T_camera_board[:3, [0, 1, 3]] @ to_board
+    picture = board.draw(scale)[:, :: -1 if mirrored else 1]
+    large = cv2.warpPerspective(picture, H, (optics.width * zoom, optics.height * zoom), borderValue=(130.0,))
+    return cv2.resize(large, (optics.width, optics.height), interpolation=cv2.INTER_AREA).astype(np.float64)
+
+
+def make_session(
+    setup: Literal["in_hand", "to_hand"] = "in_hand",
+    count: int = 15,
+    px: float = 0.05,
+    *,
+    delay: float = 0.0,
+    speed: float = 0.0,
+    spread: float = 0.35,
+    seed: int = 0,
+) -> Known:
+    """Samples at random joints around a view of the board; with `speed` (rad/s) the arm moves at every image."""
+    rng = np.random.default_rng(seed)
+    description = RobotDescription.load()
+    cameras = load_cameras()
+    camera = cameras["wrist" if setup == "in_hand" else "overhead"]
+    carrier = camera.parent if setup == "in_hand" else "openarm_right_link7"
+    k = camera.intrinsics
+    head = SessionHead(
+        camera=camera.name, setup=setup, parent=camera.parent, carrier=carrier, mount_seed=1,
+        intrinsics=(k.width, k.height, k.fx, k.fy, k.cx, k.cy), board=BOARD.model_dump(),
+    )  # fmt: skip
+    samples = SampleSet(head, description)
+    names = samples.joint_names
+    home = description.group_state("right_arm", "home")
+    middle = np.array([home[name] for name in names])
+    X = true_mount(camera, 1) @ T_LINK_OPTICAL
+    A = samples.pose(dict(zip(names, middle, strict=True)))
+    seen = se3.make(se3.rot_x(0.3) @ se3.rot_z(0.2), (0.0, 0.0, 0.36 if setup == "in_hand" else 0.6))
+    Z = A @ X @ seen if setup == "in_hand" else se3.inverse(A) @ X @ seen
+    row = np.array([k.fx, k.fy, k.cx, k.cy])
+
+    def view(q: Array) -> tuple[Array, Array] | None:
+        A = samples.pose(dict(zip(names, q, strict=True)))
+        T = se3.inverse(X) @ (se3.inverse(A) if setup == "in_hand" else A) @ Z
+        if not T[2, 2] > 0.6:
+            return None
+        return project(BOARD.points, BOARD.radius, T, row), T
+
+    while len(samples) < count:
+        q = middle + rng.uniform(-spread, spread, len(names))
+        v = rng.uniform(-1.0, 1.0, len(names)) * speed
+        got = view(q - v * delay)
+        if got is None or not ((got[0] > 16) & (got[0] < (623, 463))).all():
+            continue
+        pixels, T = got
+        t = 10**9 * (1 + len(samples))
+        track = tuple(
+            (t + 10**7 * j, dict(zip(names, (q + v * 0.01 * j).tolist(), strict=True))) for j in range(-10, 11)
+        )
+        detection = Detection(np.arange(len(BOARD.points)), pixels + rng.normal(0.0, px, pixels.shape), px)
+        joints = dict(zip(names, q.tolist(), strict=True))
+        samples.add(Sample(f"s{len(samples) + 1:03d}", t, t, joints, speed, detection, T, b"", track if speed else ()))
+    return Known(samples, X, description)

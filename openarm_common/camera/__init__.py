@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras: mounts, intrinsics, housings, depth images with their pose."""

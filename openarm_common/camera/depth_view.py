@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A depth image with all that gives its pixels a place: intrinsics, pose of the camera, limits; base frame, m."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.errors import Code, OpenArmError
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+#: Planar depth (h, w): millimetres (16UC1) or metres (32FC1).
+DepthImage = NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.uint16 | np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """A depth image and where it was taken.
+
+    Attributes:
+        depth: (h, w) planar depth, uint16 mm or float32 m.
+        intrinsics: Of the camera.
+        T_base_camera: Optical frame in the base frame, (4, 4).
+        near: Nearest valid depth, m.
+        far: Farthest valid depth, m.
+    """
+
+    depth: DepthImage
+    intrinsics: Intrinsics
+    T_base_camera: Array
+    near: float
+    far: float
+
+    def __post_init__(self) -> None:
+        """Refuse what does not fit together.
+
+        Raises:
+            OpenArmError: BAD_IMAGE, naming what does not.
+        """
+        if self.depth.ndim != 2 or self.depth.dtype.name not in ("uint16", "float32"):
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"depth image is {self.depth.dtype} {self.depth.shape}; expected (h, w) of uint16 mm or float32 m",
+            )
+        size = (self.intrinsics.height, self.intrinsics.width)
+        if self.depth.shape != size:
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"depth image is {self.depth.shape[1]}x{self.depth.shape[0]} pixels, but its CameraInfo says"
+                f" {size[1]}x{size[0]}",
+            )
+        if not (self.intrinsics.fx > 0.0 and self.intrinsics.fy > 0.0):
+            raise OpenArmError(
+                Code.BAD_IMAGE, f"focal lengths are {self.intrinsics.fx}, {self.intrinsics.fy}; expected > 0"
+            )
+        if not np.isfinite(self.T_base_camera).all():
+            raise OpenArmError(Code.NO_TRANSFORM, "the pose of the camera is not finite")
+
+    @property
+    def rays(self) -> tuple[Floats, Floats]:
+        """Directions of columns (x over z) and of rows (y over z)."""
+        k = self.intrinsics
+        x = ((np.arange(k.width) - k.cx) / k.fx).astype(np.float32)
+        return x, ((np.arange(k.height) - k.cy) / k.fy).astype(np.float32)
+
+    @property
+    def scale(self) -> np.float32:
+        """Metres of one count."""
+        return np.float32(1e-3 if self.depth.dtype == np.uint16 else 1.0)

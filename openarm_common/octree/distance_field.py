@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Distances to the nearest obstacle, shared between processes on one machine without a copy.
+
+The field lies in a file in memory (/dev/shm) that the writer and its readers map: a header, then two slots of float32
+distances. The writer computes right into the slot that is not in use and then names it the current one; a reader looks
+at the current slot in place. What it looks at stays as it is until the writer comes to that slot again, one update
+later at the earliest; `DistanceFieldReader.intact` tells afterwards whether it did.
+
+Distances are between centres of cells, m, cut at `reach`. Moments are given twice: stamps of the images (`t_ns`) and
+the machine's monotonic clock (`now_ns`), which all processes share, so that ages are right whatever the images' clock.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.octree.lattice import Lattice
+
+Floats = NDArray[np.float32]
+
+_MAGIC = b"OADIST01"
+_MAX_CAMERAS = 8
+_SLOTS = 2
+_SLOT_HEAD = np.dtype(
+    [
+        ("version", "<i8"),  # 0 while it is written
+        ("t_ns", "<i8"),
+        ("now_ns", "<i8"),
+        ("camera_t_ns", "<i8", (_MAX_CAMERAS,)),
+        ("camera_now_ns", "<i8", (_MAX_CAMERAS,)),
+    ]
+)
+_HEAD = np.dtype(
+    [
+        ("magic", "S8"),
+        ("resolution", "<f8"),
+        ("reach", "<f8"),
+        ("key_min", "<i8", (3,)),
+        ("shape", "<i8", (3,)),
+        ("frame", "S64"),
+        ("cameras", "S32", (_MAX_CAMERAS,)),
+        ("current", "<i8"),
+        ("slots", _SLOT_HEAD, (_SLOTS,)),
+    ]
+)
+_DATA_AT = 4096
+
+
+@dataclass(frozen=True)
+class CameraMoment:
+    """When a camera last contributed: stamp of its image, and the monotonic clock then (0: never)."""
+
+    t_ns: int
+    now_ns: int
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceField:
+    """One version of the field.
+
+    Attributes:
+        lattice: Which cells.
+        distances: (nx, ny, nz) float32, read-only, m.
+        reach: Where distances are cut, m.
+        frame: Frame of the cells.
+        version: Counts up with every update, from 1.
+        t_ns: Stamp of the newest image in it.
+        now_ns: Monotonic clock when it was made.
+        cameras: When each camera last contributed.
+    """
+
+    lattice: Lattice
+    distances: Floats
+    reach: float
+    frame: str
+    version: int
+    t_ns: int
+    now_ns: int
+    cameras: Mapping[str, CameraMoment]
+
+    def at(self, points: ArrayLike) -> Floats:
+        """Distances (n,), m, at points (n, 3) of the frame; `reach` outside of the workspace."""
+        index = self.lattice.indices(np.asarray(points, np.float64).reshape(-1, 3))
+        inside = self.lattice.contains(index)
+        out = np.full(index.shape[0], self.reach, np.float32)
+        out[inside] = self.distances[tuple(index[inside].T)]
+        return out
+
+    def clearance(self, centres: NDArray[np.float64], radii: NDArray[np.float64]) -> float:
+        """Smallest gap between spheres and occupied cells, m: never more than it is, up to a cell's diagonal less.
+
+        Args:
+            centres: (n, 3) in the frame, m.
+            radii: (n,) m.
+        """
+        return float(sphere_clearance(self.distances, self.lattice.lower, self.lattice.resolution, centres, radii))
+
+    def require_fresh(self, now_ns: int, limit_s: float, cameras: Sequence[str] | None = None) -> None:
+        """Refuse a field that is too old to plan with.
+
+        Args:
+            now_ns: The monotonic clock.
+            limit_s: Longest age of the field and of every camera's last contribution, s.
+            cameras: Which cameras matter; None is all.
+
+        Raises:
+            OpenArmError: STALE_DATA, with what is how old.
+        """
+        age = (now_ns - self.now_ns) * 1e-9
+        if age > limit_s:
+            raise OpenArmError(
+                Code.STALE_DATA,
+                f"the distance field is {age:.1f} s old, expected at most {limit_s:g} s; is octomap up?",
+            )
+        for name in self.cameras if cameras is None else cameras:
+            moment = self.cameras.get(name)
+            if moment is None or moment.now_ns == 0:
+                raise OpenArmError(Code.STALE_DATA, f"camera {name!r} has not contributed to the map yet")
+            age = (now_ns - moment.now_ns) * 1e-9
+            if age > limit_s:
+                raise OpenArmError(
+                    Code.STALE_DATA,
+                    f"camera {name!r} last contributed to the map {age:.1f} s ago, expected at most {limit_s:g} s",
+                )
+
+
+def field_path(name: str) -> Path:
+    """Where the field of a name lies: in memory where the system has a place for that."""
+    shm = Path("/dev/shm")
+    return (shm if shm.is_dir() else Path(tempfile.gettempdir())) / f"openarm_field_{name}"
+
+
+class DistanceFieldWriter:
+    """Owns the shared field; one at a time for a name. What an earlier one left behind is replaced.
+
+    Args:
+        path: From `field_path`.
+        lattice: Which cells.
+        reach: Where distances are cut, m.
+        frame: Frame of the cells.
+        cameras: Names of those that contribute, at most 8.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, when there is no room for it.
+    """
+
+    def __init__(self, path: Path, lattice: Lattice, reach: float, frame: str, cameras: Sequence[str]) -> None:
+        if len(cameras) > _MAX_CAMERAS:
+            raise OpenArmError(
+                Code.CONFIG_INVALID, f"{len(cameras)} cameras; a distance field has room for {_MAX_CAMERAS}"
+            )
+        self._path = path
+        self._cameras = tuple(cameras)
+        self._moments: dict[str, CameraMoment] = {name: CameraMoment(0, 0) for name in cameras}
+        size = _DATA_AT + _SLOTS * lattice.cells * 4
+        try:
+            handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
+            try:
+                # reserved now: a full file system would otherwise end the process at the first write
+                os.posix_fallocate(handle, 0, size)
+                self._map = mmap.mmap(handle, size)
+                self._inode = os.fstat(handle).st_ino
+                head = _header(self._map)
+                head["magic"], head["resolution"], head["reach"] = _MAGIC, lattice.resolution, reach
+                head["key_min"], head["shape"], head["frame"] = lattice.key_min, lattice.shape, frame.encode()
+                head["current"] = -1
+                for i, name in enumerate(cameras):
+                    head["cameras"][i] = name.encode()
+                os.replace(temporary, path)
+            except OSError:
+                os.unlink(temporary)
+                raise
+            finally:
+                os.close(handle)
+        except OSError as error:
+            raise OpenArmError(
+                Code.ENVIRONMENT, f"no room for a distance field of {size / 2**20:.1f} MiB at {path}: {error}"
+            ) from error
+        self._head = head
+        self._slots = _slots(self._map, lattice)
+        self._version = 0
+
+    @property
+    def version(self) -> int:
+        """Number of the current version; 0 before the first."""
+        return self._version
+
+    def begin(self) -> Floats:
+        """The slot to compute into, (nx, ny, nz); nobody is told of it until `commit`."""
+        slot = self._next
+        self._head["slots"][slot]["version"] = 0
+        return self._slots[slot]
+
+    def commit(self, t_ns: int, now_ns: int, cameras: Mapping[str, CameraMoment]) -> int:
+        """Make what was computed since `begin` the current version; returns its number."""
+        slot = self._next
+        head = self._head["slots"][slot]
+        self._moments |= cameras
+        head["t_ns"], head["now_ns"] = t_ns, now_ns
+        for i, name in enumerate(self._cameras):
+            head["camera_t_ns"][i], head["camera_now_ns"][i] = self._moments[name].t_ns, self._moments[name].now_ns
+        self._version += 1
+        head["version"] = self._version
+        self._head["current"] = slot
+        return self._version
+
+    def close(self) -> None:
+        """Take the field away; readers keep what they have mapped."""
+        try:
+            if self._path.stat().st_ino == self._inode:
+                self._path.unlink()
+        except FileNotFoundError:
+            pass  # taken away already
+
+    @property
+    def _next(self) -> int:
+        return (int(self._head["current"]) + 1) % _SLOTS
+
+
+class DistanceFieldReader:
+    """Looks at the field of a name; may be made before the writer is there, and survives its restart.
+
+    Args:
+        path: From `field_path`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._inode = -1
+        self._head: Any = None
+        self._slots: list[Floats] = []
+        self._lattice: Lattice | None = None
+
+    def latest(self) -> DistanceField:
+        """The current version, in place (no copy).
+
+        Raises:
+            OpenArmError: NOT_READY, when nothing has been published yet.
+        """
+        self._open()
+        slot = int(self._head["current"])
+        if slot < 0 or self._lattice is None:
+            raise OpenArmError(Code.NOT_READY, f"the distance field at {self._path} has no version yet")
+        head = self._head["slots"][slot]
+        names = [bytes(name).decode() for name in self._head["cameras"] if name]
+        return DistanceField(
+            lattice=self._lattice,
+            distances=self._slots[slot],
+            reach=float(self._head["reach"]),
+            frame=bytes(self._head["frame"]).decode(),
+            version=int(head["version"]),
+            t_ns=int(head["t_ns"]),
+            now_ns=int(head["now_ns"]),
+            cameras={
+                name: CameraMoment(int(head["camera_t_ns"][i]), int(head["camera_now_ns"][i]))
+                for i, name in enumerate(names)
+            },
+        )
+
+    def intact(self, field: DistanceField) -> bool:
+        """Whether a field of this reader is still as it was: ask after using it."""
+        return any(
+            slot is field.distances and int(self._head["slots"][i]["version"]) == field.version
+            for i, slot in enumerate(self._slots)
+        )
+
+    def _open(self) -> None:
+        try:
+            inode = self._path.stat().st_ino
+            if inode == self._inode:
+                return
+            with self._path.open("rb") as file:
+                memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except (FileNotFoundError, ValueError) as error:
+            raise OpenArmError(
+                Code.NOT_READY, f"no distance field at {self._path}; is the node octomap running?"
+            ) from error
+        head = _header(memory) if len(memory) >= _DATA_AT else None
+        if head is None or bytes(head["magic"]) != _MAGIC:
+            raise OpenArmError(Code.NOT_READY, f"{self._path} is no distance field of this version of the suite")
+        key, shape = ([int(v) for v in head[k]] for k in ("key_min", "shape"))
+        self._lattice = Lattice(float(head["resolution"]), (key[0], key[1], key[2]), (shape[0], shape[1], shape[2]))
+        self._head, self._inode = head, inode
+        self._slots = _slots(memory, self._lattice)
+
+
+def _header(memory: mmap.mmap) -> Any:
+    return np.frombuffer(memory, _HEAD, count=1)[0]
+
+
+def _slots(memory: mmap.mmap, lattice: Lattice) -> list[Floats]:
+    n = lattice.cells
+    return [
+        np.frombuffer(memory, np.float32, count=n, offset=_DATA_AT + i * 4 * n).reshape(lattice.shape)
+        for i in range(_SLOTS)
+    ]
+
+
+@njit(cache=True, nogil=True)
+def sphere_clearance(
+    distances: Floats, lower: NDArray[np.float64], edge: float, centres: NDArray[np.float64], radii: NDArray[np.float64]
+) -> float:
+    """Smallest gap between spheres and occupied cells, m; see `DistanceField.clearance`."""
+    nx, ny, nz = distances.shape
+    # a sphere's centre is up to half a diagonal from that of its cell, and a surface as far from that of its own
+    slack = np.sqrt(3.0) * edge
+    best = np.inf
+    for i in range(centres.shape[0]):
+        x = int(np.floor((centres[i, 0] - lower[0]) / edge))
+        y = int(np.floor((centres[i, 1] - lower[1]) / edge))
+        z = int(np.floor((centres[i, 2] - lower[2]) / edge))
+        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+            best = min(best, distances[x, y, z] - radii[i] - slack)
+    return best

@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot: one description for every part of the suite.
+
+`RobotDescription.load()` expands `models/openarm`; the same URDF text goes to MuJoCo, pinocchio and
+`/robot_description`. Forward kinematics here needs nothing but numpy. Poses are ``T_root_link``, (4, 4), in the frame
+of the root link (`world`, identical to `openarm_body_link0`); joint positions are rad, or m for a finger.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+import xacro
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import models_dir
+from openarm_common.robot.srdf import Semantics, parse_srdf
+from openarm_common.robot.urdf import Joint, Link, Primitive, parse_urdf
+from openarm_common.robot.xml_text import fault
+
+__all__ = ["BASE_LINK", "SIDES", "Joint", "Link", "Primitive", "RobotDescription", "Side", "mirror"]
+
+Array = NDArray[np.float64]
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+BASE_LINK = "openarm_body_link0"
+_MIRROR = np.array([-1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])
+
+
+def mirror(q: Iterable[float]) -> Array:
+    """Joint positions (7,) of one arm that put the other arm in the mirror image (y negated) of the pose."""
+    return np.fromiter(q, dtype=np.float64) * _MIRROR
+
+
+@dataclass(frozen=True, eq=False)
+class RobotDescription:
+    """Links, joints and semantics of a robot, with forward kinematics.
+
+    Attributes:
+        urdf: URDF text, expanded.
+        srdf: SRDF text, or "".
+        name: Name of the robot.
+        root: The link that is no joint's child.
+        links: By name, in the order of the URDF.
+        joints: By name, in the order of the URDF.
+        semantics: What the SRDF says.
+    """
+
+    urdf: str
+    srdf: str
+    name: str
+    root: str
+    links: Mapping[str, Link]
+    joints: Mapping[str, Joint]
+    semantics: Semantics
+    _chains: Mapping[str, tuple[Joint, ...]] = field(repr=False)
+
+    @classmethod
+    def load(cls) -> RobotDescription:
+        """Return the OpenArm description of `models/openarm`; expanded once a process.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when the xacro or the SRDF is faulty; ENVIRONMENT, when the files are missing.
+        """
+        return _load()
+
+    @classmethod
+    def from_urdf(cls, urdf: str, srdf: str = "") -> RobotDescription:
+        """Read any robot whose joints form one tree.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, naming what is wrong: duplicate names, unknown links, no or several roots, a
+                loop, an SRDF that speaks of links or joints which the URDF does not have.
+        """
+        name, links, joints = parse_urdf(urdf)
+        parent_joint: dict[str, Joint] = {}
+        for joint in joints.values():
+            if joint.child in parent_joint:
+                other = parent_joint[joint.child].name
+                raise fault(f"link {joint.child!r} is the child of two joints: {other!r} and {joint.name!r}")
+            parent_joint[joint.child] = joint
+        roots = [link for link in links if link not in parent_joint]
+        if len(roots) != 1:
+            raise fault(f"expected one root link, found {len(roots)}: {', '.join(roots) or 'the joints form a loop'}")
+        chains = {link: _chain_of(link, parent_joint) for link in links}
+        semantics = parse_srdf(srdf)
+        _check_semantics(semantics, links, joints)
+        return cls(
+            urdf=urdf,
+            srdf=srdf,
+            name=name,
+            root=roots[0],
+            links=MappingProxyType(links),
+            joints=MappingProxyType(joints),
+            semantics=semantics,
+            _chains=MappingProxyType(chains),
+        )
+
+    @staticmethod
+    def arm_joints(side: Side) -> tuple[str, ...]:
+        """Names of the seven joints of an arm, from the shoulder."""
+        return tuple(f"openarm_{side}_joint{i}" for i in range(1, 8))
+
+    @staticmethod
+    def finger_joint(side: Side) -> str:
+        """Name of the joint that drives both fingers of a hand."""
+        return f"openarm_{side}_finger_joint1"
+
+    @staticmethod
+    def tcp_link(side: Side) -> str:
+        """Name of the tool centre point of an arm: z out of the fingers, y the opening direction."""
+        return f"openarm_{side}_hand_tcp"
+
+    @property
+    def allowed_collisions(self) -> frozenset[frozenset[str]]:
+        """Pairs of links whose contact is not checked."""
+        return self.semantics.allowed_collisions
+
+    def limits(self, joint_names: Iterable[str]) -> tuple[Array, Array]:
+        """Lower and upper position limits (n,) of joints."""
+        found = [self.joint(name) for name in joint_names]
+        return np.array([j.lower for j in found]), np.array([j.upper for j in found])
+
+    def velocity_limits(self, joint_names: Iterable[str]) -> Array:
+        """Velocity limits (n,) of joints: those of the motors, far above what a plan should use."""
+        return np.array([self.joint(name).velocity for name in joint_names])
+
+    def joint(self, name: str) -> Joint:
+        """Return a joint.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing the joints there are.
+        """
+        if name not in self.joints:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"no joint {name!r} in robot {self.name!r}; joints: {', '.join(self.joints)}"
+            )
+        return self.joints[name]
+
+    def chain(self, link: str) -> tuple[Joint, ...]:
+        """Joints from the root to a link, fixed ones included.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing the links there are.
+        """
+        if link not in self._chains:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"no link {link!r} in robot {self.name!r}; links: {', '.join(self.links)}"
+            )
+        return self._chains[link]
+
+    def link_pose(self, link: str, q: Mapping[str, float]) -> Array:
+        """Pose ``T_root_link`` (4, 4) of one link; only the joints of its chain are evaluated.
+
+        Args:
+            link: Name of the link.
+            q: Positions of (at least) the movable joints of the chain; a mimicking joint takes its leader's.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for an unknown link or a joint that is missing in `q`.
+        """
+        T = np.eye(4)
+        for joint in self.chain(link):
+            T = T @ self._joint_pose(joint, q)
+        return T
+
+    def link_poses(self, q: Mapping[str, float]) -> dict[str, Array]:
+        """Poses ``T_root_link`` (4, 4) of every link.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for a joint that is missing in `q`.
+        """
+        poses: dict[str, Array] = {self.root: np.eye(4)}
+        for chain in self._chains.values():
+            for joint in chain[_known(chain, poses) :]:
+                poses[joint.child] = poses[joint.parent] @ self._joint_pose(joint, q)
+        return {link: poses[link] for link in self.links}
+
+    def group_joints(self, group: str) -> tuple[str, ...]:
+        """Movable joints of an SRDF group: those it lists, of its chains and of its subgroups, without passive ones.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing the groups there are.
+        """
+        groups = self.semantics.groups
+        if group not in groups:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no group {group!r}; groups: {', '.join(groups) or 'none'}")
+        names = list(groups[group].joints)
+        for base, tip in groups[group].chains:
+            above = {joint.name for joint in self.chain(base)}
+            names += [joint.name for joint in self.chain(tip) if joint.name not in above]
+        for subgroup in groups[group].groups:
+            names += self.group_joints(subgroup)
+        passive = self.semantics.passive_joints
+        return tuple(n for n in dict.fromkeys(names) if self.joints[n].type != "fixed" and n not in passive)
+
+    def group_state(self, group: str, name: str) -> dict[str, float]:
+        """Joint positions of a named posture, for example group "left_arm", state "home".
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing the states there are.
+        """
+        states = self.semantics.states
+        if (group, name) not in states:
+            there = ", ".join(f"{g}/{n}" for g, n in states) or "none"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no state {name!r} of group {group!r}; states: {there}")
+        return dict(states[group, name])
+
+    def _joint_pose(self, joint: Joint, q: Mapping[str, float]) -> Array:
+        if joint.type == "fixed":
+            return joint.T_parent_joint
+        leader = joint.mimic or joint.name
+        if leader not in q:
+            there = ", ".join(q) or "no joints"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no position of joint {leader!r}; got {there}")
+        position = float(q[leader])
+        if joint.mimic is not None:
+            position = joint.multiplier * position + joint.offset
+        return joint.T_parent_joint @ joint.motion(position)
+
+
+def _chain_of(link: str, parent_joint: Mapping[str, Joint]) -> tuple[Joint, ...]:
+    chain: list[Joint] = []
+    seen = {link}
+    while link in parent_joint:
+        joint = parent_joint[link]
+        chain.append(joint)
+        link = joint.parent
+        if link in seen:
+            raise fault(f"the joints form a loop through link {link!r}")
+        seen.add(link)
+    return tuple(reversed(chain))
+
+
+def _known(chain: tuple[Joint, ...], poses: Mapping[str, Array]) -> int:
+    """How many joints of a chain, from the root, have a child whose pose is there already."""
+    count = len(chain)
+    while count and chain[count - 1].child not in poses:
+        count -= 1
+    return count
+
+
+def _check_semantics(semantics: Semantics, links: Mapping[str, Link], joints: Mapping[str, Joint]) -> None:
+    for pair in semantics.allowed_collisions:
+        for link in pair - links.keys():
+            raise fault(f"SRDF disables collisions of link {link!r}, which the URDF does not have")
+    named = {joint for group in semantics.groups.values() for joint in group.joints} | semantics.passive_joints
+    named |= {joint for state in semantics.states.values() for joint in state}
+    for joint in sorted(named - joints.keys()):
+        raise fault(f"SRDF speaks of joint {joint!r}, which the URDF does not have")
+    for group in semantics.groups.values():
+        for link in (link for chain in group.chains for link in chain if link not in links):
+            raise fault(f"SRDF group {group.name!r} speaks of link {link!r}, which the URDF does not have")
+        for other in (other for other in group.groups if other not in semantics.groups):
+            raise fault(f"SRDF group {group.name!r} speaks of group {other!r}, which does not exist")
+    for group_name, state in semantics.states:
+        if group_name not in semantics.groups:
+            raise fault(f"SRDF state {state!r} belongs to group {group_name!r}, which does not exist")
+
+
+@lru_cache(maxsize=1)
+def _load() -> RobotDescription:
+    folder = models_dir() / "openarm"
+    source = folder / "openarm.urdf.xacro"
+    try:
+        document = xacro.process_file(str(source))
+    except xacro.XacroException as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"{source}: {error}") from error
+    root = ET.fromstring(document.toxml())  # drops xacro's comments, which name the folder it ran in
+    ET.indent(root)
+    urdf = ET.tostring(root, encoding="unicode") + "\n"
+    return RobotDescription.from_urdf(urdf, (folder / "openarm.srdf").read_text(encoding="utf-8"))

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read SRDF text into frozen data: groups, named postures, and the collisions that are not checked."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from openarm_common.robot.xml_text import attribute, floats, parse_root, unique
+
+
+@dataclass(frozen=True)
+class Group:
+    """A planning group of the SRDF: joints by name, chains (base, tip), and other groups."""
+
+    name: str
+    joints: tuple[str, ...]
+    chains: tuple[tuple[str, str], ...]
+    groups: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Semantics:
+    """What the SRDF adds to the URDF. `states` is (group, state) → joint → position."""
+
+    groups: Mapping[str, Group]
+    states: Mapping[tuple[str, str], Mapping[str, float]]
+    allowed_collisions: frozenset[frozenset[str]]
+    passive_joints: frozenset[str]
+
+
+def parse_srdf(text: str) -> Semantics:
+    """Read SRDF text; "" gives empty semantics.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when it is not XML or an attribute is missing.
+    """
+    root = parse_root(text, "SRDF") if text else ET.Element("robot")
+    groups: dict[str, Group] = {}
+    for element in root.findall("group"):
+        name = attribute(element, "name")
+        unique("group", name, groups)
+        groups[name] = Group(
+            name=name,
+            joints=tuple(attribute(e, "name") for e in element.findall("joint")),
+            chains=tuple((attribute(e, "base_link"), attribute(e, "tip_link")) for e in element.findall("chain")),
+            groups=tuple(attribute(e, "name") for e in element.findall("group")),
+        )
+    states: dict[tuple[str, str], Mapping[str, float]] = {}
+    for element in root.findall("group_state"):
+        key = (attribute(element, "group"), attribute(element, "name"))
+        unique("group_state", " ".join(key), {" ".join(k) for k in states})
+        states[key] = MappingProxyType(
+            {attribute(e, "name"): floats(attribute(e, "value"), 1, e)[0] for e in element.findall("joint")}
+        )
+    pairs = frozenset(
+        frozenset((attribute(e, "link1"), attribute(e, "link2"))) for e in root.findall("disable_collisions")
+    )
+    passive = frozenset(attribute(e, "name") for e in root.findall("passive_joint"))
+    return Semantics(MappingProxyType(groups), MappingProxyType(states), pairs, passive)

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read URDF text into frozen data.
+
+Lengths are metres, angles radians, masses kilograms. ``T_parent_joint`` is the pose of a joint frame in its parent
+link, ``T_link_primitive`` the pose of a shape in its link; a cylinder's axis is its local z.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.robot.xml_text import attribute, fault, floats, parse_root, unique
+
+Array = NDArray[np.float64]
+Rgba = tuple[float, float, float, float]
+JointType = Literal["revolute", "continuous", "prismatic", "fixed"]
+ShapeKind = Literal["box", "cylinder", "sphere"]
+
+
+@dataclass(frozen=True, eq=False)
+class Primitive:
+    """A simple shape on a link.
+
+    Attributes:
+        size: box: full edges x, y, z; cylinder: radius, length; sphere: radius.
+        material: Name of the material of a visual, "" without one.
+        rgba: Colour of a visual, None without one.
+    """
+
+    name: str
+    kind: ShapeKind
+    size: tuple[float, ...]
+    T_link_primitive: Array
+    material: str = ""
+    rgba: Rgba | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A link; centre of mass and inertia (about it) are in link axes. `meshes` names shapes that are not primitives."""
+
+    name: str
+    mass: float
+    com: Array
+    inertia: Array
+    collision: tuple[Primitive, ...]
+    visual: tuple[Primitive, ...]
+    meshes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint. Its position follows ``multiplier * q[mimic] + offset`` where `mimic` is set.
+
+    Limits are rad and rad/s (m and m/s for a prismatic joint); a continuous joint has infinite ones. Effort is N m (N).
+    """
+
+    name: str
+    type: JointType
+    parent: str
+    child: str
+    T_parent_joint: Array
+    axis: Array
+    lower: float
+    upper: float
+    velocity: float
+    effort: float
+    mimic: str | None = None
+    multiplier: float = 1.0
+    offset: float = 0.0
+    damping: float = 0.0
+    friction: float = 0.0
+
+    def motion(self, position: float) -> Array:
+        """Pose of the child link in the joint frame, (4, 4)."""
+        if self.type == "fixed":
+            return np.eye(4)
+        if self.type == "prismatic":
+            return se3.make(None, self.axis * position)
+        return se3.make(se3.exp_so3(self.axis * position))
+
+
+def parse_urdf(text: str) -> tuple[str, dict[str, Link], dict[str, Joint]]:
+    """Read URDF text.
+
+    Returns:
+        Robot name, links by name, joints by name.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming the element: not XML, a duplicate name, a missing attribute, a joint type
+            that is not supported, a joint between links that do not exist.
+    """
+    root = parse_root(text, "URDF")
+    colors = {m.get("name", ""): _rgba(m) for m in root.findall("material")}
+    links: dict[str, Link] = {}
+    joints: dict[str, Joint] = {}
+    shape_names: set[str] = set()
+    for element in root.findall("link"):
+        link = _link(element, colors)
+        unique("link", link.name, links)
+        links[link.name] = link
+        for tag in ("visual", "collision"):
+            for shape in element.findall(tag):
+                name = shape.get("name")
+                if name is not None:
+                    unique("visual or collision", name, shape_names)
+                    shape_names.add(name)
+    for element in root.findall("joint"):
+        joint = _joint(element)
+        unique("joint", joint.name, joints)
+        joints[joint.name] = joint
+        for role, name in (("parent", joint.parent), ("child", joint.child)):
+            if name not in links:
+                raise fault(f"joint {joint.name!r} has the {role} link {name!r}, which does not exist")
+    for joint in joints.values():
+        leader = joints.get(joint.mimic) if joint.mimic is not None else None
+        if joint.mimic is not None and (leader is None or leader.mimic is not None or leader.type == "fixed"):
+            why = "does not exist" if leader is None else "is fixed or mimics a joint itself"
+            raise fault(f"joint {joint.name!r} mimics {joint.mimic!r}, which {why}")
+    return root.get("name", ""), links, joints
+
+
+def _origin(element: ET.Element) -> Array:
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(4)
+    roll, pitch, yaw = floats(origin.get("rpy", "0 0 0"), 3, origin)
+    return se3.make(se3.matrix_from_rpy(roll, pitch, yaw), floats(origin.get("xyz", "0 0 0"), 3, origin))
+
+
+def _rgba(material: ET.Element) -> Rgba | None:
+    color = material.find("color")
+    if color is None:
+        return None
+    r, g, b, a = floats(attribute(color, "rgba"), 4, color)
+    return (r, g, b, a)
+
+
+def _primitive(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Primitive | None:
+    geometry = element.find("geometry")
+    if geometry is None or len(geometry) != 1:
+        raise fault(f"<{element.tag} {element.attrib}>: expected one <geometry> with one shape")
+    shape = geometry[0]
+    size: tuple[float, ...]
+    kind: ShapeKind
+    if shape.tag == "box":
+        kind, size = "box", floats(attribute(shape, "size"), 3, shape)
+    elif shape.tag == "cylinder":
+        kind = "cylinder"
+        size = tuple(floats(attribute(shape, key), 1, shape)[0] for key in ("radius", "length"))
+    elif shape.tag == "sphere":
+        kind, size = "sphere", floats(attribute(shape, "radius"), 1, shape)
+    elif shape.tag == "mesh":
+        return None
+    else:
+        raise fault(f"<{element.tag} {element.attrib}>: <{shape.tag}> is none of box, cylinder, sphere, mesh")
+    material = element.find("material")
+    name = material.get("name", "") if material is not None else ""
+    rgba = _rgba(material) if material is not None else None
+    return Primitive(element.get("name", ""), kind, size, _origin(element), name, rgba or colors.get(name))
+
+
+def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
+    mass, com, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
+    inertial = element.find("inertial")
+    if inertial is not None:
+        mass_element, tensor = inertial.find("mass"), inertial.find("inertia")
+        if mass_element is None or tensor is None:
+            raise fault(f"link {element.get('name')!r}: <inertial> needs <mass> and <inertia>")
+        mass = floats(attribute(mass_element, "value"), 1, mass_element)[0]
+        xx, xy, xz, yy, yz, zz = (
+            floats(tensor.get(key, "0"), 1, tensor)[0] for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        )
+        T = _origin(inertial)
+        com = T[:3, 3]
+        inertia = T[:3, :3] @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ T[:3, :3].T
+    shapes: dict[str, list[Primitive]] = {"visual": [], "collision": []}
+    meshes: list[str] = []
+    for tag, found in shapes.items():
+        for shape in element.findall(tag):
+            primitive = _primitive(shape, colors)
+            if primitive is None:
+                meshes.append(shape.get("name", tag))
+            else:
+                found.append(primitive)
+    return Link(
+        name=attribute(element, "name"),
+        mass=mass,
+        com=com,
+        inertia=inertia,
+        collision=tuple(shapes["collision"]),
+        visual=tuple(shapes["visual"]),
+        meshes=tuple(meshes),
+    )
+
+
+def _child(element: ET.Element, tag: str, key: str) -> str:
+    found = element.find(tag)
+    if found is None:
+        raise fault(f"joint {element.get('name')!r} has no <{tag}>")
+    return attribute(found, key)
+
+
+def _joint(element: ET.Element) -> Joint:
+    name = attribute(element, "name")
+    kind = attribute(element, "type")
+    if kind not in get_args(JointType):
+        raise fault(f"joint {name!r} has type {kind!r}; supported: {', '.join(get_args(JointType))}")
+    axis_element, limit, mimic = element.find("axis"), element.find("limit"), element.find("mimic")
+    dynamics = element.find("dynamics")
+    axis = np.array(
+        floats(axis_element.get("xyz", "1 0 0"), 3, axis_element) if axis_element is not None else (1.0, 0.0, 0.0)
+    )
+    norm = float(np.linalg.norm(axis))
+    if norm < 1e-9:
+        raise fault(f"joint {name!r} has the axis (0, 0, 0)")
+    if kind in ("revolute", "prismatic") and limit is None:
+        raise fault(f"joint {name!r} is {kind} and has no <limit>")
+
+    def number(parent: ET.Element | None, key: str, default: float) -> float:
+        text = parent.get(key) if parent is not None else None
+        return default if parent is None or text is None else floats(text, 1, parent)[0]
+
+    bounded = kind in ("revolute", "prismatic")
+    lower = number(limit, "lower", 0.0) if bounded else -math.inf
+    upper = number(limit, "upper", 0.0) if bounded else math.inf
+    if lower > upper:
+        raise fault(f"joint {name!r} has the lower limit {lower} above the upper limit {upper}")
+    return Joint(
+        name=name,
+        type=kind,  # pyright: ignore[reportArgumentType]
+        parent=_child(element, "parent", "link"),
+        child=_child(element, "child", "link"),
+        T_parent_joint=_origin(element),
+        axis=axis / norm,
+        lower=lower,
+        upper=upper,
+        velocity=number(limit, "velocity", math.inf),
+        effort=number(limit, "effort", math.inf),
+        mimic=mimic.get("joint") if mimic is not None else None,
+        multiplier=number(mimic, "multiplier", 1.0),
+        offset=number(mimic, "offset", 0.0),
+        damping=number(dynamics, "damping", 0.0),
+        friction=number(dynamics, "friction", 0.0),
+    )

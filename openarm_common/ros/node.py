@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every node of the suite starts from: parameters, QoS, diagnostics, worker threads, orderly shutdown."""
+
+from __future__ import annotations
+
+import faulthandler
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Generic, ParamSpec, TypeVar, get_args
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.logging import get_logger
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+
+from openarm_common.config import AT_RUN_TIME, Config, validate
+from openarm_common.errors import OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.lockstep_node import LockstepNode
+
+ConfigT = TypeVar("ConfigT", bound=Config)
+P = ParamSpec("P")
+R = TypeVar("R")
+
+#: A node that moves something has this long to bring it to rest before the process ends, s.
+_HOLD = 2.0
+_ENDING = (signal.SIGINT, signal.SIGTERM)
+#: Where poses of the suite are expressed.
+BASE_FRAME = "openarm_body_link0"
+
+
+def _profile(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProfile:
+    return QoSProfile(
+        depth=depth,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def reliable(depth: int) -> QoSProfile:
+    """Reliable, volatile, keep last `depth`."""
+    return _profile(depth)
+
+
+#: Camera images, info, clouds as published (REP-2003).
+QOS_SENSOR = _profile(5, reliable=False)
+#: A subscriber that only ever wants the newest frame.
+QOS_NEWEST = _profile(1, reliable=False)
+QOS_COMMAND = _profile(10)
+QOS_CLOCK = _profile(1, reliable=False)
+QOS_TF = _profile(100)
+QOS_LATCHED = _profile(1, latched=True)
+#: As tf2: publishers keep one message each, the listener takes those of many publishers.
+QOS_STATIC_TF = _profile(100, latched=True)
+
+
+def offered_qos(node: Node, topic: str, depth: int) -> QoSProfile:
+    """The quality of service with which everything that is published on a topic now is heard.
+
+    Args:
+        node: Who asks.
+        topic: Absolute name; without a publisher, best effort and volatile.
+        depth: Messages that may wait.
+    """
+    profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
+    dependable = bool(profiles) and all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    latched = bool(profiles) and all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    return _profile(depth, reliable=dependable, latched=latched)
+
+
+class BaseNode(LockstepNode, Generic[ConfigT]):
+    """A node with validated parameters, /diagnostics and a worker pool; it can take part in a lock-step.
+
+    Args:
+        name: Node name.
+        model: Configuration model; every field becomes a ROS parameter (nested models joined by dots), read-only but
+            for those that are marked `AT_RUN_TIME`.
+        kwargs: Passed to `rclpy.node.Node`.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming each wrong parameter.
+    """
+
+    def __init__(self, name: str, model: type[ConfigT], **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        data = _declare(self, model, "")
+        self.config: ConfigT = validate(model, data, f"parameters of {self.get_fully_qualified_name()}")
+        self.__pool = ThreadPoolExecutor(max_workers=4, thread_name_prefix=name)
+        self.__description: RobotDescription | None = None
+        self.__status = DiagnosticStatus(
+            level=DiagnosticStatus.STALE, name=f"{self.get_name()}: status", hardware_id="openarm"
+        )
+        self.__diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+        self.create_timer(1.0, self.__publish_diagnostics, clock=self.steady_clock)
+
+    @property
+    def default_callback_group(self) -> CallbackGroup:
+        """Callbacks may overlap at their awaits: a coroutine that waits must not keep the others from running."""
+        if not hasattr(self, "_BaseNode__group"):  # asked for in the constructor of Node
+            self.__group = ReentrantCallbackGroup()
+        return self.__group
+
+    @property
+    def description(self) -> RobotDescription:
+        """The robot, loaded at first use."""
+        if self.__description is None:
+            self.__description = RobotDescription.load()
+        return self.__description
+
+    def diagnose(self, ok: bool, message: str, **values: object) -> None:
+        """Set what /diagnostics says of this node once a second."""
+        status = DiagnosticStatus(name=self.__status.name, hardware_id=self.__status.hardware_id, message=message)
+        status.level = DiagnosticStatus.OK if ok else DiagnosticStatus.ERROR
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        self.__status = status
+
+    def accept_changes(self, take: Callable[[ConfigT], None]) -> None:
+        """Let the parameters that are marked `AT_RUN_TIME` change: `take` gets the new configuration before it holds.
+
+        What the model or `take` refuse with an OpenArmError stays as it was; who asked is told why.
+        """
+
+        def change(parameters: list[Parameter]) -> SetParametersResult:
+            data = self.config.model_dump()
+            for parameter in parameters:
+                *groups, key = parameter.name.split(".")
+                place = data
+                for group in groups:
+                    place = place.get(group, {})
+                if key in place:  # else it is none of the model's, such as use_sim_time
+                    place[key] = parameter.value
+            try:
+                config = validate(type(self.config), data, f"parameters of {self.get_fully_qualified_name()}")
+                take(config)
+            except OpenArmError as error:
+                return SetParametersResult(successful=False, reason=error.message)
+            self.config = config
+            return SetParametersResult(successful=True)
+
+        self.add_on_set_parameters_callback(change)
+
+    def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Any:
+        """Run `fn` in a worker thread; await the returned rclpy future (which carries no type) in a coroutine callback.
+
+        A future completed from another thread does not wake a waiting executor, so this does. In lock-step `fn` runs at
+        once: simulated time waits for it.
+        """
+        future = Future(executor=self.executor)
+
+        def work() -> None:
+            try:
+                result = fn(*args, **kwargs)
+            except BaseException as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+            if self.executor is not None:
+                self.executor.wake()
+
+        if self.lockstep:
+            work()
+        else:
+            self.__pool.submit(work)
+        return future
+
+    def make_executor(self) -> Executor:
+        """Make the executor that spins this node in a process of its own; the node is in it."""
+        if self.lockstep:
+            from openarm_common.ros.lockstep_executor import ParticipantExecutor  # an ordinary node needs none of it
+
+            return ParticipantExecutor(self)
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
+        return executor
+
+    async def hold(self) -> None:
+        """Bring to rest what the node moves: called when the process is to end, while the graph is still there."""
+
+    def close(self) -> None:
+        """Stop what the node runs beside the executor; subclasses with threads extend this."""
+        self.__pool.shutdown(wait=True, cancel_futures=True)
+
+    def __publish_diagnostics(self) -> None:
+        message = DiagnosticArray(status=[self.__status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self.__diagnostics.publish(message)
+
+
+def _declare(node: Node, model: type[BaseModel], prefix: str) -> dict[str, Any]:
+    data: dict[str, Any] = {}
+    for key, field in model.model_fields.items():
+        name = prefix + key
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            data[key] = _declare(node, field.annotation, name + ".")
+            continue
+        descriptor = ParameterDescriptor(
+            description=field.description or "",
+            additional_constraints=_constraints(field),
+            read_only=field.json_schema_extra != AT_RUN_TIME,
+        )
+        # Types are checked by the model, which says more (and takes 1 for 1.0) than rcl does.
+        descriptor.dynamic_typing = True
+        default: Any = field.get_default(call_default_factory=True)
+        value = node.declare_parameter(name, _to_ros(default), descriptor).value
+        if value is not None:
+            data[key] = list(value) if hasattr(value, "tolist") else value
+    return data
+
+
+def _to_ros(value: Any) -> Any:
+    if isinstance(value, tuple | list):
+        items: list[Any] = list(value)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+        return items
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def _constraints(field: FieldInfo) -> str:
+    limits = [
+        f"{symbol} {getattr(limit, key)}"
+        for limit in field.metadata
+        for key, symbol in _SYMBOLS.items()
+        if getattr(limit, key, None) is not None
+    ]
+    choices = [repr(choice) for choice in get_args(field.annotation) if isinstance(choice, str)]
+    return ", ".join(limits + (["one of " + ", ".join(choices)] if choices else []))
+
+
+_SYMBOLS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+
+
+def run(factory: Callable[[], BaseNode[Any]]) -> None:
+    """Main function of a node: create, spin until SIGINT or SIGTERM, shut down in order, exit.
+
+    The process exits with 0 after a signal and with 1 when the node could not be created.
+    """
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    signals = _Signals()
+    executor: Executor | None = None
+    node: BaseNode[Any] | None = None
+    code = 0
+    try:
+        node = factory()
+        if not rclpy.ok():  # the signal came while the node was being made
+            raise ExternalShutdownException
+        executor = node.make_executor()
+        signals.node = node
+        executor.spin()
+    except OpenArmError as error:
+        get_logger("openarm").fatal(str(error))
+        code = 1
+    except ExternalShutdownException:
+        pass  # the normal end
+    except (rclpy_implementation.RCLError, TypeError):  # the latter from an executor in a context that has ended
+        if rclpy.ok():
+            raise
+        # The signal came while something of rcl was being made.
+    finally:
+        if executor is not None:
+            executor.shutdown(timeout_sec=2.0)
+        if node is not None:
+            node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    sys.exit(code)
+
+
+class _Signals:
+    """Ends the context when SIGINT or SIGTERM comes, after `BaseNode.hold`: rclpy's own handlers end it at once.
+
+    They are read in a thread: the main one may be waiting in rcl, where Python's handlers don't run. And these do
+    nothing: a KeyboardInterrupt could cut the shutdown short. A SIGTERM after another signal, because the end takes too
+    long, writes to stderr where every thread stands.
+    """
+
+    def __init__(self) -> None:
+        self.node: BaseNode[Any] | None = None
+        self._reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        for kind in _ENDING:
+            signal.signal(kind, lambda *_: None)
+        threading.Thread(target=self._wait, name="signals", daemon=True).start()
+
+    def _wait(self) -> None:
+        while self._reader.recv(1)[0] not in _ENDING:
+            pass
+        faulthandler.register(signal.SIGTERM)
+        executor = self.node.executor if self.node is not None else None
+        # In lock-step nothing moves any more: simulated time waits for a node that ends.
+        if self.node is not None and executor is not None and not self.node.lockstep:
+            rested = threading.Event()
+            executor.create_task(self.node.hold).add_done_callback(lambda _: rested.set())
+            rested.wait(_HOLD)
+        rclpy.try_shutdown()

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Campaigns: many tasks by seed, on one or more processes, with rows on disk as they come and resume.
+
+The folder of a campaign holds `rows.jsonl` (one row a line, as they come), `campaign.json`, `campaign.csv`,
+`campaign.html` and `failures/<seed>/`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from openarm_bringup.supervision import runs
+from openarm_common.errors import Code, OpenArmError
+from openarm_evaluation.campaign import cluster, report
+from openarm_evaluation.campaign.one_task import run_one
+from openarm_evaluation.campaign.options import CampaignOptions, Row
+from openarm_evaluation.campaign.sets import make_task
+from openarm_evaluation.judging import provenance
+
+ROWS = "rows.jsonl"
+
+
+@dataclass
+class Campaign:
+    """What has come out so far."""
+
+    folder: Path
+    options: CampaignOptions
+    rows: list[Row] = field(default_factory=list[Row])
+    wall_s: float = 0.0
+    resumed: int = 0
+
+
+def run_campaign(
+    options: CampaignOptions,
+    folder: Path,
+    on_row: Callable[[Row], None] = lambda row: None,
+    on_begin: Callable[[int], None] = lambda done: None,
+) -> Campaign:
+    """Run all seeds that the folder has no row of, and write the reports; Ctrl-C keeps what is done.
+
+    Args:
+        options: What is run.
+        folder: Of the campaign.
+        on_row: Called with each new row.
+        on_begin: Called with the number of rows that are there already.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for an unknown set, or a folder with rows of other settings; what a fault of
+            the program did to one task is in its row.
+    """
+    for seed in options.seeds[:1]:
+        make_task(options.set_name, seed)  # faults of the call show before anything is started
+    campaign = Campaign(folder, options, read_rows(folder, options))
+    campaign.resumed = len(campaign.rows)
+    on_begin(campaign.resumed)
+    done = {row["seed"] for row in campaign.rows}
+    left = [seed for seed in options.seeds if seed not in done]
+    began = time.monotonic()
+    try:
+        with contextlib.closing(_rows(options, left, folder)) as new:
+            for row in new:
+                keep_row(campaign, row)
+                on_row(row)
+    finally:
+        campaign.wall_s = time.monotonic() - began
+        write_reports(campaign)
+    return campaign
+
+
+def keep_row(campaign: Campaign, row: Row) -> None:
+    """Take a row that has come, and write it down at once."""
+    with (campaign.folder / ROWS).open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row, default=str) + "\n")
+    campaign.rows.append(row)
+
+
+def read_rows(folder: Path, options: CampaignOptions) -> list[Row]:
+    """Rows of an earlier run in this folder, those of the asked seeds alone.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when they were made with other settings.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    kept, path = folder / "settings.json", folder / ROWS
+    settings = options.settings()
+    if kept.is_file():
+        before = json.loads(kept.read_text(encoding="utf-8"))
+        if before != settings:
+            changed = ", ".join(f"{key} was {before.get(key)}" for key in settings if before.get(key) != settings[key])
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"{folder} holds rows of another campaign ({changed}); choose another --out"
+            )
+    runs.write_json(kept, settings)
+    if not path.is_file():
+        return []
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    whole = [line for line in lines if line.endswith("\n")]
+    if len(whole) != len(lines):  # the last line was being written when the power went
+        path.write_text("".join(whole), encoding="utf-8")
+    rows = [json.loads(line) for line in whole]
+    return [row for row in rows if row["seed"] in set(options.seeds)]
+
+
+def _rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Generator[Row, None, None]:
+    """Rows as they come; the order of seeds with one worker."""
+    if options.ray:
+        yield from cluster.rows(options, seeds, folder)
+        return
+    if options.workers == 1:
+        for seed in seeds:
+            yield run_one(options, seed, folder)
+        return
+    # Spawned, not forked: OpenGL and numba's threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(options.workers, mp_context=context, initializer=_quiet_worker) as pool:
+        waiting: set[Future[Row]] = set()
+        queue = list(reversed(seeds))
+        try:
+            while queue or waiting:
+                while queue and len(waiting) < 2 * options.workers:
+                    waiting.add(pool.submit(run_one, options, queue.pop(), folder))
+                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _quiet_worker() -> None:
+    """Ctrl-C is for the parent; BLAS threads of many workers would fight over the cores."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(key, "1")
+
+
+def write_reports(campaign: Campaign) -> dict[str, Any]:
+    """Write JSON, CSV and HTML, and return what the JSON says."""
+    rows = sorted(campaign.rows, key=lambda row: row["seed"])
+    new = len(rows) - campaign.resumed
+    data: dict[str, Any] = {
+        "settings": campaign.options.settings(),
+        "summary": report.summarise(rows),
+        "asked": len(campaign.options.seeds),
+        "wall_s": round(campaign.wall_s, 1),
+        "scenes_per_hour": round(3600.0 * new / campaign.wall_s) if new and campaign.wall_s > 0.0 else None,
+        "workers": campaign.options.workers,
+        "machine": provenance.machine(),
+        "versions": provenance.versions(),
+        "rows": rows,
+    }
+    runs.write_json(campaign.folder / "campaign.json", data)
+    report.write_csv(campaign.folder / "campaign.csv", rows)
+    report.write_html(campaign.folder / "campaign.html", data)
+    return data

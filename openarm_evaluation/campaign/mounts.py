@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera mounts of a campaign: true ones that no configuration knows, each calibrated once by the suite itself.
+
+The robot stands in random postures in which the nominal mounts promise a view of the board; images are drawn from the
+true mounts, the marks are detected in them and the calibration is solved as on a real robot. World = base frame, m.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_calibration.board.board import CircleGrid
+from openarm_calibration.board.board_files import write_board
+from openarm_calibration.board.detect import detect
+from openarm_calibration.handeye.offline import Result, calibrate
+from openarm_calibration.sampling.gate import Matched
+from openarm_calibration.sampling.poses import visible
+from openarm_calibration.sampling.samples import SampleSet, SessionHead
+from openarm_calibration.store.store import CalibrationStore
+from openarm_common import se3
+from openarm_common.camera.cameras import CameraConfig, load_cameras
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import load_scene
+from openarm_evaluation.campaign.robot import shared_renderer
+from openarm_evaluation.campaign.tasks import Task
+from openarm_sim_bridge.world.model import build_spec
+from openarm_sim_bridge.world.world import Snapshot
+
+Array = NDArray[np.float64]
+
+HAND = "openarm_right_link7"
+#: The board between the fingers, seen by a standing camera; and lying on the table, seen by one on the hand.
+_HELD = se3.make(se3.rotation_from_z_y((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.37))
+_PLACED = se3.make(se3.rotation_from_z_y((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)), (0.33, -0.2, 0.405))
+_SAMPLES = 15
+_SPREAD = 0.4  # rad, of each joint around the middle of the postures
+_NOT_SEEN = 200
+
+
+def with_mounts(
+    task: Task, mount_seeds: Sequence[int], folder: Path, names: Sequence[str] = ("overhead", "wrist")
+) -> tuple[Task, Mapping[str, Array]]:
+    """The task with true mounts of one of the seeds (each in turn), and T_parent_link by camera as calibrated.
+
+    Args:
+        task: The task.
+        mount_seeds: To go through.
+        folder: Of calibrations; those that it lacks are made.
+        names: Cameras that the grasp looks through.
+    """
+    seed = mount_seeds[task.seed % len(mount_seeds)]
+    store = CalibrationStore(folder / str(seed))
+    mounts: dict[str, Array] = {}
+    for camera in (load_cameras()[name] for name in names):
+        if store.find(camera.name) is None:
+            store.save(calibrated(camera, seed).calibration)
+        found = store.find(camera.name)
+        if found is None:
+            raise OpenArmError(Code.INTERNAL, f"the calibration of {camera.name!r} was saved and is not there")
+        mounts[camera.name] = found.calibration.T_parent_link
+    return replace(task, mount_seed=seed), mounts
+
+
+def calibrated(camera: CameraConfig, mount_seed: int) -> Result:
+    """Calibrate a camera at true mounts of a seed."""
+    with tempfile.TemporaryDirectory() as name:
+        bench = Bench(camera, mount_seed, Path(name))
+        bench.fill(np.random.default_rng(mount_seed))
+        return calibrate(bench.samples)
+
+
+class Bench:
+    """One camera of the simulated robot with a board in front of it, without dynamics.
+
+    Args:
+        camera: Which.
+        seed: Of the true mounts.
+        folder: For the board's files.
+    """
+
+    def __init__(self, camera: CameraConfig, seed: int, folder: Path) -> None:
+        self._camera, self._board, self._description = camera, CircleGrid(), RobotDescription.load()
+        self._standing = camera.parent != HAND
+        posture = self._description.group_state
+        self._home = {**posture("right_arm", "home"), **posture("left_arm", "home")}
+        self._T_carrier_board, carrier = (_HELD, HAND) if self._standing else (_PLACED, "")
+        write_board(self._board, folder / "board.xml")
+        spec = build_spec(self._description, load_scene("empty"), load_cameras(), seed)
+        child = mujoco.MjSpec.from_file(str(folder / "board.xml"))
+        parent = spec.body(carrier) if carrier else spec.worldbody
+        quat = np.roll(se3.quat_xyzw_from_matrix(self._T_carrier_board[:3, :3]), 1)
+        frame = parent.add_frame(pos=self._T_carrier_board[:3, 3], quat=quat)
+        frame.attach_body(child.body("calibration_board"), "board_", "")
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+        self._picture = np.empty((camera.height, camera.width, 3), np.uint8)
+        optics = camera.intrinsics
+        numbers = (optics.width, optics.height, optics.fx, optics.fy, optics.cx, optics.cy)
+        head = SessionHead(
+            camera=camera.name,
+            setup="to_hand" if self._standing else "in_hand",
+            parent=camera.parent,
+            carrier=HAND,
+            intrinsics=numbers,
+            board=self._board.model_dump(),
+            mount_seed=seed,
+        )
+        self.samples = SampleSet(head, self._description)
+        self._optics = np.array(numbers[2:])
+
+    def fill(self, rng: np.random.Generator, count: int = _SAMPLES) -> None:
+        """Take `count` samples.
+
+        Raises:
+            OpenArmError: From the detector, when the board is hardly ever seen.
+        """
+        lower, upper = self._description.limits(self.samples.joint_names)
+        middle = self._middle()
+        missed = 0
+        while len(self.samples) < count:
+            joints = self._joints(np.clip(middle + rng.uniform(-_SPREAD, _SPREAD, len(middle)), lower, upper))
+            if not self._seen(joints) or not self._free(joints):
+                continue
+            renderer = shared_renderer()
+            renderer.load(Snapshot(self._model, 0, self._data.qpos.copy()))
+            renderer.draw(self._camera.name, self._picture)
+            try:
+                grey = np.asarray(cv2.cvtColor(self._picture, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+                found = detect(self._board, grey)
+            except OpenArmError:
+                missed += 1
+                if missed > _NOT_SEEN:
+                    raise
+                continue
+            self.samples.take(0, Matched(joints, 0, 0.0), found)
+
+    def _middle(self, tries: int = 3000) -> Array:
+        """Joint positions around which most postures show the board."""
+        rng = np.random.default_rng(0)
+        lower, upper = self._description.limits(self.samples.joint_names)
+        best, most = lower, 0
+        for _ in range(tries):
+            q = rng.uniform(lower + 0.1, upper - 0.1)
+            if not self._seen(self._joints(q)):
+                continue
+            near = np.clip(q + rng.uniform(-_SPREAD, _SPREAD, (20, len(q))), lower, upper)
+            count = sum(self._seen(self._joints(k)) for k in near) if self._free(self._joints(q)) else 0
+            if count > most:
+                best, most = q, count
+        return best
+
+    def _seen(self, joints: dict[str, float]) -> bool:
+        hand = self._description.link_pose(HAND, joints)
+        if self._standing:
+            T = se3.inverse(self._camera.T_parent_optical) @ hand @ self._T_carrier_board
+        else:
+            T = se3.inverse(hand @ self._camera.T_parent_optical) @ self._T_carrier_board
+        # a board farther from the standing camera is below the table
+        return bool(T[2, 3] < 0.62) and visible(self._board, T, self._optics, (self._camera.width, self._camera.height))
+
+    def _joints(self, q: Array) -> dict[str, float]:
+        return {**self._home, **dict(zip(self.samples.joint_names, q.tolist(), strict=True))}
+
+    def _free(self, joints: dict[str, float]) -> bool:
+        for name, value in joints.items():
+            self._data.qpos[self._model.joint(name).qposadr[0]] = value
+        mujoco.mj_forward(self._model, self._data)
+        return self._data.ncon == 0

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is kept of a task that did not go as expected: pictures, cloud and map, joints, states, how to run it again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import OpenArmError
+from openarm_common.octree.codec import write_file
+from openarm_evaluation.campaign.robot import SimRobot
+from openarm_octomap.config import GridConfig
+from openarm_octomap.grid import DepthScan, OccupancyGrid
+
+_VIEWS = ("overhead", "spectator")
+_PICTURES = 6
+
+
+class Keeper:
+    """Collects while a task runs; writes nothing unless it is asked to.
+
+    Args:
+        robot: That the task runs on.
+        folder: Of this task.
+    """
+
+    def __init__(self, robot: SimRobot, folder: Path) -> None:
+        self._robot = robot
+        self._folder = folder
+        self._pictures: list[tuple[str, NDArray[np.uint8]]] = []
+        self._scan: DepthScan | None = None
+        self._failed = False
+
+    def step(self, state: str, *, failed: bool) -> None:
+        """Note a transition; the first one after a failure is photographed."""
+        if failed and not self._failed and len(self._pictures) < _PICTURES:
+            self._shoot(f"failed_{len(self._pictures) // len(_VIEWS)}_{state.lower()}")
+        self._failed = failed
+        seen = self._robot.images.get("overhead")
+        if state == "TRANSFORM" and seen is not None:
+            t_ns, _, depth = seen
+            camera = self._robot.cameras["overhead"]
+            T_base_camera = self._robot.camera_pose(camera, t_ns)
+            self._scan = DepthScan(depth.copy(), camera.intrinsics, T_base_camera, camera.near, camera.far)
+
+    def write(self, row: Mapping[str, Any], steps: Sequence[Mapping[str, Any]]) -> Path:
+        """Write all that is known of the task into its folder, and return that."""
+        folder = self._folder
+        folder.mkdir(parents=True, exist_ok=True)
+        self._shoot("end")
+        for name, picture in self._pictures:
+            cv2.imwrite(str(folder / f"{name}.png"), np.ascontiguousarray(picture[..., ::-1]))
+        if self._scan is not None:
+            np.savez_compressed(folder / "cloud.npz", points_base=self._scan.points())
+            grid = OccupancyGrid(GridConfig())
+            grid.integrate([self._scan], 0)
+            write_file(folder / "map.bt", grid.binary(), grid.lattice.resolution)
+        trace = list(self._robot.trace)
+        np.savez_compressed(
+            folder / "joints.npz",
+            joint_names=np.array(self._robot.world.joint_names),
+            t_ns=np.array([t for t, _, _ in trace]),
+            position=np.array([q for _, q, _ in trace]),
+            effort=np.array([e for _, _, e in trace]),
+        )
+        (folder / "row.json").write_text(json.dumps({**row, "transitions": list(steps)}, indent=1), encoding="utf-8")
+        truth = "; ".join(row["reasons"]) or "as asked"
+        text = f"{row['outcome']}: {row['code']}: {row['message']}\nground truth: {truth}\nagain: {row['again']}\n"
+        (folder / "reason.txt").write_text(text, encoding="utf-8")
+        return folder
+
+    def _shoot(self, name: str) -> None:
+        for view in _VIEWS:
+            try:
+                self._pictures.append((f"{name}_{view}", self._robot.draw(view)[0].copy()))
+            except OpenArmError:
+                return  # a picture that cannot be drawn is not what failed

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a campaign asks: a scene, what to grasp in it, and what goes wrong on purpose; all of it from a set and a seed.
+
+Positions are in the base frame, m; the same set and seed always give the same task.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from openarm_common.errors import Code
+from openarm_common.scene.scene import PALETTE, SPACING, Scene, random_scene
+
+#: Faults of the campaign's own: as many plans as the parameter `times` says find no way,
+PLAN_FAILS = "plan_fails"
+#: and the detector misses each object in a `share` of the frames.
+MISSES = "detection_missed"
+
+
+_ENDURANCE = 10
+
+
+@dataclass(frozen=True)
+class FaultPlan:
+    """Something that goes wrong.
+
+    Attributes:
+        name: Of `openarm_sim_bridge.faults.faults`, `PLAN_FAILS` or `MISSES`.
+        parameters: Of it.
+        when: State that is entered when it begins; "" begins with the scene.
+        until_attempt: It is cleared when this attempt begins; 0: never.
+    """
+
+    name: str
+    parameters: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    when: str = ""
+    until_attempt: int = 0
+
+
+@dataclass(frozen=True)
+class Task:
+    """One row of a campaign.
+
+    Attributes:
+        set_name: Of `SETS`.
+        seed: Of everything that is drawn.
+        scene: What is on the table.
+        labels: What is asked for, one after the other.
+        arm: auto, left or right.
+        kind: What is special, for the report.
+        fault: What goes wrong; None: nothing.
+        codes: How it may end; OK stands for placed. Without OK it is impossible and must be refused.
+        mount_seed: Of the true camera mounts; None: nominal.
+        place: (x, y) of the footprint centre that is asked for, base frame, m; None: chosen by the suite.
+        posture: Joints that start elsewhere than at home, rad by name.
+        clear: Labels that come more than once are so many objects: what was placed stays where it is.
+        route: By which it must come to its place, as `GraspOutcome.route`; "": any.
+        together: Both labels are asked for at once, of both arms.
+    """
+
+    set_name: str
+    seed: int
+    scene: Scene
+    labels: tuple[str, ...]
+    arm: str = "auto"
+    kind: str = "nominal"
+    fault: FaultPlan | None = None
+    codes: tuple[Code, ...] = (Code.OK,)
+    mount_seed: int | None = None
+    place: tuple[float, float] | None = None
+    posture: Mapping[str, float] = field(default_factory=dict[str, float])
+    clear: bool = False
+    route: str = ""
+    together: bool = False
+
+    @property
+    def possible(self) -> bool:
+        """Whether it may end with all that was asked for placed."""
+        return Code.OK in self.codes
+
+
+def nominal(seed: int) -> Task:
+    """A random scene, one or two objects asked for, the others in the way."""
+    scene = random_scene(seed)
+    rng = np.random.default_rng([seed, 1])
+    wanted = min(len(scene.objects), 1 + int(rng.random() < 0.5))
+    return Task("nominal", seed, scene, tuple(item.label for item in scene.objects[:wanted]))
+
+
+def clutter(seed: int) -> Task:
+    """Five to eight objects, all asked for; where there are more than colours, two of a colour are two tasks."""
+    rng = np.random.default_rng([seed, 2])
+    scene = crowded_scene(seed, int(rng.integers(5, 9)))
+    return Task("clutter", seed, scene, tuple(item.label for item in scene.objects), kind="clutter", clear=True)
+
+
+def crowded_scene(seed: int, count: int) -> Scene:
+    """Objects of a random scene, more than there are colours: those beyond get the colours anew."""
+    whole = random_scene(seed, count=min(count, len(PALETTE)))
+    objects, k = list(whole.objects), 0
+    while len(objects) < count:
+        k += 1
+        for twin in random_scene(seed + k * 1_000_000, count=len(PALETTE)).objects:
+            far = all(math.dist(twin.position[:2], item.position[:2]) >= SPACING for item in objects)
+            if len(objects) < count and far:
+                objects.append(twin.model_copy(update={"name": f"{twin.name}_{k + 1}"}))
+    return whole.model_copy(update={"objects": tuple(objects), "name": f"crowded_{seed}"})
+
+
+def endurance(seed: int) -> Task:
+    """Two objects, picked and placed ten times each in one world: nothing is reset, and no failure is made good."""
+    scene = random_scene(seed, count=2)
+    labels = tuple(item.label for item in scene.objects)
+    return Task("endurance", seed, scene, _ENDURANCE * labels, kind="endurance")

@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One task of a campaign in this process: the grasp's machine and performer on a `SimRobot`, judged by its truth."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import Side
+from openarm_evaluation.campaign import record
+from openarm_evaluation.campaign.gap import LEAST_GAP, watch_gap
+from openarm_evaluation.campaign.link import DirectLink
+from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
+from openarm_evaluation.campaign.tasks import MISSES, PLAN_FAILS, Task
+from openarm_evaluation.judging.judge import JudgeConfig, Sample, Verdict, at_rest, judge
+from openarm_evaluation.judging.provenance import scene_hash
+from openarm_evaluation.judging.trial import Step, Trial
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.strategy.effects import GraspOutcome, GraspRequest
+from openarm_grasp.strategy.legs import run_task
+from openarm_grasp.strategy.link import Link
+from openarm_grasp.strategy.machine import GraspMachine
+from openarm_grasp.strategy.memory import Surroundings
+from openarm_grasp.strategy.orders import Ask, Order
+from openarm_grasp.strategy.pair import PairRunner
+from openarm_grasp.strategy.performer import Performer
+from openarm_sim_bridge.faults.faults import checked_fault
+
+Array = NDArray[np.float64]
+
+_SETTLE_S = 0.5
+_REST_LIMIT_S = 5.0
+#: Directions that a push tries before something stands in its way on every side.
+_DIRECTIONS = 12
+
+
+class Trials:
+    """Runs the requests of one task.
+
+    Args:
+        task: What is asked.
+        senses: How well the robot sees.
+        config: Parameters of the grasp.
+        mounts: T_parent_link by camera as the suite believes.
+        folder: Gets what is kept of a failure.
+        again: The command that runs this task again, for the report.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        senses: SimulatedSenses,
+        config: GraspConfig,
+        mounts: Mapping[str, Array] | None = None,
+        folder: Path | None = None,
+        again: str = "",
+    ) -> None:
+        self._task = task
+        self._again = again
+        self._config = config
+        self.robot = SimRobot(
+            task.scene, senses, mount_seed=task.mount_seed, mounts=mounts, seed=task.seed, posture=task.posture
+        )
+        self.link = DirectLink(self.robot, config)
+        self.performer = Performer(self.link, config)
+        self.machine = GraspMachine(Surroundings.of(config, task.scene.table, self.robot.description))
+        self.steps: list[Step] = []
+        self._rules = JudgeConfig()
+        self._keep = record.Keeper(self.robot, folder) if folder is not None else None
+        self._faulty = False
+        self._stands: tuple[float, ...] = ()
+
+    def run(self) -> dict[str, Any]:
+        """Carry out the task and return its row."""
+        began = time.monotonic()
+        self.robot.pass_time(_SETTLE_S)
+        self._begin_fault("")
+        gap = watch_gap(self.robot) if self._task.set_name.startswith("pairs") else None
+        began_ns = self.robot.t_ns
+        trials = self._both() if self._task.together else self._all_in_turn()
+        row = row_of(self._task, trials, time.monotonic() - began)
+        row["again"] = self._again
+        if gap is not None:
+            add_gap(row, gap.least, (self.robot.t_ns - began_ns) * 1e-9)
+        row["planning_ms_median"] = round(1e3 * float(np.median(self.link.planning_s or [math.nan])), 1)
+        if self._keep is not None and not row["as_expected"]:
+            self._keep.write(row, [step.__dict__ for step in self.steps])
+        return row
+
+    def _all_in_turn(self) -> list[Trial]:
+        """Grasp what is asked for; what others hide or block is asked for again when they have been placed."""
+        labels, clear = self._task.labels, self._task.clear
+        if not clear and len(set(labels)) < len(labels):  # the same object more than once
+            return [self._grasp(Ask(label)) for label in labels]
+        order, placed, open_ = Order(labels, each=Counter(labels)), list[Trial](), dict[str, Trial]()
+        while ask := order.next():
+            trial = self._grasp(ask)
+            order.done(ask, Code(trial.code), trial.message, self._stands)
+            if trial.claimed:
+                placed.append(trial)
+                continue
+            open_[ask.label] = trial
+            if trial.attempts and not clear:  # three attempts are what a scene may take
+                order.failed[ask.label] = trial.message
+        missing = Counter(labels) - Counter(trial.label for trial in placed)
+        return [*placed, *(open_[label] for label in missing.elements())]
+
+    def _grasp(self, ask: Ask) -> Trial:
+        robot, task = self.robot, self._task
+        began, first = time.monotonic(), len(self.steps)
+        for track in robot.tracks.values():
+            track.clear()
+        robot.pass_time(0.1)
+        request = GraspRequest(ask.label, task.arm, task.place, leave=ask.leave)
+        result: GraspOutcome | OpenArmError
+        try:
+            result = self.link.run(run_task(self.machine, self.performer, request, self._tell))
+        except OpenArmError as error:
+            result = error
+        wall_s = time.monotonic() - began
+        outcome = result if isinstance(result, GraspOutcome) else GraspOutcome(result.code, result.message, ask.label)
+        self._stands = outcome.place_position
+        return self._trial(outcome, self.steps[first:], wall_s)
+
+    def _both(self) -> list[Trial]:
+        """Ask for two objects at once, of both arms."""
+        robot, task = self.robot, self._task
+        began = time.monotonic()
+        second = GraspMachine(self.machine.around)
+        steps: dict[int, list[Step]] = {id(self.machine): [], id(second): []}
+
+        def tell(machine: GraspMachine) -> None:
+            self._tell(machine)
+            steps[id(machine)].append(self.steps[-1])
+
+        links: dict[Side, Link] = {arm: self.link.beside(self._config.limits.beside_wait) for arm in ARMS}
+        pair = PairRunner((self.machine, second), links, self.performer, tell)
+        robot.pass_time(0.1)
+        outcomes: Sequence[GraspOutcome]
+        try:
+            outcomes = self.link.run(pair.run((GraspRequest(task.labels[0]), GraspRequest(task.labels[1])))).answers
+        except OpenArmError as error:
+            outcomes = [GraspOutcome(error.code, error.message, label) for label in task.labels]
+        wall_s = 0.5 * (time.monotonic() - began)
+        return [self._trial(outcome, mine, wall_s) for outcome, mine in zip(outcomes, steps.values(), strict=True)]
+
+    def _trial(self, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
+        """What came of a request, judged."""
+        task = self._task
+        ends = [*(step.t_ns for step in steps[1:]), self.robot.t_ns]
+        target, verdict = self._judge(outcome)
+        return Trial(
+            seed=task.seed,
+            scene=task.scene.name,
+            scene_hash=scene_hash(task.scene),
+            target=target,
+            label=outcome.label,
+            arm=outcome.arm,
+            attempts=outcome.attempts,
+            claimed=outcome.success,
+            code=outcome.code.value,
+            message=outcome.message,
+            verdict=verdict,
+            states=tuple(
+                (step.state, (end - step.t_ns) * 1e-9, step.attempt, step.reason)
+                for step, end in zip(steps, ends, strict=bool(steps))
+                if step.state != "IDLE"
+            ),
+            sim_s=(steps[-1].t_ns - steps[0].t_ns) * 1e-9 if steps else 0.0,
+            wall_s=wall_s,
+            route=outcome.route,
+        )
+
+    # --- while it runs
+    def _tell(self, machine: GraspMachine | None = None) -> None:
+        machine = machine or self.machine
+        step = Step(
+            self.robot.t_ns,
+            machine.state.value,
+            machine.previous.value,
+            machine.reason,
+            machine.attempt,
+            machine.label,
+            machine.arm,
+        )
+        self.steps.append(step)
+        if self._keep is not None:
+            self._keep.step(step.state, failed=bool(machine.memory and machine.memory.failure))
+        fault = self._task.fault
+        if fault is None:
+            return
+        if self._faulty and fault.until_attempt and machine.attempt >= fault.until_attempt:
+            self._faulty = False
+            self.robot.world_faults.clear()
+            self.robot.camera_faults.set(())
+        elif machine.attempt == 1:
+            self._begin_fault(step.state)
+
+    def _begin_fault(self, state: str) -> None:
+        fault = self._task.fault
+        if fault is None or self._faulty or fault.when != state:
+            return
+        self._faulty = True
+        if fault.name == PLAN_FAILS:
+            self.link.plans_to_fail = int(fault.parameters["times"])
+            return
+        if fault.name == MISSES:
+            self.robot.missed = float(fault.parameters["share"])
+            return
+        for seed in range(self._task.seed, self._task.seed + _DIRECTIONS):
+            try:
+                self.robot.inject(checked_fault(fault.name, fault.parameters, seed))
+                return
+            except OpenArmError as error:
+                if error.code is not Code.SCENE_INVALID:
+                    raise
+        # Something stands on every side: it is not pushed, and the task is a nominal one.
+
+    # --- after it
+    def _judge(self, outcome: GraspOutcome) -> tuple[str, Verdict | None]:
+        """The verdict on the object of that label; where there are several, on the one that went highest."""
+        robot = self.robot
+        names = [item.name for item in self._task.scene.objects if item.label == outcome.label]
+        if not names:
+            return "", None
+        self._rest(names)
+        where = outcome.place_position
+        xy = (where[0], where[1]) if any(where) else (math.nan, math.nan)
+        name = max(names, key=lambda n: max(float(s.p_world[2]) for s in robot.tracks[n]))
+        return name, judge(robot.tracks[name], xy, claimed=outcome.success, config=self._rules)
+
+    def _rest(self, names: list[str]) -> None:
+        end_ns = self.robot.t_ns + round(_REST_LIMIT_S * 1e9)
+        least_ns = self.robot.t_ns + round(1.2 * self._rules.rest * 1e9)
+        while self.robot.t_ns < end_ns:
+            self.robot.tick()
+            ends = [self._end(self.robot.tracks[name]) for name in names]
+            if self.robot.t_ns > least_ns and all(at_rest(s, self._rules) for end in ends for s in end):
+                return
+
+    def _end(self, track: list[Sample]) -> list[Sample]:
+        return [sample for sample in track if track[-1].t_ns - sample.t_ns <= self._rules.rest * 1e9]
+
+
+def row_of(task: Task, trials: list[Trial], wall_s: float) -> dict[str, Any]:
+    """One row of the report."""
+    grasps = [trial.as_row() for trial in trials]
+    bad = next((g for g in grasps if not g["placed"]), None)
+    errors = [g["place_error_mm"] for g in grasps if g["placed"]]
+    placed = bad is None
+    false = any(g["false_success"] for g in grasps)
+    allowed = {code.value for code in task.codes}
+    strayed = bool(task.route) and any(g["placed"] and g["route"] != task.route for g in grasps)
+    expected = not (false or strayed) and all(
+        g["code"] in allowed and (g["placed"] or g["code"] != Code.OK) for g in grasps
+    )
+    refused = expected and not placed
+    shown = bad or grasps[-1]
+    return _head(task, len(trials)) | {
+        "outcome": "false success" if false else "placed" if placed else "refused" if refused else "failed",
+        "as_expected": expected,
+        "placed": placed,
+        "false_success": false,
+        "code": shown["code"],
+        "message": shown["message"],
+        "reasons": shown["reasons"],
+        "arm": shown["arm"],
+        "attempts": max(trial.attempts for trial in trials),
+        "place_error_mm": max(errors, default=None),
+        "sim_s": round(sum(g["sim_s"] for g in grasps), 2),
+        "wall_s": round(wall_s, 2),
+        "grasps": grasps,
+    }
+
+
+def add_gap(row: dict[str, Any], least: float, sim_s: float) -> None:
+    """Say how near the arms came to each other, m, and how long both objects took together, s."""
+    row["arm_gap_mm"] = round(1e3 * least, 1)
+    row["as_expected"] = bool(row["as_expected"] and least >= LEAST_GAP)
+    row["sim_s"] = round(sim_s, 2)
+
+
+def crashed_row(task: Task, error: Exception) -> dict[str, Any]:
+    """The row of a task that a fault of this program ended."""
+    return _head(task, len(task.labels)) | {
+        "outcome": "failed",
+        "as_expected": False,
+        "placed": False,
+        "false_success": False,
+        "code": Code.INTERNAL.value,
+        "message": f"{type(error).__name__}: {error}",
+        "reasons": [],
+        "arm": "",
+        "attempts": 0,
+        "place_error_mm": None,
+        "sim_s": 0.0,
+        "wall_s": 0.0,
+        "grasps": [],
+    }
+
+
+def _head(task: Task, targets: int) -> dict[str, Any]:
+    """What a row says of the task, whatever came of it."""
+    return {
+        "set": task.set_name,
+        "seed": task.seed,
+        "kind": task.kind,
+        "scene_hash": scene_hash(task.scene),
+        "objects": len(task.scene.objects),
+        "targets": targets,
+        "expected": ["placed" if code is Code.OK else code.value for code in task.codes],
+    }

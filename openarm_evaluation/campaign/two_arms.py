@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks that take both arms: a place that only the other arm reaches, an object that none can grasp where it stands.
+
+Base frame, m; all is drawn from the seed. `Task.route` says by which way the object must have come to its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from openarm_common import se3
+from openarm_common.errors import OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import PALETTE, Scene, SceneObject, parse_scene, random_scene
+from openarm_evaluation.campaign.planner import arms_behind, request_of
+from openarm_evaluation.campaign.tasks import Task
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.planning.candidates import propose, target_box
+from openarm_grasp.planning.rehearsal import NO_WAY
+from openarm_grasp.strategy.effects import PlanGrasp
+from openarm_motion.planning.approach import plan_approach
+
+#: Objects of the hand-over stand, and are wanted, at least so far on one arm's side: the other reaches over to 0.21, m.
+_ASIDE = 0.26
+#: Between the middles of a place and any object, m.
+_ROOM = 0.13
+#: Where objects are looked for that no arm can grasp and a hand comes behind: before the robot, between the arms.
+_BAND_X, _BAND_ABS_Y = (0.37, 0.43), 0.03
+
+
+def handover_task(seed: int) -> Task:
+    """An object on one arm's side, wanted on the other's; none to two others stand about, and the middle is free."""
+    rng = np.random.default_rng([seed, 4])
+    while True:
+        scene = random_scene(int(rng.integers(1 << 31)), count=int(rng.integers(1, 4)))
+        first = scene.objects[0]
+        others = [np.array(item.position[:2]) for item in scene.objects[1:]]
+        if abs(first.position[1]) < _ASIDE or any(abs(p[1]) < 0.16 for p in others):
+            continue
+        side = -np.sign(first.position[1])
+        place = np.array([rng.uniform(0.18, 0.34), side * rng.uniform(_ASIDE, 0.40)]).round(3)
+        if all(np.linalg.norm(place - p) >= _ROOM for p in others):
+            break
+    named = scene.model_copy(update={"name": f"handover_{seed}"})
+    xy = (float(place[0]), float(place[1]))
+    return Task("handover", seed, named, (first.label,), kind="handover", place=xy, route="hand_over")
+
+
+def pair_task(seed: int) -> Task:
+    """Two objects, one for each arm, asked for at once; up to two others stand about."""
+    rng = np.random.default_rng([seed, 6])
+    while True:
+        scene = random_scene(int(rng.integers(1 << 31)), count=int(rng.integers(2, 5)))
+        left = [item for item in scene.objects if item.position[1] > 0.0]
+        right = [item for item in scene.objects if item.position[1] < 0.0]
+        if left and right:
+            break
+    named = scene.model_copy(update={"name": f"pair_{seed}"})
+    return Task("pairs", seed, named, (left[0].label, right[0].label), kind="pair", together=True)
+
+
+def in_turn_task(seed: int) -> Task:
+    """The same, one after the other: what the time of a pair is held against."""
+    return replace(pair_task(seed), set_name="pairs_in_turn", kind="pair in turn", together=False)
+
+
+def push_task(seed: int) -> Task:
+    """An object before the robot, between the arms, so turned that neither can grasp it where it stands."""
+    rng = np.random.default_rng([seed, 5])
+    while True:
+        scene = _one_object(seed, rng)
+        if not any(_graspable(scene, arm) for arm in ("left", "right")):
+            return Task("push", seed, scene, (scene.objects[0].label,), kind="push", route="push")
+
+
+def _one_object(seed: int, rng: np.random.Generator) -> Scene:
+    color = str(rng.choice(list(PALETTE)))
+    a, b, c = (round(float(edge), 3) for edge in rng.uniform((0.04, 0.04, 0.04), (0.07, 0.07, 0.06)))
+    item = SceneObject(
+        name=f"{color}_box",
+        shape="box",
+        size=(a, b, c),
+        color=color,
+        position=(round(float(rng.uniform(*_BAND_X)), 3), round(float(rng.uniform(-_BAND_ABS_Y, _BAND_ABS_Y)), 3)),
+        yaw=round(float(rng.uniform(-np.pi, np.pi)), 3),
+        mass=round(float(rng.uniform(0.06, 0.25)), 3),
+    )
+    return parse_scene({"name": f"push_{seed}", "objects": [item]}, f"push scene {seed}")
+
+
+def _graspable(scene: Scene, arm: str) -> bool:
+    """Whether an arm at home finds a plan for the first object, known without an error."""
+    table, item, config = scene.table, scene.objects[0], GraspConfig()
+    T = se3.make(se3.rot_z(item.yaw), item.centre(table))
+    target = Detection(item.label, 1.0, T, np.array(item.size))
+    solver = arms_behind(table.top_z, table.centre, table.extents)[arm]
+    request = request_of(PlanGrasp(arm, propose(target, config), (), target_box(target, config)))
+    try:
+        plan_approach(solver, solver.situation(_home()), request)
+    except OpenArmError as error:
+        if error.code not in NO_WAY:
+            raise
+        return False
+    return True
+
+
+def _home() -> Mapping[str, float]:
+    robot = RobotDescription.load()
+    state = dict.fromkeys(robot.joints, 0.0)
+    for side in ("left", "right"):
+        state |= robot.group_state(f"{side}_arm", GraspConfig().home_state)
+    return state

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm demo`: see it work, and get a report of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from openarm_bringup.outcome import Outcome
+from openarm_common.errors import Code
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from openarm_bringup.supervision.supervisor import Event
+    from openarm_evaluation.demo.demo import DemoResult
+    from openarm_evaluation.judging.trial import Step, Trial
+
+
+def demo(
+    *,
+    seeds: str | None = None,
+    label: str | None = None,
+    arm: Literal["auto", "left", "right"] = "auto",
+    place: tuple[float, float, float] | None = None,
+    scene: str | None = None,
+    graph: str = "sim",
+    set_: Annotated[tuple[str, ...], Parameter(name="--set")] = (),
+    video: bool | None = None,
+    mount_seed: str | None = None,
+    uncalibrated: Annotated[bool, Parameter(negative=())] = False,
+    domain: int | None = None,
+    accept: float = 0.9,
+) -> Outcome:
+    """Start a graph of its own without a display, grasp and place an object, judge it by ground truth, and stop.
+
+    Leaves a folder below runs/ with report.json, the logs of all nodes, pictures and a video.
+
+    Args:
+        seeds: Random scenes one after the other, such as 0-19; in each the first object is grasped.
+        label: What to grasp; the first object of the scene when not given.
+        arm: Which arm.
+        place: Where to place it: x y z of the footprint centre, base frame, m (z is not read); chosen when not given.
+        scene: Name or path of a scene, or "random".
+        graph: Name of a graph, or a file.
+        set_: A parameter, as node.param=value.
+        video: Pictures and a video; by default for a single grasp only.
+        mount_seed: Of the true camera mounts, or "none" for those of the configuration. Mounts of a seed that was never
+            calibrated are calibrated first, once.
+        uncalibrated: Use the mounts of the configuration, to see what that does.
+        domain: ROS_DOMAIN_ID; a free one when not given.
+        accept: With seeds: the share of objects placed that counts as success.
+    """
+    from openarm_evaluation.demo.demo import DemoOptions, Listeners, parse_seeds, run_demo
+    from openarm_evaluation.judging.trial import Ask
+
+    chosen = parse_seeds(seeds) if seeds is not None else ()
+    options = DemoOptions(
+        graph=graph,
+        scene=scene,
+        seeds=chosen,
+        ask=Ask(label, arm, place[:2] if place is not None else None),
+        film=not chosen if video is None else video,
+        domain=domain,
+        sets=tuple(set_),
+        mount_seed=mount_seed,
+        uncalibrated=uncalibrated,
+    )
+    show = _Show(quiet_steps=bool(chosen))
+    listeners = Listeners(
+        on_event=show.event, on_ready=show.ready, on_step=show.step, on_trial=show.trial, on_note=show.note
+    )
+    return _outcome(run_demo(options, listeners), options.seeds, accept)
+
+
+class _Show:
+    """Prints what happens, on stderr."""
+
+    def __init__(self, *, quiet_steps: bool) -> None:
+        from rich.console import Console
+
+        self._console: Console = Console(stderr=True, highlight=False)
+        self._quiet = quiet_steps
+        self._first_ns: int | None = None
+        self._rows = 0
+
+    def note(self, note: str) -> None:
+        self._console.print(note, style="yellow", markup=False)
+
+    def event(self, event: Event) -> None:
+        if event.state in ("failed", "backoff"):
+            self._console.print(f"{event.node}: {event.state}: {event.detail}", style="red", markup=False)
+
+    def ready(self, seconds: float) -> None:
+        self._console.print(f"[green]the graph is ready[/green] after {seconds:.1f} s")
+        if self._quiet:
+            head = f"{'seed':>4} {'target':<17}{'arm':<6}{'att.':>4}  {'outcome':<18}{'mm':>6}{'sim s':>7}{'wall s':>7}"
+        else:
+            head = f"{'sim s':>7}  {'state':<18}{'attempt':>7}  reason"
+        self._console.print(head, style="bold")
+
+    def step(self, step: Step) -> None:
+        if self._quiet:
+            return
+        if self._first_ns is None:
+            self._first_ns = step.t_ns
+        seconds = (step.t_ns - self._first_ns) * 1e-9
+        self._console.print(f"{seconds:7.2f}  [cyan]{step.state:<18}[/cyan]{step.attempt or '':>7}  ", end="")
+        self._console.print(step.reason, markup=False)
+
+    def trial(self, trial: Trial) -> None:
+        if not self._quiet:
+            return
+        row = trial.as_row()
+        error = "-" if row["place_error_mm"] is None else f"{row['place_error_mm']:.1f}"
+        outcome = "placed" if trial.placed else f"FALSE {trial.code}" if trial.claimed else trial.code
+        self._console.print(
+            f"{row['seed']:>4} {row['target']:<17}{row['arm']:<6}{row['attempts']:>4}  {outcome:<18}{error:>6}"
+            f"{row['sim_s']:>7.1f}{row['wall_s']:>7.1f}",
+            style="" if trial.placed else "red",
+            markup=False,
+        )
+
+
+def _outcome(result: DemoResult, seeds: tuple[int, ...], accept: float) -> Outcome:
+    from openarm_evaluation.judging.provenance import summarise
+
+    rows: list[dict[str, Any]] = [trial.as_row() for trial in result.trials]
+    summary = summarise(rows)
+    where = _short(result.run_dir)
+    data: dict[str, Any] = {
+        "run_dir": str(result.run_dir),
+        "summary": summary,
+        "rows": rows,
+        "warnings": result.warnings,
+        "mounts": result.mounts,
+    }
+    notes = "".join(f"note: {warning}\n" for warning in result.warnings)
+    for camera, off in result.mounts.items():
+        notes += (
+            f"{camera}: the mount in use is {off['used_mm']:.2f} mm and {off['used_deg']:.3f}° off,"
+            f" that of the configuration {off['nominal_mm']:.1f} mm and {off['nominal_deg']:.2f}°\n"
+        )
+    if result.error is not None:
+        return Outcome(False, f"{result.error.message}; the logs are in {where}/logs", result.error.code, data, notes)
+    if seeds:
+        return _campaign_outcome(result.trials, summary, accept, where, data, notes)
+    trial = result.trials[0]
+    if trial.verdict is None or not trial.placed:
+        why = "; ".join(trial.as_row()["reasons"])
+        claim = "it reported success, but " if trial.claimed else f"{trial.message} — "
+        code = Code.PLACE_FAILED if trial.claimed else trial.code
+        return Outcome(False, f"{trial.target} was not placed: {claim}{why}. See {where}", code, data, notes)
+    verdict = trial.verdict
+    message = (
+        f"{trial.target} was placed {verdict.place_error * 1e3:.1f} mm from its target by the {trial.arm} arm "
+        f"({trial.attempts} attempt{'s' if trial.attempts != 1 else ''}, lifted {verdict.rise * 1e3:.0f} mm, "
+        f"{trial.sim_s:.1f} s), judged by ground truth. Report, pictures and video: {where}"
+    )
+    return Outcome(True, message, data=data, text=notes)
+
+
+def _campaign_outcome(
+    trials: list[Trial], summary: dict[str, Any], accept: float, where: str, data: dict[str, Any], notes: str
+) -> Outcome:
+    lines = [notes] if notes else []
+    failed = [trial for trial in trials if not trial.placed]
+    for trial in failed:
+        lines.append(f"seed {trial.seed}, {trial.target}: {trial.outcome}: {trial.code}: {trial.message}")
+        lines += [f"    ground truth: {reason}" for reason in trial.as_row()["reasons"]]
+    error = summary["place_error_mm"]
+    figures = f", place error median {error['median']:.1f} mm, max {error['max']:.1f} mm" if error else ""
+    message = (
+        f"{summary['success']} of {summary['n']} placed ({summary['first_attempt']} at the first attempt), "
+        f"{summary['false_success']} false successes{figures}. Report: {where}/report.json"
+    )
+    success = summary["n"] > 0 and summary["success"] >= accept * summary["n"] and summary["false_success"] == 0
+    return Outcome(success, message, Code.OK if success else Code.PLACE_FAILED, data, "\n".join(lines))
+
+
+def _short(path: Path) -> str:
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)

@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demonstration: a graph of its own, grasps asked for over DDS and judged by ground truth, report and pictures."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from openarm_bringup.supervision import environment, runs
+from openarm_bringup.supervision.graph import Graph, load_graph
+from openarm_bringup.supervision.session import in_thread, running_graph
+from openarm_common.domain import reserve_domain
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene.scene import load_scene
+from openarm_evaluation.demo import mounts
+from openarm_evaluation.judging import provenance
+from openarm_evaluation.judging.trial import Ask, Step, Trial, choose_target, run_trial
+
+if TYPE_CHECKING:
+    from openarm_bringup.supervision.supervisor import Event
+    from openarm_evaluation.judging.ros.observer import Observer
+    from openarm_grasp.ros.client import GraspClient
+
+SPECTATOR = "/spectator/color/image_raw"
+DETECTION = "/detection_image"
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """What to demonstrate.
+
+    Args:
+        seeds: Random scenes, one after the other; empty: one grasp in `scene`.
+        film: Pictures and a video.
+        mount_seed: Of the true camera mounts, or "none"; None is the graph's.
+        uncalibrated: Use the mounts of the configuration, to see what that does.
+    """
+
+    graph: str = "sim"
+    scene: str | None = None
+    seeds: tuple[int, ...] = ()
+    ask: Ask = field(default_factory=Ask)
+    film: bool = True
+    domain: int | None = None
+    sets: tuple[str, ...] = ()
+    mount_seed: str | None = None
+    uncalibrated: bool = False
+
+
+@dataclass
+class Listeners:
+    """Who is told what while it happens; each is called in some thread."""
+
+    on_event: Callable[[Event], None] = lambda event: None
+    on_ready: Callable[[float], None] = lambda seconds: None
+    on_step: Callable[[Step], None] = lambda step: None
+    on_trial: Callable[[Trial], None] = lambda trial: None
+    on_note: Callable[[str], None] = lambda note: None
+
+
+@dataclass
+class DemoResult:
+    """What came out; `pictures` are files in the run folder, `mounts` how far off cameras are (see `mounts.errors`)."""
+
+    run_dir: Path
+    trials: list[Trial] = field(default_factory=list["Trial"])
+    pictures: list[str] = field(default_factory=list[str])
+    warnings: list[str] = field(default_factory=list[str])
+    mounts: dict[str, dict[str, float]] = field(default_factory=dict[str, "dict[str, float]"])
+    ready_s: float = 0.0
+    error: OpenArmError | None = None
+
+
+def run_demo(options: DemoOptions, listeners: Listeners | None = None) -> DemoResult:
+    """Run the demonstration to its end; the graph is stopped whatever happens.
+
+    Raises:
+        OpenArmError: What is wrong with the options; what happens later is in the result.
+    """
+    domain = reserve_domain() if options.domain is None else options.domain
+    overrides = {
+        "domain": domain,
+        "scene": "random" if options.seeds else options.scene,
+        "mount_seed": options.mount_seed,
+    }
+    if options.seeds:
+        overrides["seed"] = options.seeds[0]
+    sets = (*options.sets, *(("calibration_publisher.nominal=true",) if options.uncalibrated else ()))
+    graph = load_graph(options.graph, overrides=overrides, sets=sets)
+    # Faults of the call show before anything is started.
+    for seed in options.seeds or (graph.seed,):
+        choose_target(load_scene(graph.scene, seed), options.ask.label)
+    result = DemoResult(runs.new_run_dir())
+    told = listeners or Listeners()
+    try:
+        if graph.mount_seed != "none":
+            if not options.uncalibrated:
+                mounts.calibrate_once(graph.mount_seed, told.on_note)
+            result.mounts = mounts.errors(graph.mount_seed, nominal=options.uncalibrated)
+        asyncio.run(_demo(options, graph, result, told))
+    except OpenArmError as error:
+        result.error = error
+    write_report(options, graph, result)
+    return result
+
+
+async def _demo(options: DemoOptions, graph: Graph, result: DemoResult, listeners: Listeners) -> None:
+    began = time.monotonic()
+    # Clients made in this process find the graph through the environment.
+    os.environ.update(environment.ros_environment(graph))
+    async with running_graph(graph, result.run_dir, listeners.on_event) as supervisor:
+        await supervisor.wait_ready()
+        result.ready_s = time.monotonic() - began
+        listeners.on_ready(result.ready_s)
+        from openarm_evaluation.judging.ros.observer import Observer
+        from openarm_grasp.ros.client import GraspClient
+
+        studio = Studio(result) if options.film else None
+
+        def on_step(step: Step) -> None:
+            listeners.on_step(step)
+            if studio is not None:
+                studio.on_step(step)
+
+        with Observer(environment.domain_id(graph), on_step) as observer, GraspClient() as client:
+            if studio is not None:
+                studio.observer = observer
+            work = in_thread(lambda: _trials(options, graph, observer, client, studio, result, listeners), "trials")
+            stop = asyncio.create_task(supervisor.wait_stop_asked())
+            await asyncio.wait([work, stop], return_when=asyncio.FIRST_COMPLETED)
+            try:
+                if not work.done():
+                    client.cancel()
+                    await asyncio.wait([work], timeout=5.0)
+                    stop.result()
+                    raise OpenArmError(Code.CANCELLED, "stopped by Ctrl-C")
+                work.result()
+            finally:
+                stop.cancel()
+                if studio is not None:
+                    studio.finish()
+
+
+def _trials(
+    options: DemoOptions,
+    graph: Graph,
+    observer: Observer,
+    client: GraspClient,
+    studio: Studio | None,
+    result: DemoResult,
+    listeners: Listeners,
+) -> None:
+    before = studio.begin if studio is not None else None
+    if not options.seeds:
+        seed = graph.seed if graph.scene == "random" else None
+        scene = load_scene(graph.scene, graph.seed)
+        trial = run_trial(observer, client, scene, options.ask, seed=seed, before=before)
+        result.trials.append(trial)
+        listeners.on_trial(trial)
+        return
+    for seed in options.seeds:
+        after_ns = observer.reset_world("random", seed)
+        scene = load_scene("random", seed)
+        trial = run_trial(observer, client, scene, options.ask, seed=seed, after_ns=after_ns, before=before)
+        result.trials.append(trial)
+        listeners.on_trial(trial)
+
+
+class Studio:
+    """Takes the pictures of a run: before, what was detected, held, after; and a film of all of it."""
+
+    def __init__(self, result: DemoResult) -> None:
+        from openarm_common.camera.cameras import load_cameras
+        from openarm_evaluation.judging.film import Film
+
+        self._result = result
+        self._folder = result.run_dir
+        self._film = Film(result.run_dir / "grasp.mp4", load_cameras()["spectator"].rate)
+        self.observer: Observer | None = None
+        self._filming = False
+
+    def begin(self) -> None:
+        """Start filming and take the picture before; called in the thread of the trials."""
+        if self.observer is None:
+            return
+        self._filming = True
+        self.observer.look(SPECTATOR, self._film.add)
+        self._save_next(SPECTATOR, "before.png")
+        self.observer.look(DETECTION)
+        self._save_next(DETECTION, "detection.png")
+        self.observer.look_away(DETECTION)
+
+    def on_step(self, step: Step) -> None:
+        """Take the picture of the held object when it has been lifted."""
+        if step.previous == "LIFT" and step.state == "PLACE":
+            self._save_newest("held.png")
+
+    def finish(self) -> None:
+        """Take the last picture and finish the film."""
+        if self.observer is not None and self._filming:
+            self._save_newest("after.png")
+            self.observer.look_away(SPECTATOR)
+        if self._film.close():
+            self._result.pictures.append("grasp.mp4")
+        if self._film.save_animation(self._folder / "grasp.webp"):
+            self._result.pictures.append("grasp.webp")
+        if self._film.dropped:
+            self._result.warnings.append(f"the film lost {self._film.dropped} frames")
+
+    def _save_next(self, topic: str, name: str) -> None:
+        observer = self.observer
+        if observer is None:
+            return
+        try:
+            self._save(name, observer.wait(lambda: observer.frame(topic), 10.0, f"an image of {topic}")[1])
+        except OpenArmError as error:
+            self._result.warnings.append(f"{name}: {error.message}")
+
+    def _save_newest(self, name: str) -> None:
+        frame = self.observer.frame(SPECTATOR) if self.observer is not None else None
+        if frame is None:
+            self._result.warnings.append(f"{name}: no image of {SPECTATOR}")
+        else:
+            self._save(name, frame[1])
+
+    def _save(self, name: str, picture: Any) -> None:
+        from openarm_evaluation.judging.film import save_picture
+
+        save_picture(self._folder / name, picture)
+        self._result.pictures.append(name)
+
+
+def write_report(options: DemoOptions, graph: Graph, result: DemoResult) -> dict[str, Any]:
+    """Write report.json into the run folder and return it."""
+    rows = [trial.as_row() for trial in result.trials]
+    data: dict[str, Any] = {
+        "graph": graph.name,
+        "domain": graph.domain,
+        "mount_seed": graph.mount_seed,
+        "mounts": result.mounts,
+        "seeds": list(options.seeds),
+        "ready_s": round(result.ready_s, 2),
+        "summary": provenance.summarise(rows),
+        "rows": rows,
+        "error": {"code": str(result.error.code), "message": result.error.message} if result.error else None,
+        "pictures": result.pictures,
+        "warnings": result.warnings,
+        "versions": provenance.versions(),
+        "machine": provenance.machine(),
+    }
+    runs.write_json(result.run_dir / "report.json", data)
+    return data
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of `A-B`, `A` or a list such as `1,4,7-9`.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT.
+    """
+    seeds: list[int] = []
+    for part in text.split(","):
+        low, dash, high = part.strip().partition("-")
+        if not low.isdecimal() or (dash and not high.isdecimal()) or (dash and int(high) < int(low)):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"--seeds {text}: expected numbers such as 0-19, 3 or 1,4,7-9")
+        seeds += range(int(low), int(high if dash else low) + 1)
+    return tuple(seeds)
+
+
+def failures(trials: Sequence[Trial]) -> list[Trial]:
+    """Return the trials that were not judged as placed."""
+    return [trial for trial in trials if not trial.placed]

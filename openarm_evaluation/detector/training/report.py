@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a detector does on a set that it was not made with: figures, worst pictures, one page to look at. No torch."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_evaluation.detector.training.samples import Sample, Samples
+from openarm_evaluation.detector.training.scores import SHOWN, Scores, score
+from openarm_perception.detection.boxes import Candidates, overlap
+from openarm_perception.detection.network import NetworkDetector
+
+#: Detections are counted from this score on.
+LEAST = 0.05
+_WORST = 24
+_COLORS = ((230, 60, 60), (60, 200, 90), (80, 130, 255), (240, 190, 40), (220, 90, 220))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Figures of a detector on a set, and its detections picture by picture."""
+
+    scores: Scores
+    found: tuple[Candidates, ...]
+
+
+def evaluate(
+    network: NetworkDetector, samples: Samples, progress: Callable[[], None] | None = None, count: int | None = None
+) -> Evaluation:
+    """Run a detector over a set, or over the first `count` pictures of it."""
+    found: list[Candidates] = []
+    truth: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+    for i in range(len(samples) if count is None else min(count, len(samples))):
+        sample = samples[i]
+        found.append(network.candidates(sample.rgb, LEAST))
+        truth.append((sample.classes, sample.boxes))
+        if progress is not None:
+            progress()
+    return Evaluation(score(found, truth, len(samples.names)), tuple(found))
+
+
+def as_json(scores: Scores, names: Sequence[str]) -> dict[str, Any]:
+    """Figures as JSON takes them."""
+    data = asdict(scores) | {"confusion": scores.confusion.tolist(), "ap50": dict(zip(names, scores.ap50, strict=True))}
+    return {key: round(value, 4) if isinstance(value, float) else value for key, value in data.items()}
+
+
+def write_page(
+    path: Path,
+    samples: Samples,
+    results: dict[str, Evaluation],
+    curve: Sequence[dict[str, float]],
+    facts: dict[str, Any],
+) -> None:
+    """Write the page, and its figures as JSON beside it.
+
+    Args:
+        path: Of the HTML file.
+        samples: The set.
+        results: By name of the model; failures are shown of the last one.
+        curve: Rows of a training run; empty without one.
+        facts: Lines for the head of the page.
+    """
+    names = samples.names
+    figures = {name: as_json(result.scores, names) for name, result in results.items()}
+    path.with_suffix(".json").write_text(json.dumps({**facts, "models": figures}, indent=1), encoding="utf-8")
+    last = list(results.values())[-1]
+    parts = [_HEAD, "<h1>Network detector</h1>", _table(["", ""], [[k, v] for k, v in facts.items()])]
+    columns = ("map50", "map", "any50", "centre_median_px", "centre_p95_px", "precision", "recall")
+    rows = [
+        [name, *(f"{data[c]:.3f}" for c in columns), *(f"{data['ap50'][n]:.3f}" for n in names)]
+        for name, data in figures.items()
+    ]
+    parts += ["<h2>Figures</h2>", _table(["model", *columns, *(f"AP50 {n}" for n in names)], rows)]
+    confusion = last.scores.confusion.tolist()
+    header = ["is, called", *names, "missed"]
+    lines = [[name, *map(str, row)] for name, row in zip((*names, "nothing"), confusion, strict=True)]
+    parts += [f"<h2>Confusion at a score of {SHOWN}</h2>", _table(header, lines)]
+    if curve:
+        parts += ["<h2>Training</h2>", _curves(curve)]
+    faults = sorted(((_fault(samples[i], last.found[i]), i) for i in range(len(last.found))), reverse=True)[:_WORST]
+    parts.append("<h2>Failures to look at</h2><p>Thick: what is there; thin: what was found, with its score.</p>")
+    for fault, i in faults:
+        if fault > 0.0:
+            title = html.escape(samples.paths[i].name)
+            parts.append(
+                f"<figure>{_image(_drawn(samples[i], last.found[i], names))}<figcaption>{title}</figcaption></figure>"
+            )
+    path.write_text("\n".join(parts), encoding="utf-8")
+
+
+def _fault(sample: Sample, found: Candidates) -> float:
+    """How wrong a picture is: objects that are missed or called something else, and what is shown of nothing."""
+    shown = found.scores >= SHOWN
+    fault = 0.0
+    for kind, box in zip(sample.classes, sample.boxes, strict=True):
+        shared = overlap(box, found.boxes) if len(found.boxes) else np.zeros(0)
+        fault += not bool(np.any((shared >= 0.5) & shown & (found.classes == kind)))
+    for kind, box, certain in zip(found.classes[shown], found.boxes[shown], found.scores[shown], strict=True):
+        shared = overlap(box, sample.boxes) if len(sample.boxes) else np.zeros(0)
+        if not np.any((shared >= 0.5) & (sample.classes == kind)):
+            fault += float(certain)
+    return fault
+
+
+def _drawn(sample: Sample, found: Candidates, names: Sequence[str]) -> NDArray[np.uint8]:
+    picture = sample.rgb.copy()
+    for kind, box in zip(sample.classes, sample.boxes.round().astype(int).tolist(), strict=True):
+        cv2.rectangle(picture, box[:2], box[2:], _COLORS[kind % len(_COLORS)], 3)
+    for kind, certain, box in zip(found.classes, found.scores, found.boxes.round().astype(int).tolist(), strict=True):
+        if certain >= SHOWN:
+            cv2.rectangle(picture, box[:2], box[2:], (255, 255, 255), 1)
+            text = f"{names[kind]} {certain:.2f}"
+            at = (box[0], max(box[1] - 3, 10))
+            cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, _COLORS[kind % len(_COLORS)], 1, cv2.LINE_AA)
+    return picture
+
+
+def _image(rgb: NDArray[np.uint8]) -> str:
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return f'<img src="data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}" width="420">'
+
+
+def _curves(curve: Sequence[dict[str, float]]) -> str:
+    """Losses and figures of the selection set over the steps, as SVG lines each scaled to its own largest value."""
+    steps = np.array([row["step"] for row in curve], np.float64)
+    lines: list[str] = []
+    for i, key in enumerate(k for k in curve[0] if k not in ("step", "cpu_s")):
+        values = np.nan_to_num(np.array([row[key] for row in curve], np.float64))
+        top = float(values.max()) or 1.0
+        points = " ".join(
+            f"{60 + 560 * s / steps[-1]:.1f},{220 - 200 * v / top:.1f}" for s, v in zip(steps, values, strict=True)
+        )
+        color = "rgb" + str(_COLORS[i % len(_COLORS)])
+        lines.append(f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="2"/>')
+        text = f"{key}: last {values[-1]:.4g}, top {top:.4g}"
+        lines.append(f'<text x="640" y="{30 + 22 * i}" fill="{color}" font-size="14">{text}</text>')
+    axis = '<line x1="60" y1="220" x2="620" y2="220" stroke="#888"/>'
+    return f'<svg width="960" height="240">{axis}{"".join(lines)}</svg><p>{int(steps[-1])} batches.</p>'
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    head = "".join(f"<th>{html.escape(str(cell))}</th>" for cell in header)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
+_HEAD = """<!doctype html><meta charset="utf-8"><title>Network detector</title><style>
+body{font:15px sans-serif;margin:2em;max-width:1320px}table{border-collapse:collapse}td,th{border:1px solid #bbb;
+padding:3px 8px;text-align:left}figure{display:inline-block;margin:6px}figcaption{color:#555;font-size:12px}</style>"""

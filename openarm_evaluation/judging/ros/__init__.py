@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Observation of a running graph for the judge."""

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Watches a run from outside: ground truth for the judge, states of the grasp, pictures; resets the world.
+
+Runs in a thread and a ROS context of its own, so that whoever asks for grasps is free to block.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import rclpy
+from openarm_interfaces.msg import GraspStatus, ObjectState, ObjectStateArray
+from openarm_interfaces.srv import ResetWorld
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import Image, JointState
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import image_to_array, stamp_to_ns
+from openarm_evaluation.judging.film import Picture
+from openarm_evaluation.judging.judge import Sample
+from openarm_evaluation.judging.trial import Step
+
+T = TypeVar("T")
+Frame = tuple[int, Picture]
+
+_RELIABLE = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
+_LATCHED = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_NEWEST = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """All objects at one time, by name; `labels` says what each is called."""
+
+    t_ns: int
+    objects: Mapping[str, Sample]
+    labels: Mapping[str, str]
+
+
+class Observer:
+    """A context manager; inside it, everything is watched.
+
+    Args:
+        domain: ROS_DOMAIN_ID of the graph.
+        on_step: Called (in the observer's thread) for every state that the grasp enters.
+    """
+
+    def __init__(self, domain: int, on_step: Callable[[Step], None] | None = None) -> None:
+        self._context = Context()
+        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        self._node: Node = rclpy.create_node("openarm_observer", context=self._context, use_global_arguments=False)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._changed = threading.Condition()
+        self._on_step = on_step
+        self._truth: Truth | None = None
+        self._tracks: dict[str, list[Sample]] = {}
+        self._steps: list[Step] = []
+        self._joints: list[tuple[int, dict[str, float]]] = []
+        self._joint_states: Subscription | None = None
+        self._cameras: dict[str, Subscription] = {}
+        self._frames: dict[str, Frame] = {}
+        self._node.create_subscription(ObjectStateArray, "/sim/ground_truth/objects", self._on_truth, _RELIABLE)
+        self._node.create_subscription(GraspStatus, "/grasp/status", self._on_status, _LATCHED)
+        self._reset = self._node.create_client(ResetWorld, "/sim/reset_world")
+        self._thread = threading.Thread(target=self._spin, name="observer", daemon=True)
+
+    def __enter__(self) -> Observer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._executor.shutdown(timeout_sec=1.0)
+        self._context.try_shutdown()
+        self._thread.join(timeout=2.0)
+        self._node.destroy_node()
+
+    def wait(self, condition: Callable[[], T | None], seconds: float, what: str) -> T:
+        """Wait until `condition` gives something.
+
+        Raises:
+            OpenArmError: TIMEOUT, saying what was waited for.
+        """
+        deadline = time.monotonic() + seconds
+        with self._changed:
+            while True:
+                value = condition()
+                if value is not None and value is not False:
+                    return value
+                left = deadline - time.monotonic()
+                if left <= 0.0:
+                    raise OpenArmError(Code.TIMEOUT, f"{what} was not there within {seconds:g} s")
+                self._changed.wait(timeout=min(0.2, left))
+
+    def truth(self) -> Truth | None:
+        """Return the newest ground truth, or None before the first."""
+        return self._truth
+
+    def steps(self) -> list[Step]:
+        """Return the states since `forget`."""
+        return list(self._steps)
+
+    def track(self, name: str) -> list[Sample]:
+        """Return the samples of an object since `forget`."""
+        return list(self._tracks.get(name, []))
+
+    def joints(self) -> list[tuple[int, dict[str, float]]]:
+        """Return the joint states since `forget`: simulated time in ns, position by name; the first call begins."""
+        if self._joint_states is None:
+            self._joint_states = self._node.create_subscription(JointState, "/joint_states", self._on_joints, _RELIABLE)
+        return list(self._joints)
+
+    def forget(self) -> None:
+        """Begin new tracks and a new list of states."""
+        with self._changed:
+            self._tracks.clear()
+            self._steps.clear()
+            self._joints.clear()
+
+    def look(self, topic: str, on_frame: Callable[[int, Picture], None] | None = None) -> None:
+        """Begin to receive a colour image topic; its newest frame is kept, `on_frame` gets every one."""
+
+        def receive(message: Image) -> None:
+            try:
+                picture = np.array(image_to_array(message), dtype=np.uint8)
+            except OpenArmError as error:
+                self._node.get_logger().warning(str(error), throttle_duration_sec=5.0)
+                return
+            frame = (stamp_to_ns(message.header.stamp), picture)
+            if on_frame is not None:
+                on_frame(*frame)
+            with self._changed:
+                self._frames[topic] = frame
+                self._changed.notify_all()
+
+        if topic not in self._cameras:
+            self._cameras[topic] = self._node.create_subscription(Image, topic, receive, _NEWEST)
+
+    def look_away(self, topic: str) -> None:
+        """Stop receiving a topic, so that nothing is rendered for it."""
+        if topic in self._cameras:
+            self._node.destroy_subscription(self._cameras.pop(topic))
+
+    def frame(self, topic: str) -> Frame | None:
+        """Return the newest frame of a topic, or None."""
+        return self._frames.get(topic)
+
+    def reset_world(self, scene: str, seed: int, timeout_s: float = 30.0) -> int:
+        """Load a scene and return the simulated time after which ground truth shows it, ns.
+
+        Raises:
+            OpenArmError: SCENE_INVALID, when the bridge refused it; TIMEOUT, when it did not answer.
+        """
+        future = self._call(self._reset, ResetWorld.Request(scene=scene, seed=seed))
+        self.wait(lambda: future.done() or None, timeout_s, "an answer of /sim/reset_world")
+        answer = future.result()
+        if not answer.success:
+            raise OpenArmError(Code.SCENE_INVALID, f"/sim/reset_world refused: {answer.message}")
+        return self._truth.t_ns if self._truth is not None else 0
+
+    def _call(self, client: Any, request: Any) -> Any:
+        if not client.wait_for_service(timeout_sec=10.0):
+            raise OpenArmError(Code.TIMEOUT, f"{client.srv_name} has no server")
+        future = client.call_async(request)
+        self._executor.wake()
+        return future
+
+    def _on_truth(self, message: ObjectStateArray) -> None:
+        t_ns = stamp_to_ns(message.header.stamp)
+        samples = {state.name: _sample(t_ns, state) for state in message.objects}
+        with self._changed:
+            self._truth = Truth(t_ns, samples, {state.name: state.label for state in message.objects})
+            for name, sample in samples.items():
+                self._tracks.setdefault(name, []).append(sample)
+            self._changed.notify_all()
+
+    def _on_joints(self, message: JointState) -> None:
+        with self._changed:
+            self._joints.append(
+                (stamp_to_ns(message.header.stamp), dict(zip(message.name, message.position, strict=True)))
+            )
+            self._changed.notify_all()
+
+    def _on_status(self, message: GraspStatus) -> None:
+        step = Step(
+            stamp_to_ns(message.header.stamp),
+            message.state,
+            message.previous_state,
+            message.reason,
+            message.attempt,
+            message.label,
+            message.arm,
+        )
+        with self._changed:
+            self._steps.append(step)
+            self._changed.notify_all()
+        if self._on_step is not None:
+            self._on_step(step)
+
+    def _spin(self) -> None:
+        with contextlib.suppress(ExternalShutdownException):  # __exit__ has shut the context down
+            self._executor.spin()
+
+
+def _sample(t_ns: int, state: ObjectState) -> Sample:
+    p, q, v, w = state.pose.position, state.pose.orientation, state.twist.linear, state.twist.angular
+    return Sample(
+        t_ns,
+        np.array([p.x, p.y, p.z]),
+        np.array([q.x, q.y, q.z, q.w]),
+        np.array([v.x, v.y, v.z]),
+        np.array([w.x, w.y, w.z]),
+    )

@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One grasp, asked for, watched and judged."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene.scene import Scene, SceneObject
+from openarm_evaluation.judging.judge import JudgeConfig, Sample, Verdict, at_rest, judge
+from openarm_evaluation.judging.provenance import scene_hash
+
+if TYPE_CHECKING:
+    from openarm_evaluation.judging.ros.observer import Observer
+    from openarm_grasp.ros.client import GraspClient, GraspResult
+
+#: How near an object must be to its place in the scene file to be that scene's, m.
+_SAME_PLACE = 0.02
+SETTLE_TIMEOUT_S = 20.0
+
+
+@dataclass(frozen=True)
+class Step:
+    """A state that a grasp has entered, at simulated time `t_ns`."""
+
+    t_ns: int
+    state: str
+    previous: str
+    reason: str
+    attempt: int
+    label: str
+    arm: str
+
+
+@dataclass(frozen=True)
+class Ask:
+    """What is asked of a grasp.
+
+    Args:
+        label: Of the object; None takes the first of the scene.
+        arm: auto, left or right.
+        place: (x, y) of the footprint centre, base frame, m; None lets the suite choose.
+    """
+
+    label: str | None = None
+    arm: str = "auto"
+    place: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """How it went.
+
+    Args:
+        claimed: The grasp reported success.
+        verdict: Of ground truth; None when the object could not be watched.
+        states: (state, s of simulated time, attempt, reason it was entered for), in order.
+        sim_s: Simulated s from the request's first state to the last one's beginning.
+        route: By which the object came to its place.
+    """
+
+    seed: int | None
+    scene: str
+    scene_hash: str
+    target: str
+    label: str
+    arm: str
+    attempts: int
+    claimed: bool
+    code: str
+    message: str
+    verdict: Verdict | None
+    states: tuple[tuple[str, float, int, str], ...]
+    sim_s: float
+    wall_s: float
+    route: str = ""
+
+    @property
+    def placed(self) -> bool:
+        """Judged as placed."""
+        return self.verdict is not None and self.verdict.placed
+
+    @property
+    def outcome(self) -> str:
+        """placed, failed (and said so), or false success."""
+        if self.placed:
+            return "placed"
+        return "false success" if self.claimed else "failed"
+
+    def as_row(self) -> dict[str, Any]:
+        """Return what reports write."""
+        verdict = self.verdict
+        error = verdict.place_error * 1e3 if verdict else math.nan
+        return {
+            "seed": self.seed,
+            "scene": self.scene,
+            "scene_hash": self.scene_hash,
+            "target": self.target,
+            "label": self.label,
+            "arm": self.arm,
+            "route": self.route,
+            "outcome": self.outcome,
+            "placed": self.placed,
+            "claimed_success": self.claimed,
+            "false_success": self.outcome == "false success",
+            "code": self.code,
+            "message": self.message,
+            "reasons": list(verdict.reasons) if verdict else ["the object could not be watched"],
+            "attempts": self.attempts,
+            "place_error_mm": round(error, 2) if math.isfinite(error) else None,
+            "rise_mm": round(verdict.rise * 1e3, 1) if verdict else None,
+            "tilt_deg": round(math.degrees(verdict.tilt), 2) if verdict else None,
+            "sim_s": round(self.sim_s, 2),
+            "wall_s": round(self.wall_s, 2),
+            "states": [
+                {"state": state, "seconds": round(seconds, 3), "attempt": attempt, "reason": reason}
+                for state, seconds, attempt, reason in self.states
+            ],
+        }
+
+
+def choose_target(scene: Scene, label: str | None) -> SceneObject:
+    """Return the object to grasp: the first, or the one with that label.
+
+    Raises:
+        OpenArmError: UNKNOWN_OBJECT, listing the labels of the scene.
+    """
+    for item in scene.objects:
+        if label is None or item.label == label:
+            return item
+    labels = ", ".join(item.label for item in scene.objects) or "none"
+    raise OpenArmError(Code.UNKNOWN_OBJECT, f"scene {scene.name} has no object {label or ''!r}; it has {labels}")
+
+
+def shows(scene: Scene, positions: dict[str, Sample], rules: JudgeConfig) -> bool:
+    """Tell whether ground truth is of this scene, untouched and at rest."""
+    if set(positions) != {item.name for item in scene.objects}:
+        return False
+    return all(
+        at_rest(positions[item.name], rules)
+        and float(np.hypot(*(positions[item.name].p_world[:2] - np.array(item.position[:2])))) < _SAME_PLACE
+        for item in scene.objects
+    )
+
+
+def wait_scene(observer: Observer, scene: Scene, after_ns: int, rules: JudgeConfig) -> None:
+    """Wait until ground truth shows the scene at rest, later than `after_ns`.
+
+    Raises:
+        OpenArmError: TIMEOUT.
+    """
+
+    def there() -> bool | None:
+        truth = observer.truth()
+        return truth is not None and truth.t_ns > after_ns and shows(scene, dict(truth.objects), rules)
+
+    observer.wait(there, SETTLE_TIMEOUT_S, f"ground truth of scene {scene.name} at rest")
+
+
+def durations(steps: Sequence[Step], start: str = "IDLE") -> tuple[tuple[str, float, int, str], ...]:
+    """Return how long each state lasted, s of simulated time; a last state has no end and is left out."""
+    return tuple(
+        (step.state, (later.t_ns - step.t_ns) * 1e-9, step.attempt, step.reason)
+        for step, later in itertools.pairwise(steps)
+        if step.state != start
+    )
+
+
+def run_trial(
+    observer: Observer,
+    client: GraspClient,
+    scene: Scene,
+    ask: Ask,
+    *,
+    seed: int | None = None,
+    after_ns: int = 0,
+    rules: JudgeConfig | None = None,
+    before: Callable[[], None] | None = None,
+    moved: bool = False,
+) -> Trial:
+    """Wait for the scene, ask for a grasp, wait until all is at rest, and judge.
+
+    Args:
+        observer: Watches the graph.
+        client: Asks for the grasp.
+        scene: What is on the table now.
+        ask: What to grasp and where to place it.
+        seed: Of the scene, for the report.
+        after_ns: Ground truth up to this time is of an earlier scene.
+        rules: Of the judge.
+        before: Called when the scene stands, before the grasp is asked for.
+        moved: Earlier grasps have moved its objects, so it is not waited for.
+
+    Raises:
+        OpenArmError: TIMEOUT, when the scene does not show; UNKNOWN_OBJECT.
+    """
+    rules = rules or JudgeConfig()
+    item = choose_target(scene, ask.label)
+    if not moved:
+        wait_scene(observer, scene, after_ns, rules)
+    if before is not None:
+        before()
+    observer.forget()
+    _wait_track(observer, item.name)
+    began = time.monotonic()
+    result: GraspResult | OpenArmError
+    try:
+        result = client.pick(item.label, arm=ask.arm, place=ask.place)
+    except OpenArmError as error:
+        result = error
+    wall_s = time.monotonic() - began
+    _wait_rest(observer, item.name, rules)
+    _wait_idle(observer)
+    return _judged(observer, scene, item, result, ask, observer.steps(), wall_s, seed, rules)
+
+
+def run_pair(
+    observer: Observer,
+    client: GraspClient,
+    scene: Scene,
+    labels: Sequence[str],
+    *,
+    seed: int | None = None,
+    after_ns: int = 0,
+    rules: JudgeConfig | None = None,
+) -> list[Trial]:
+    """As `run_trial`, for two objects that are asked for at once; joint states are kept by the observer meanwhile."""
+    rules = rules or JudgeConfig()
+    first, second = items = [choose_target(scene, label) for label in labels]
+    wait_scene(observer, scene, after_ns, rules)
+    observer.forget()
+    observer.wait(lambda: observer.joints() or None, SETTLE_TIMEOUT_S, "/joint_states")
+    for item in items:
+        _wait_track(observer, item.name)
+    began = time.monotonic()
+    results: Sequence[GraspResult | OpenArmError]
+    try:
+        both = client.pick_two(first.label, second.label)
+        results = both.answers or 2 * [OpenArmError(both.code, both.message)]
+    except OpenArmError as error:
+        results = 2 * [error]
+    wall_s = 0.5 * (time.monotonic() - began)
+    for item in items:
+        _wait_rest(observer, item.name, rules)
+    _wait_idle(observer)
+    steps = observer.steps()
+    return [
+        _judged(
+            observer,
+            scene,
+            item,
+            result,
+            Ask(item.label),
+            [step for step in steps if step.label == item.label],
+            wall_s,
+            seed,
+            rules,
+        )
+        for item, result in zip(items, results, strict=True)
+    ]
+
+
+def _judged(
+    observer: Observer,
+    scene: Scene,
+    item: SceneObject,
+    result: GraspResult | OpenArmError,
+    ask: Ask,
+    steps: Sequence[Step],
+    wall_s: float,
+    seed: int | None,
+    rules: JudgeConfig,
+) -> Trial:
+    claimed = not isinstance(result, OpenArmError) and result.success
+    verdict = judge(observer.track(item.name), _target(result, ask), claimed=claimed, config=rules)
+    return Trial(
+        seed=seed,
+        scene=scene.name,
+        scene_hash=scene_hash(scene),
+        target=item.name,
+        label=item.label,
+        arm="" if isinstance(result, OpenArmError) else result.arm,
+        attempts=0 if isinstance(result, OpenArmError) else result.attempts,
+        claimed=claimed,
+        code=str(result.code),
+        message=result.message,
+        verdict=verdict,
+        states=durations(steps),
+        sim_s=(steps[-1].t_ns - steps[0].t_ns) * 1e-9 if steps else 0.0,
+        wall_s=wall_s,
+        route="" if isinstance(result, OpenArmError) else result.route,
+    )
+
+
+def _target(result: GraspResult | OpenArmError, ask: Ask) -> tuple[float, float]:
+    """Return where the object should be: as asked, else as the grasp chose; NaN when nothing was chosen."""
+    if ask.place is not None:
+        return ask.place
+    if isinstance(result, OpenArmError) or not any(result.place_position):
+        return (math.nan, math.nan)
+    return (result.place_position[0], result.place_position[1])
+
+
+def _wait_track(observer: Observer, name: str) -> None:
+    observer.wait(lambda: observer.track(name) or None, SETTLE_TIMEOUT_S, f"ground truth of {name}")
+
+
+def _wait_idle(observer: Observer) -> None:
+    """Wait until no grasp runs any more, also after a request whose answer never came: the next trial resets."""
+    observer.wait(lambda: not observer.steps() or observer.steps()[-1].state == "IDLE", 90.0, "the end of the grasp")
+
+
+def _wait_rest(observer: Observer, name: str, rules: JudgeConfig) -> None:
+    """Wait until the object has been at rest for as long as the judge looks back; one that never rests is judged so."""
+
+    def resting() -> bool:
+        track = observer.track(name)
+        end = [sample for sample in track if track[-1].t_ns - sample.t_ns <= rules.rest * 1e9]
+        long_enough = bool(track) and track[-1].t_ns - track[0].t_ns > rules.rest * 1e9
+        return long_enough and all(at_rest(sample, rules) for sample in end)
+
+    try:
+        observer.wait(resting, 5.0, f"{name} at rest")
+    except OpenArmError as error:
+        if error.code != Code.TIMEOUT:
+            raise

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether an object is held, has risen, and stands where it should: from the gripper's joint and the camera.
+
+A command that was sent proves nothing. Two independent kinds of evidence are needed for a lift: the gripper (gap,
+effort, rest) and the camera (the object has left its place, or is seen higher).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code
+from openarm_grasp.config import HeldConfig
+from openarm_grasp.evidence.observation import Detection, Frame, apart, sticks_out
+
+Array = NDArray[np.float64]
+
+
+#: Largest turn of a placed object from the yaw that was asked for, rad.
+YAW_TOLERANCE = float(np.radians(15.0))
+#: An object that is placed is as high as before; one that differs by more lies on its side, m.
+UPRIGHT_WITHIN = 0.006
+#: What is farther from an object is another one, or the hand hides it, m.
+_ELSEWHERE = 0.10
+#: Edges of a footprint that differ by less are taken for equal, m; what is round looks so, too.
+SQUARE_WITHIN = 0.006
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the gripper's joint says at rest.
+
+    Attributes:
+        gap: Distance between the fingers, m (twice the position of one finger).
+        expected: Width of the object between them, m.
+        effort: Force of the finger actuator, N, any sign.
+        speed: Of the gap, m/s, any sign.
+        tcp_error: Distance of the TCP from the planned grasp, m.
+        pads: Force on each finger pad, N; empty when no sensor tells it.
+    """
+
+    gap: float
+    expected: float
+    effort: float
+    speed: float
+    tcp_error: float = 0.0
+    pads: tuple[float, ...] = ()
+
+
+class Grip(Enum):
+    """What the hand holds."""
+
+    HELD = "held"
+    EMPTY = "empty"
+    HAND_COLLISION = "hand_collision"
+    MOVING = "moving"
+    LOST = "lost"
+
+    @property
+    def code(self) -> Code:
+        """The code that a grasp failing on this ends with."""
+        return _GRIP_CODES[self]
+
+
+_GRIP_CODES = {
+    Grip.HELD: Code.OK,
+    Grip.EMPTY: Code.GRASP_MISSED,
+    Grip.HAND_COLLISION: Code.HAND_COLLISION,
+    Grip.MOVING: Code.GRASP_MISSED,
+    Grip.LOST: Code.GRASP_LOST,
+}
+
+
+class Sight(Enum):
+    """What the camera says of an object after its lift."""
+
+    RISEN = "risen"
+    GONE = "gone from its place"
+    STILL_THERE = "still there"
+    ASKEW = "held elsewhere than planned"
+    BLIND = "no frame"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A judgement with its reason in a sentence; after a `final` one another try would not help."""
+
+    code: Code
+    reason: str
+    final: bool = False
+
+    @property
+    def ok(self) -> bool:
+        """Whether what was hoped for is so."""
+        return self.code is Code.OK
+
+
+def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> tuple[Grip, str]:
+    """Held, empty, moving, or the hand on top of the object.
+
+    Args:
+        e: What the gripper says.
+        config: Thresholds.
+        was_held: The object was held before: an empty hand has lost it.
+
+    Returns:
+        The judgement and its reason with values and limits.
+    """
+    empty = Grip.LOST if was_held else Grip.EMPTY
+    gap, width = f"gap {e.gap * 1e3:.1f} mm", f"the object's {e.expected * 1e3:.1f} mm"
+    if e.tcp_error > config.max_tcp_error:
+        off, limit = e.tcp_error * 1e3, config.max_tcp_error * 1e3
+        return Grip.HAND_COLLISION, f"the hand is {off:.1f} mm from the grasp, expected at most {limit:.0f} mm"
+    if e.gap <= config.closed_below:
+        return empty, f"{gap}: the fingers are closed on nothing"
+    if e.gap > e.expected + config.width_tolerance:
+        return Grip.HAND_COLLISION, f"{gap} is wider than {width}: the fingers are not around it"
+    if e.gap < e.expected - config.width_tolerance:
+        return empty, f"{gap} is narrower than {width}: something else is between the fingers"
+    if abs(e.speed) >= config.max_speed:
+        return Grip.MOVING, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest"
+    if config.use_effort and abs(e.effort) <= config.min_effort:
+        return empty, f"{gap}, but the fingers press with {abs(e.effort):.1f} N, expected over {config.min_effort:g} N"
+    if config.use_finger_force and min(e.pads, default=0.0) < config.min_pad_force:
+        felt = f"a finger pad feels {min(e.pads):.1f} N" if e.pads else "no sensor tells what the finger pads feel"
+        return empty, f"{gap}, but {felt}, expected {config.min_pad_force:g} N on each (held.use_finger_force)"
+    force = f", {abs(e.effort):.0f} N" if config.use_effort else ""
+    return Grip.HELD, f"{gap} for {e.expected * 1e3:.1f} mm{force}: held"
+
+
+def judge_sight(
+    before: Detection,
+    frames: Sequence[Frame],
+    config: HeldConfig,
+    *,
+    match_radius: float,
+    others: Sequence[Detection] = (),
+) -> tuple[Sight, str]:
+    """Whether the camera still sees the object at its old place, sees it higher, or not there any more.
+
+    Args:
+        before: The object as it was before the grasp.
+        frames: Taken after the lift, straight up; a detector may miss what it still sees in the next.
+        config: Thresholds.
+        match_radius: Horizontal distance that counts as the old place, m.
+        others: What else stood there; those like the object are not taken for it.
+    """
+    if not frames:
+        return Sight.BLIND, "no camera frame after the lift"
+    twins = [d for d in others if d.label == before.label]
+    same = [
+        d
+        for frame in frames
+        for d in frame.detections
+        if d.label == before.label and all(apart(d, twin) > match_radius for twin in twins)
+    ]
+    if not same:
+        return Sight.GONE, f"{before.label!r} has gone from its place"
+    # The top counts: a detector may take the visible part of a lifted object for a box that reaches down to the table.
+    highest = max(same, key=lambda d: d.top)
+    risen = highest.top - before.top
+    if risen >= config.rise:
+        text = f"{before.label!r} is seen {risen * 1e3:.0f} mm higher"
+        off = sticks_out(highest, before)
+        if off > config.askew:
+            limit = f"expected at most {config.askew * 1e3:.0f} mm"
+            return Sight.ASKEW, f"{text}, {off * 1e3:.0f} mm out of where the hand should hold it, {limit}"
+        return Sight.RISEN, text
+    distance = min(apart(d, before) for d in same)
+    if distance <= match_radius:
+        return Sight.STILL_THERE, f"{before.label!r} still stands at its place ({distance * 1e3:.0f} mm from it)"
+    return Sight.GONE, f"{before.label!r} has left its place ({distance * 1e3:.0f} mm)"
+
+
+def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) -> tuple[bool, str]:
+    """Whether the object still stands where it was seen, as far as the hand above it lets the camera see.
+
+    Args:
+        before: The object as it was seen before.
+        frames: Taken since; the newest counts.
+        config: Thresholds.
+    """
+    near = (d for d in frames[-1].detections if d.label == before.label) if frames else ()
+    nearest = min(near, key=lambda d: apart(d, before), default=None)
+    if nearest is None or apart(nearest, before) > _ELSEWHERE:
+        return True, "the hand hides the object"
+    if max(nearest.size[:2]) > max(before.size[:2]) + config.moved:
+        return True, "the hand is in front of the object: what is seen is larger than it"
+    off, limit = sticks_out(nearest, before) * 1e3, config.moved * 1e3
+    if off > limit:
+        return False, f"{before.label!r} has moved: it reaches {off:.0f} mm out of where it stood, expected {limit:.0f}"
+    return True, f"{before.label!r} still stands there"
+
+
+def judge_lift(grip: tuple[Grip, str], sight: tuple[Sight, str]) -> Verdict:
+    """A lift counts only when hand and camera agree."""
+    if grip[0] is not Grip.HELD:
+        return Verdict(grip[0].code, grip[1])
+    if sight[0] in (Sight.RISEN, Sight.GONE):
+        return Verdict(Code.OK, f"{grip[1]}; {sight[1]}")
+    code = Code.STALE_DATA if sight[0] is Sight.BLIND else Code.GRASP_MISSED
+    return Verdict(code, f"{grip[1]}, but {sight[1]}")
+
+
+def judge_place(
+    label: str,
+    p_target: Array,
+    frames: Sequence[Frame],
+    tolerance: float,
+    yaw: float | None = None,
+    height: float | None = None,
+) -> Verdict:
+    """Whether the camera sees the object at the place target after the arm has left.
+
+    Args:
+        label: Of the object.
+        p_target: (3,) where its footprint centre shall stand, base frame, m; z is that of the table.
+        frames: Taken after the arm has left; the newest that shows the object counts.
+        tolerance: Largest horizontal distance, m.
+        yaw: Of its x axis, where one was asked for, rad; what looks square or round is not judged by it.
+        height: Of the object as it stood, m: one of another height lies on its side. None: it is not judged.
+    """
+    if not frames:
+        return Verdict(Code.STALE_DATA, "no camera frame after the place")
+    same = next(
+        (found for frame in reversed(frames) if (found := [d for d in frame.detections if d.label == label])), ()
+    )
+    if not same:
+        return Verdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
+    nearest = min(same, key=lambda d: float(np.linalg.norm((d.p_base - p_target)[:2])))
+    distance = float(np.linalg.norm((nearest.p_base - p_target)[:2]))
+    text = f"{label!r} stands {distance * 1e3:.0f} mm from its target"
+    if distance > tolerance:
+        return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
+    top = nearest.top - float(p_target[2])
+    if height is not None and abs(top - height) > UPRIGHT_WITHIN:
+        was = f"it is {top * 1e3:.0f} mm high there and was {height * 1e3:.0f} mm"
+        return Verdict(Code.PLACE_FAILED, f"{label!r} has fallen over: {was}", final=True)
+    if yaw is not None and abs(float(nearest.size[0] - nearest.size[1])) > SQUARE_WITHIN:
+        off = abs((nearest.yaw - yaw + np.pi / 2.0) % np.pi - np.pi / 2.0)
+        text += f", turned {np.degrees(off):.0f}° from what was asked"
+        if off > YAW_TOLERANCE:
+            return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {np.degrees(YAW_TOLERANCE):.0f}°")
+    return Verdict(Code.OK, text)

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ways to take hold of an upright box: top-down and leaning grasps across its faces, in order of preference.
+
+What is round is taken hold of from any side.
+
+All poses are of the tool centre point (TCP) in the base frame. The tool's z axis is the approach direction (out of the
+fingers) and its y axis the opening axis; orientations are built from those two directions, never from Euler angles. The
+opening axis is always horizontal, so both fingers close at one height and the object is not tipped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from math import cos, hypot, radians, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.config import ApproachConfig, GraspConfig, HandConfig
+from openarm_grasp.evidence.observation import Detection
+
+Array = NDArray[np.float64]
+
+UP = np.array([0.0, 0.0, 1.0])
+#: Below every difference that a tilt makes: a candidate that has failed is tried after all that have not.
+USED_PENALTY = 10.0
+#: A tilt of 15° costs more than width and side together can win back.
+_TILT_COST_PER_RAD = 2.0
+_WIDTH_WEIGHT = 0.15
+_SIDE_WEIGHT = 0.15
+_ROOM_WEIGHT = 0.15
+#: More room than this beside a finger is as good as this, m.
+_ROOM = 0.04
+#: Half of a finger's thickness, m.
+_FINGER = 0.010
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box that motion planning keeps clear of, or that the hand carries.
+
+    Attributes:
+        id: Shown in refusals.
+        T_frame_box: (4, 4) pose of its centre; the user says in which frame.
+        size: (3,) full edges, m.
+    """
+
+    id: str
+    T_frame_box: Array
+    size: Array
+
+
+@dataclass(frozen=True)
+class GraspCandidate:
+    """One way to take hold of the object.
+
+    Attributes:
+        id: Names edge (of what is round, the direction in degrees), flip, tilt and lean, for example
+            "red/x+/tilt15/lean-", "red/x+/tilt0" or "red/30+/tilt0".
+        T_base_tcp: (4, 4) pose of the TCP at the grasp.
+        approach_offset: (3,) from the grasp to the pre-grasp, base frame, m.
+        retreat_offset: (3,) from the grasp to the end of the lift, base frame, m.
+        width: Extent of the object between the fingers, m.
+        tilt: Lean of the approach from straight down, rad.
+        score: Higher is tried first; the sum of `parts`.
+        parts: What the score is made of.
+    """
+
+    id: str
+    T_base_tcp: Array
+    approach_offset: Array
+    retreat_offset: Array
+    width: float
+    tilt: float
+    score: float
+    parts: Mapping[str, float]
+
+
+def tcp_height(height: float, tilt: float, hand: HandConfig) -> float:
+    """Height of the TCP above the surface the object stands on, m.
+
+    The largest of three: the finger tips clear the surface, the pads meet the object's middle, the palm clears its top.
+
+    Args:
+        height: Of the object, m.
+        tilt: Of the approach from straight down, rad.
+        hand: Measures of the gripper.
+    """
+    tips = hand.tip_clearance + hand.tip_clearance_tilted * sin(tilt)
+    pads = height / 2.0 - hand.pad_centre
+    palm = height - hand.palm_depth + hand.palm_depth_tilted * sin(tilt)
+    return max(tips, pads, palm)
+
+
+def graspable_edges(target: Detection, limits: ApproachConfig) -> list[tuple[str, Array, float]]:
+    """Footprint directions across which the hand fits: both edges of a box, all around what is round.
+
+    Returns:
+        Name, horizontal unit direction (3,) in the base frame, and width in m of each.
+
+    Raises:
+        OpenArmError: TOO_WIDE, with the widths and the limit, when there is none.
+    """
+    fitting = [edge for edge in _edges(target, limits) if _fits(edge[2], limits)]
+    if not fitting:
+        raise OpenArmError(
+            Code.TOO_WIDE,
+            f"{target.label!r} is {target.size[0] * 1e3:.0f} mm × {target.size[1] * 1e3:.0f} mm wide;"
+            f" the hand grasps sides up to {limits.max_width * 1e3:.0f} mm",
+        )
+    return fitting
+
+
+def wide_edges(target: Detection, limits: ApproachConfig) -> list[tuple[str, float]]:
+    """Name and width, m, of the edges across which the hand does not fit."""
+    return [(name, width) for name, _, width in _edges(target, limits) if not _fits(width, limits)]
+
+
+def _edges(target: Detection, limits: ApproachConfig) -> list[tuple[str, Array, float]]:
+    if target.round:
+        turns = np.arange(round(180.0 / limits.round_step_deg)) * limits.round_step_deg
+        return [(f"{turn:g}", se3.rot_z(radians(turn))[:, 0], float(target.size[:2].mean())) for turn in turns]
+    return [(name, target.T_base_object[:3, axis], float(target.size[axis])) for axis, name in enumerate("xy")]
+
+
+def _fits(width: float, limits: ApproachConfig) -> bool:
+    return width <= limits.max_width + limits.width_noise
+
+
+def propose(
+    target: Detection,
+    config: GraspConfig,
+    *,
+    shoulder_xy: Sequence[float] = (0.0, 0.0),
+    used: frozenset[str] = frozenset(),
+    others: Sequence[Detection] = (),
+) -> tuple[GraspCandidate, ...]:
+    """Every grasp worth planning, best first.
+
+    Args:
+        target: The object; its lower face is the surface it stands on.
+        config: Parameters.
+        shoulder_xy: (2,) of the arm's shoulder in the base frame, m; leaning away from it reaches furthest.
+        used: Ids that have failed before; they come last.
+        others: What stands around it; hands whose fingers have room come first.
+
+    Raises:
+        OpenArmError: TOO_WIDE, when no side fits into the hand.
+    """
+    found: list[GraspCandidate] = []
+    for edge, direction, width in graspable_edges(target, config.approach):
+        room = _room(target.p_base, direction, others, config.hand)
+        for flip, tilt_deg, lean in product(("+", "-"), config.approach.tilts_deg, ("+", "-")):
+            if tilt_deg == 0.0 and lean == "-":
+                continue  # a vertical hand leans nowhere
+            name = f"{target.label}/{edge}{flip}/tilt{tilt_deg:g}" + (f"/lean{lean}" if tilt_deg else "")
+            y_tool = direction if flip == "+" else -direction
+            heading = np.cross(UP, direction) * (1.0 if lean == "+" else -1.0)
+            candidate = _candidate(name, target, config, y_tool, heading, radians(tilt_deg), width)
+            parts = {
+                **candidate.parts,
+                "side": _SIDE_WEIGHT * sin(candidate.tilt) * _outward(target.p_base, heading, shoulder_xy),
+                "room": _ROOM_WEIGHT * (min(room, _ROOM) / _ROOM - 1.0),
+                "used": -USED_PENALTY if name in used else 0.0,
+            }
+            found.append(replace(candidate, parts=parts, score=sum(parts.values())))
+    # Stable sort: equal scores keep the order of the edges, so the same scene gives the same plan.
+    return tuple(sorted(found, key=lambda c: -c.score))
+
+
+def _candidate(
+    name: str, target: Detection, config: GraspConfig, y_tool: Array, heading: Array, tilt: float, width: float
+) -> GraspCandidate:
+    z_tool = sin(tilt) * heading - cos(tilt) * UP
+    p = target.p_base.copy()
+    p[2] = target.bottom + tcp_height(float(target.size[2]), tilt, config.hand)
+    parts = {
+        "tilt": -_TILT_COST_PER_RAD * tilt,
+        "width": _WIDTH_WEIGHT * max(0.0, 1.0 - width / config.approach.max_width),
+    }
+    return GraspCandidate(
+        id=name,
+        T_base_tcp=se3.make(se3.rotation_from_z_y(z_tool, y_tool), p),
+        approach_offset=-config.approach.pregrasp_distance * z_tool,
+        retreat_offset=config.approach.lift_height * UP,
+        width=width,
+        tilt=tilt,
+        score=sum(parts.values()),
+        parts=parts,
+    )
+
+
+def hold_of(candidate: GraspCandidate) -> str:
+    """The hold of a grasp, whatever its tilt: label and edge."""
+    return "/".join(candidate.id.split("/")[:2])
+
+
+def _outward(p_base: Array, heading: Array, shoulder_xy: Sequence[float]) -> float:
+    """Cosine between the lean and the direction from the shoulder to the object, -1 to 1."""
+    x, y = float(p_base[0]) - shoulder_xy[0], float(p_base[1]) - shoulder_xy[1]
+    distance = hypot(x, y)
+    return (float(heading[0]) * x + float(heading[1]) * y) / distance if distance > 1e-6 else 0.0
+
+
+def _room(p_base: Array, direction: Array, others: Sequence[Detection], hand: HandConfig) -> float:
+    """Least distance between an open finger and what stands around, seen from above, m; negative: it does not fit."""
+    least = np.inf
+    for side in (1.0, -1.0):
+        finger = p_base[:2] + side * (hand.opening + _FINGER) * direction[:2]
+        for d in others:
+            local = np.abs((finger - d.p_base[:2]) @ d.T_base_object[:2, :2]) - d.size[:2] / 2.0
+            outside = float(np.linalg.norm(np.maximum(local, 0.0)))
+            least = min(least, (outside or float(local.max())) - _FINGER)
+    return least
+
+
+def target_box(target: Detection, config: GraspConfig) -> Box:
+    """The object itself as an obstacle that the fingers may touch, base frame.
+
+    Its lower face is raised by `table_gap`, so that an object standing on the table is not in collision with it.
+    """
+    gap = min(config.approach.table_gap, float(target.size[2]) / 2.0)
+    T = target.T_base_object.copy()
+    T[2, 3] += gap / 2.0
+    return Box(f"target/{target.label}", T, target.size - np.array([0.0, 0.0, gap]))
+
+
+def obstacle_boxes(others: Sequence[Detection], config: GraspConfig) -> tuple[Box, ...]:
+    """Other objects in view as obstacles, a little inflated, base frame."""
+    margin = config.approach.obstacle_margin
+    boxes: list[Box] = []
+    for i, d in enumerate(others):
+        T = d.T_base_object.copy()
+        T[2, 3] += margin / 2.0
+        boxes.append(Box(f"detected/{d.label}_{i}", T, d.size + np.array([2.0 * margin, 2.0 * margin, margin])))
+    return tuple(boxes)
+
+
+def held_box(target: Detection, candidate: GraspCandidate, config: GraspConfig) -> Box:
+    """The object in the closed hand, TCP frame."""
+    box = target_box(target, config)
+    return Box(box.id, se3.inverse(candidate.T_base_tcp) @ box.T_frame_box, box.size)
+
+
+def shifted(T: Array, offset: Array) -> Array:
+    """The pose (4, 4) moved by an offset (3,) in its parent frame."""
+    moved = T.copy()
+    moved[:3, 3] += offset
+    return moved

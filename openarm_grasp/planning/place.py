@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where to put an object down, and how the hand stands there.
+
+The object keeps its place in the hand: ``T_base_tcp(place) = T_base_object(place) @ inv(T_base_object(grasp)) @
+T_base_tcp(grasp)``. It is let go a hair above touching, and its yaw is free, so that a hand that could not stand one
+way may stand another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.evidence.evidence import SQUARE_WITHIN
+from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.planning.candidates import UP, GraspCandidate, hold_of
+
+Array = NDArray[np.float64]
+
+#: Spots nearer to each other than this are one, m.
+_SAME_SPOT = 0.02
+
+
+@dataclass(frozen=True)
+class PlaceTarget:
+    """One way to put the object down.
+
+    Attributes:
+        id: Names the spot and the turn, for example "spot0/yaw+30".
+        T_base_tcp: (4, 4) pose of the TCP at release.
+        position: (3,) of the footprint centre on the table, base frame, m.
+        yaw_offset: Turn of the object against its yaw at the grasp, rad.
+        approach_offset: (3,) from the release to where the straight way down begins, base frame, m.
+        retreat_offset: (3,) from the release to the end of the straight way back, base frame, m.
+        score: Higher is tried first.
+    """
+
+    id: str
+    T_base_tcp: Array
+    position: Array
+    yaw_offset: float
+    approach_offset: Array
+    retreat_offset: Array
+    score: float
+
+
+def place_targets(
+    target: Detection,
+    candidate: GraspCandidate,
+    spots: Sequence[Array],
+    config: GraspConfig,
+    used: Sequence[PlaceTarget] = (),
+    *,
+    yaw: float | None = None,
+) -> tuple[PlaceTarget, ...]:
+    """Hand poses that put the object on each of the spots, best first: earlier spots, then smaller turns.
+
+    Args:
+        target: The object as it stood at the grasp.
+        candidate: How it is held.
+        spots: (2,) or (3,) footprint centres, base frame, m, best first; z is not read.
+        config: Parameters.
+        used: Targets that have failed before: their spots (where there are others) or turns come last.
+        yaw: Of the object's x axis about the base z when it stands there, rad; None: any.
+    """
+    T_object_tcp = se3.inverse(target.T_base_object) @ candidate.T_base_tcp
+    yaws = yaw_offsets(config.place.yaw_step_deg) if yaw is None or target.round else turns_to(target, yaw)
+    # Small turns of every spot come first: a hopeless spot must not use up the planner's patience. Turns of one spot
+    # score alike, so that the planner takes the one that is near.
+    n = len(spots)
+    ranked = [
+        (2 * n * _failed(used, spot, yaw, any_turn=n > 1) + n * (abs(yaw) > np.pi / 4.0) + i, i, yaw)
+        for i, spot in enumerate(spots)
+        for yaw in yaws
+    ]
+    order = sorted(ranked, key=lambda r: r[0])
+    found: list[PlaceTarget] = []
+    for rank, i, yaw in order:
+        x, y = float(spots[i][0]), float(spots[i][1])
+        p = np.array([x, y, target.p_base[2] + config.place.release_height])
+        T_base_tcp = se3.make(se3.rot_z(yaw) @ target.T_base_object[:3, :3], p) @ T_object_tcp
+        found.append(
+            PlaceTarget(
+                id=f"spot{i}/yaw{np.degrees(yaw):+.0f}",
+                T_base_tcp=T_base_tcp,
+                position=np.array([x, y, target.bottom]),
+                yaw_offset=yaw,
+                approach_offset=config.approach.pregrasp_distance * UP,
+                retreat_offset=-config.approach.pregrasp_distance * T_base_tcp[:3, 2],
+                score=-float(rank),
+            )
+        )
+    return tuple(found)
+
+
+def other_grasps(
+    offered: Sequence[GraspCandidate], failed: GraspCandidate, code: Code, target: Detection, yaw: float | None
+) -> tuple[GraspCandidate, ...]:
+    """What to try when a grasp can be planned, but nowhere to put the object with it.
+
+    Hands that stand alike at the place have its fate: where turns are free, those whose approach leans alike; else
+    those that differ by a turn after which the object looks the same. A search that found no path says nothing about
+    them: it began elsewhere.
+
+    Args:
+        offered: Grasps that were offered to the planner.
+        failed: The one that it chose.
+        code: Why the place was refused.
+        target: The object as it stands.
+        yaw: How it is wanted, rad; None: any.
+    """
+    if code is Code.NO_PLAN:
+        return tuple(c for c in offered if hold_of(c) != hold_of(failed))
+    step = 0.0 if yaw is None or target.round else symmetry(target)
+    return tuple(c for c in offered if not _stands_alike(c, failed, step))
+
+
+def _stands_alike(a: GraspCandidate, b: GraspCandidate, step: float) -> bool:
+    """Whether two hands differ by a turn about the vertical, of whole steps (rad; 0: of any angle)."""
+    R_a, R_b = a.T_base_tcp[:3, :3], b.T_base_tcp[:3, :3]
+    if not np.allclose(R_a[2], R_b[2], atol=1e-6):
+        return False
+    if step == 0.0:
+        return True
+    (ax, ay), (bx, by) = R_a[:2, 1], R_b[:2, 1]
+    steps = np.arctan2(ax * by - ay * bx, ax * bx + ay * by) / step
+    return abs(steps - round(steps)) < 1e-6
+
+
+def symmetry(target: Detection) -> float:
+    """Turn after which a box looks the same, rad: half of one, a quarter for a square."""
+    return np.pi / 2.0 if abs(float(target.size[0] - target.size[1])) < SQUARE_WITHIN else np.pi
+
+
+def _failed(used: Sequence[PlaceTarget], spot: Array, yaw: float, *, any_turn: bool) -> bool:
+    return any(
+        np.linalg.norm(t.position[:2] - spot[:2]) < _SAME_SPOT and (any_turn or abs(t.yaw_offset - yaw) < 1e-6)
+        for t in used
+    )
+
+
+def yaw_offsets(step_deg: float) -> tuple[float, ...]:
+    """Turns to try, rad, in (-pi, pi]: 0, then ± one step, ± two steps, and so on."""
+    offsets = [0.0]
+    k = 1
+    while k * step_deg < 180.0 - 1e-9:
+        offsets += [float(np.radians(k * step_deg)), -float(np.radians(k * step_deg))]
+        k += 1
+    if abs(k * step_deg - 180.0) < 1e-9:
+        offsets.append(float(np.pi))
+    return tuple(offsets)
+
+
+def turns_to(target: Detection, yaw: float) -> tuple[float, ...]:
+    """Turns that give a box a yaw, rad, smallest first; it looks the same after half a turn, a square one a quarter."""
+    step = symmetry(target)
+    first = (yaw - target.yaw) % step
+    turns = [(first + k * step + np.pi) % (2.0 * np.pi) - np.pi for k in range(round(2.0 * np.pi / step))]
+    return tuple(sorted((float(turn) for turn in turns), key=abs))
+
+
+def free_spots(arm: str, target: Detection, others: Sequence[Detection], config: GraspConfig) -> tuple[Array, ...]:
+    """Free spots on the arm's side of the table, best first.
+
+    A spot keeps its distance from every other object and from where the object came. Those come first that leave room
+    for a hand around the others; among them, room around it counts (up to twice the distance asked for) and nearness to
+    where it came from, which keeps the carry short.
+
+    Args:
+        arm: "left" (y > 0) or "right".
+        target: The object as it stood at the grasp.
+        others: Other objects in view.
+        config: Parameters.
+
+    Raises:
+        OpenArmError: PLACE_FAILED, when nothing is free.
+    """
+    place = config.place
+    side = 1.0 if arm == "left" else -1.0
+    ranked: list[tuple[bool, float, float, float]] = []
+    for x in grid(*place.region_x, place.spot_step):
+        for abs_y in grid(*place.region_abs_y, place.spot_step):
+            spot = np.array([x, side * abs_y])
+            origin = float(np.linalg.norm(spot - target.p_base[:2]))
+            room = min((float(np.linalg.norm(spot - d.p_base[:2])) for d in others), default=np.inf)
+            if origin < place.origin_distance or room < place.neighbour_distance:
+                continue
+            cost = origin - min(room, 2.0 * place.neighbour_distance)
+            ranked.append((room < place.neighbour_room, cost, x, side * abs_y))
+    if not ranked:
+        raise OpenArmError(
+            Code.PLACE_FAILED,
+            f"no free spot for the {arm} arm: none is {place.neighbour_distance * 1e3:.0f} mm from"
+            f" {len(others)} other objects and {place.origin_distance * 1e3:.0f} mm from where it stood",
+        )
+    # Six spots side by side would share one fate, so those offered lie apart.
+    chosen: list[Array] = []
+    for _, _, x, y in sorted(ranked):
+        spot = np.array([x, y])
+        if all(np.linalg.norm(spot - other) >= 1.9 * place.spot_step for other in chosen):
+            chosen.append(spot)
+        if len(chosen) == place.spots:
+            break
+    return tuple(chosen)
+
+
+def check_position(
+    position: Sequence[float],
+    target: Detection,
+    others: Sequence[Detection],
+    table_x: tuple[float, float],
+    table_y: tuple[float, float],
+) -> Array:
+    """A place position that a user asked for.
+
+    Args:
+        position: x, y (and a z that is not read), base frame, m.
+        target: The object that shall stand there.
+        others: Other objects in view.
+        table_x: Ends of the table top, base frame, m.
+        table_y: Its sides.
+
+    Returns:
+        (2,) position.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when it is not finite or not on the table; IN_COLLISION, when another object is
+            there.
+    """
+    p = np.asarray(position, dtype=np.float64)[:2]
+    half = float(min(target.size[:2])) / 2.0
+    (x_min, x_max), (y_min, y_max) = table_x, table_y
+    # Not finite compares false, too.
+    if not (x_min + half <= p[0] <= x_max - half and y_min + half <= p[1] <= y_max - half):
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"place position ({p[0]:.3f}, {p[1]:.3f}) m is not on the table: expected x in [{x_min + half:.3f},"
+            f" {x_max - half:.3f}] and y in [{y_min + half:.3f}, {y_max - half:.3f}] for {target.label!r}",
+        )
+    for d in others:
+        distance = float(np.linalg.norm(d.p_base[:2] - p))
+        if distance < half + float(min(d.size[:2])) / 2.0:
+            raise OpenArmError(
+                Code.IN_COLLISION,
+                f"{d.label!r} stands {distance * 1e3:.0f} mm from the place position ({p[0]:.3f}, {p[1]:.3f}) m:"
+                f" {target.label!r} does not fit there",
+            )
+    return p
+
+
+def grid(low: float, high: float, step: float) -> Array:
+    """Numbers from one end to the other, about a step apart."""
+    return np.linspace(low, high, max(2, round((high - low) / step) + 1))

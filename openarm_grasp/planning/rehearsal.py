@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans of what is not done yet: whether an arm could pick an object that stood somewhere, and put it somewhere else.
+
+Nothing moves. Ways with several parts are found so before their first part begins. Base frame, m, rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.planning.candidates import GraspCandidate, held_box, obstacle_boxes, propose, target_box
+from openarm_grasp.planning.place import PlaceTarget, other_grasps, place_targets
+from openarm_grasp.strategy.effects import PlanGrasp, Planned, PlanPlace
+from openarm_grasp.strategy.link import Link
+from openarm_grasp.strategy.memory import Surroundings
+
+Array = NDArray[np.float64]
+
+#: A plan that fails with one of these says that it cannot be done; with any other it was not found out.
+NO_WAY = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN, Code.TOO_WIDE)
+
+
+@dataclass(frozen=True)
+class Pick:
+    """A grasp that can be made, and its plan."""
+
+    candidate: GraspCandidate
+    plan: Planned
+
+
+class Rehearsal:
+    """Asks the planner.
+
+    Args:
+        link: To the planner.
+        around: Parameters and where the arms stand.
+    """
+
+    def __init__(self, link: Link, around: Surroundings) -> None:
+        self._link = link
+        self._around = around
+
+    async def pick(
+        self,
+        arm: str,
+        target: Detection,
+        others: Sequence[Detection],
+        offered: Sequence[GraspCandidate] | None = None,
+        now: Detection | None = None,
+    ) -> Pick:
+        """Plan a grasp of an object that stands there.
+
+        Args:
+            arm: Whose.
+            target: The object.
+            others: What else stands on the table.
+            offered: The grasps to choose from; every one when not given.
+            now: The object where it stands until then, when that is elsewhere.
+
+        Raises:
+            OpenArmError: One of `NO_WAY`; what the link raises.
+        """
+        config = self._around.config
+        offered = self._offered(arm, target, others) if offered is None else tuple(offered)
+        self._link.check()
+        gone = () if now is None else (target_box(now, config),)
+        effect = PlanGrasp(arm, offered, obstacle_boxes(others, config), target_box(target, config), gone)
+        plan = await self._link.plan(effect)
+        return Pick(offered[plan.chosen], plan)
+
+    def _offered(self, arm: str, target: Detection, others: Sequence[Detection]) -> tuple[GraspCandidate, ...]:
+        shoulder = self._around.shoulders.get(arm, (0.0, 0.0))
+        return propose(target, self._around.config, shoulder_xy=shoulder, others=others)
+
+    async def place(
+        self, arm: str, pick: Pick, target: Detection, others: Sequence[Detection], ways: Sequence[PlaceTarget]
+    ) -> PlaceTarget:
+        """Plan how an object that was picked so is put down one of these ways.
+
+        Raises:
+            OpenArmError: As `pick`.
+        """
+        config = self._around.config
+        self._link.check()
+        held = held_box(target, pick.candidate, config)
+        stood = (target_box(target, config),)
+        effect = PlanPlace(arm, tuple(ways), obstacle_boxes(others, config), held, pick.plan.retreat, stood)
+        return ways[(await self._link.plan(effect)).chosen]
+
+    async def pick_and_place(
+        self,
+        arm: str,
+        target: Detection,
+        others: Sequence[Detection],
+        spots: Sequence[Array],
+        *,
+        yaw: float | None = None,
+        used: Sequence[PlaceTarget] = (),
+    ) -> PlaceTarget:
+        """Plan a grasp, and how it ends on one of the spots; others are tried when one cannot be put down.
+
+        Args:
+            arm: Whose.
+            target: The object.
+            others: What else stands on the table.
+            spots: (2,) footprint centres, best first.
+            yaw: Of the object there; None: any.
+            used: Ways to put it down that are of no use.
+
+        Raises:
+            OpenArmError: As `pick`.
+        """
+        left = self._offered(arm, target, others)
+        refused: OpenArmError | None = None
+        while True:
+            try:
+                pick = await self.pick(arm, target, others, left)
+            except OpenArmError as error:
+                if refused is None or error.code not in NO_WAY:
+                    raise
+                raise refused from error
+            offered = place_targets(target, pick.candidate, spots, self._around.config, yaw=yaw)
+            ways = [way for way in offered if not any(_same(way, other, any_turn=target.round) for other in used)]
+            try:
+                if not ways:
+                    raise OpenArmError(Code.UNREACHABLE, "no other way to put it down is left")
+                return await self.place(arm, pick, target, others, ways)
+            except OpenArmError as error:
+                left = other_grasps(left, pick.candidate, error.code, target, yaw)
+                if error.code not in NO_WAY or not left:
+                    raise
+                refused = error
+
+
+def standing_at(target: Detection, xy: Sequence[float] | Array, turn: float = 0.0) -> Detection:
+    """The object as it would be seen elsewhere, turned by `turn` about the vertical; what is round looks the same."""
+    p = np.array([xy[0], xy[1], target.p_base[2]])
+    turn = 0.0 if target.round else turn
+    return replace(target, T_base_object=se3.make(se3.rot_z(turn) @ target.T_base_object[:3, :3], p))
+
+
+def _same(a: PlaceTarget, b: PlaceTarget, *, any_turn: bool) -> bool:
+    there = float(np.linalg.norm(a.position[:2] - b.position[:2])) < 1e-6
+    return there and (any_turn or abs(a.yaw_offset - b.yaw_offset) < 1e-6)

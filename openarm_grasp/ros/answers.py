@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What users of the client ask for, and what they are told. Base frame, m, rad."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from openarm_common.errors import Answer
+from openarm_grasp.planning.options import Option
+
+
+@dataclass(frozen=True)
+class GraspResult(Answer):
+    """How a grasp ended.
+
+    Success: the object was placed and seen there (dry run: it could be).
+
+    Attributes:
+        outcome: SUCCESS; PARTIAL: held, not placed as asked; FAILED; REFUSED: never touched; CANCELLED.
+        label: What was picked.
+        arm: The arm that was used, or "".
+        attempts: Physical attempts.
+        place_position: (x, y, z) of the target on the table, base frame, m.
+        duration: s of robot time.
+        route: "direct"; "hand_over": by way of the middle, with both arms; "push": pushed into reach; "" when it was
+            not placed.
+        options: Ways to grasp that were weighed for the newest plan, by arm, the preferred first; of one object only.
+    """
+
+    outcome: str
+    label: str
+    arm: str
+    attempts: int
+    place_position: tuple[float, float, float]
+    duration: float
+    route: str = ""
+    options: tuple[Option, ...] = ()
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """One of two objects that are picked at once.
+
+    Attributes:
+        label: What to pick.
+        arm: "auto", "left" or "right".
+        place: (x, y) or (x, y, z) of the footprint centre, base frame, m; z is not read. None lets a free spot be
+            chosen.
+        place_yaw: Of the object's x axis about the base z where it is put down, rad; None: as the hand likes.
+        object_at: (x, y) near which the object stands, base frame, m, when there are several alike.
+    """
+
+    label: str
+    arm: str = "auto"
+    place: Sequence[float] | None = None
+    place_yaw: float | None = None
+    object_at: Sequence[float] | None = None
+
+
+@dataclass(frozen=True)
+class PairResult(Answer):
+    """How two grasps that were asked for at once ended.
+
+    Success: of both; else the code is that of the first that failed.
+
+    Attributes:
+        outcome: SUCCESS; PARTIAL: one of them, or picked and not placed as asked; FAILED; REFUSED: none was touched;
+            CANCELLED.
+        at_once: Both arms worked at the same time.
+        answers: To each, in the order asked; none when they were not taken.
+        duration: s of robot time.
+    """
+
+    outcome: str
+    at_once: bool
+    answers: tuple[GraspResult, ...]
+    duration: float

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ask for grasps from plain Python: no node, no executor and no spinning in the caller's code."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from openarm_interfaces.action import Pick, PickTwo
+from openarm_interfaces.msg import GraspStatus, PickAnswer, PickRequest
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.client import BackgroundNode
+from openarm_common.ros.convert import point, xyz
+from openarm_grasp.ros.answers import GraspResult, PairResult, Wanted
+from openarm_grasp.ros.convert import option_from_msg
+
+OnFeedback = Callable[[GraspStatus], None]
+
+
+class GraspClient(BackgroundNode):
+    """Asks the grasp node; a context manager.
+
+    It brings its own ROS context, node and background thread, so it also works beside an rclpy program.
+
+    Args:
+        timeout: Longest wait for the grasp node to be there and to answer, s of wall clock.
+
+    Example:
+        ``with GraspClient() as grasp: print(grasp.pick("red").message)``
+    """
+
+    def __init__(self, *, timeout: float = 10.0) -> None:
+        super().__init__("grasp_client", timeout=timeout)
+        self._stop = threading.Event()
+
+    def pick(
+        self,
+        label: str = "",
+        *,
+        arm: str = "auto",
+        place: Sequence[float] | None = None,
+        place_yaw: float | None = None,
+        object_at: Sequence[float] | None = None,
+        leave: Sequence[Sequence[float]] = (),
+        phase: str = "all",
+        dry_run: bool = False,
+        time_limit: float = 0.0,
+        timeout: float = 300.0,
+        on_feedback: OnFeedback | None = None,
+    ) -> GraspResult:
+        """Pick an object and place it; returns when that has ended, well or not.
+
+        Args:
+            label: What to pick; "" takes the detection with the highest score.
+            arm: "auto", "left" or "right".
+            place: (x, y) or (x, y, z) of the footprint centre, base frame, m; z is not read. None lets a free spot be
+                chosen.
+            place_yaw: Of the object's x axis about the base z where it is put down, rad; None: as the hand likes.
+            object_at: (x, y) near which the object stands, base frame, m, when there are several alike.
+            leave: (x, y) of objects that stay where they are.
+            phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
+            dry_run: Plan and report, do not move.
+            time_limit: s of robot time; then it ends with TIMEOUT, the hand keeping what it holds. 0: none.
+            timeout: s of wall clock; then the grasp is cancelled.
+            on_feedback: Called with each `GraspStatus`, in the background thread; it may call `cancel`.
+
+        Returns:
+            The result; `raise_for_code` turns a failure into an exception.
+
+        Raises:
+            OpenArmError: NOT_READY, when no grasp node answers; TIMEOUT; INVALID_ARGUMENT, for a place that is not two
+                or three numbers.
+        """
+        goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run, phase=phase, timeout=time_limit)
+        _where(goal, place, place_yaw, object_at)
+        goal.leave = [point((p[0], p[1], 0.0)) for p in leave]
+        return _result(self._ask(Pick, "/grasp/pick", goal, timeout, on_feedback))
+
+    def pick_two(
+        self,
+        first: str | Wanted,
+        second: str | Wanted,
+        *,
+        dry_run: bool = False,
+        time_limit: float = 0.0,
+        timeout: float = 300.0,
+        on_feedback: OnFeedback | None = None,
+    ) -> PairResult:
+        """Pick two objects and place them, with both arms at the same time where planning allows that.
+
+        Args:
+            first: A label, or more about what is wanted.
+            second: Another.
+            dry_run: Plan and report, do not move.
+            time_limit: s of robot time for both; then they end with TIMEOUT, hands keeping what they hold. 0: none.
+            timeout: s of wall clock; then both are cancelled.
+            on_feedback: Called with each `GraspStatus`, which says of what label and arm it is, in the background
+                thread; it may call `cancel`.
+
+        Returns:
+            The result; `raise_for_code` turns a failure into an exception.
+
+        Raises:
+            OpenArmError: As `pick`.
+        """
+        goal = PickTwo.Goal(dry_run=dry_run, timeout=time_limit)
+        for request, wanted in zip(goal.requests, (first, second), strict=True):
+            wish = Wanted(wanted) if isinstance(wanted, str) else wanted
+            request.label, request.arm = wish.label, wish.arm
+            _where(request, wish.place, wish.place_yaw, wish.object_at)
+        answer: PickTwo.Result = self._ask(PickTwo, "/grasp/pick_two", goal, timeout, on_feedback)
+        return PairResult(
+            success=answer.success,
+            outcome=answer.outcome,
+            code=_code(answer.code),
+            message=answer.message,
+            at_once=answer.at_once,
+            answers=tuple(_result(one) for one in answer.answers),
+            duration=answer.duration,
+        )
+
+    def cancel(self) -> None:
+        """Ask what runs to stop; it returns with CANCELLED, the arms holding where they are."""
+        self._stop.set()
+
+    def _ask(self, kind: Any, name: str, goal: object, timeout: float, on_feedback: OnFeedback | None) -> Any:
+        """Send a goal and return its result message."""
+        self._stop.clear()
+        deliver = None if on_feedback is None else (lambda feedback: on_feedback(feedback.status))
+        return self.do(kind, name, goal, timeout=timeout, on_feedback=deliver, stop=self._stop)
+
+
+def _where(
+    request: Pick.Goal | PickRequest,
+    place: Sequence[float] | None,
+    place_yaw: float | None,
+    object_at: Sequence[float] | None,
+) -> None:
+    """Fill in where an object stands and where it shall stand."""
+    if place_yaw is not None:
+        request.has_place_yaw, request.place_yaw = True, place_yaw
+    if place is not None:
+        if len(place) not in (2, 3):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"place {list(place)} must be x, y or x, y, z in metres")
+        request.has_place_position = True
+        request.place_position = point((place[0], place[1], place[2] if len(place) == 3 else 0.0))
+    if object_at is not None:
+        request.has_object_position, request.object_position = True, point((object_at[0], object_at[1], 0.0))
+
+
+def _code(text: str) -> Code:
+    return Code(text) if text in Code.__members__ else Code.INTERNAL
+
+
+def _result(message: Pick.Result | PickAnswer) -> GraspResult:
+    x, y, z = (float(v) for v in xyz(message.place_position))
+    return GraspResult(
+        success=message.success,
+        outcome=message.outcome,
+        code=_code(message.code),
+        message=message.message,
+        label=message.label,
+        arm=message.arm,
+        attempts=message.attempts,
+        place_position=(x, y, z),
+        duration=message.duration,
+        route=message.route,
+        options=() if isinstance(message, PickAnswer) else tuple(map(option_from_msg, message.options)),
+    )

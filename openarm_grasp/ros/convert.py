@@ -1,0 +1,341 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Between messages and the frozen data of the core. Poses are in the base frame unless a name says otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from control_msgs.action import GripperCommand, ParallelGripperCommand
+from geometry_msgs.msg import Point
+from numpy.typing import NDArray
+from openarm_interfaces.action import MoveArm, Pick, PickTwo, PlanApproach
+from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspOption, GraspStatus, PickAnswer, PickRequest
+from openarm_interfaces.srv import ComputeIK, Grasp
+from sensor_msgs.msg import JointState
+from std_msgs.msg import ColorRGBA
+from vision_msgs.msg import Detection3DArray
+from visualization_msgs.msg import Marker, MarkerArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, point, pose_to_matrix, stamp_to_ns, vector, xyz
+from openarm_common.ros.node import BASE_FRAME
+from openarm_grasp.evidence.evidence import Verdict
+from openarm_grasp.evidence.observation import Detection, Frame
+from openarm_grasp.planning.candidates import Box, GraspCandidate
+from openarm_grasp.planning.options import NoWayError, Option
+from openarm_grasp.planning.place import PlaceTarget
+from openarm_grasp.strategy.effects import (
+    GoHome,
+    GraspOutcome,
+    GraspRequest,
+    MoveLinear,
+    PlanGrasp,
+    Planned,
+    PlanPlace,
+)
+from openarm_grasp.strategy.machine import GraspMachine
+from openarm_grasp.strategy.pair import PairOutcome
+
+Array = NDArray[np.float64]
+
+_CHOSEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
+_REFUSED = ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.35)
+_OFFERED = ColorRGBA(r=0.4, g=0.5, b=0.9, a=0.35)
+#: Shapes that are round seen from above when they stand; one that lies is seldom as long as wide.
+_ROUND, _AS_LONG_AS_WIDE = frozenset({"cylinder", "can", "sphere"}), 0.001
+
+
+# --- requests and answers
+def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
+    """The user's wish; a service request and an action goal have the same fields."""
+    return replace(
+        _wish(message),
+        dry_run=message.dry_run,
+        phase=message.phase or "all",
+        timeout=message.timeout,
+        leave=tuple((p.x, p.y) for p in message.leave),
+    )
+
+
+def requests_from_msg(goal: PickTwo.Goal) -> tuple[GraspRequest, GraspRequest]:
+    """Two wishes at once."""
+    first, second = (replace(_wish(item), dry_run=goal.dry_run, timeout=goal.timeout) for item in goal.requests)
+    return first, second
+
+
+def _wish(message: Grasp.Request | Pick.Goal | PickRequest) -> GraspRequest:
+    """What all of them say of an object and its place."""
+    p, at = message.place_position, message.object_position
+    return GraspRequest(
+        label=message.label,
+        arm=message.arm or "auto",
+        place=(p.x, p.y, p.z) if message.has_place_position else None,
+        place_yaw=message.place_yaw if message.has_place_yaw else None,
+        object_at=(at.x, at.y) if message.has_object_position else None,
+    )
+
+
+def fill_answer(answer: Grasp.Response | Pick.Result | PickAnswer, outcome: GraspOutcome) -> None:
+    """Write an outcome into a service response, an action result, or one of its answers."""
+    answer.success = outcome.success
+    answer.outcome = outcome.kind
+    answer.code = outcome.code.value
+    answer.message = outcome.message
+    answer.label = outcome.label
+    answer.arm = outcome.arm
+    answer.attempts = outcome.attempts
+    answer.place_position = point(outcome.place_position)
+    answer.duration = outcome.duration
+    answer.route = outcome.route
+    if not isinstance(answer, PickAnswer):
+        answer.options = [option_to_msg(option) for option in outcome.options]
+
+
+def option_to_msg(option: Option) -> GraspOption:
+    """How one way to grasp fared."""
+    return GraspOption(
+        id=option.id,
+        arm=option.arm,
+        score=option.score,
+        parts=list(option.parts),
+        values=list(option.parts.values()),
+        limit_margin=option.limit_margin,
+        code=str(option.code),
+        message=option.message,
+    )
+
+
+def option_from_msg(message: GraspOption) -> Option:
+    """The same, of an answer."""
+    return Option(
+        message.id,
+        message.arm,
+        message.score,
+        dict(zip(message.parts, message.values, strict=True)),
+        message.limit_margin,
+        message.code,
+        message.message,
+    )
+
+
+def pair_result(outcome: PairOutcome) -> PickTwo.Result:
+    """The answer to two wishes."""
+    result = PickTwo.Result(
+        success=outcome.success,
+        outcome=outcome.kind,
+        code=outcome.code.value,
+        message=outcome.message,
+        at_once=outcome.at_once,
+        duration=outcome.duration,
+    )
+    for one in outcome.answers:
+        answer = PickAnswer()
+        fill_answer(answer, one)
+        result.answers.append(answer)
+    return result
+
+
+def status_msg(machine: GraspMachine, t_ns: int, *, again: bool = False) -> GraspStatus:
+    """Where the grasp stands; when it is said again, it came from where it is."""
+    ended = machine.outcome
+    message = GraspStatus(
+        state=machine.state.value,
+        previous_state=machine.state.value if again else machine.previous.value,
+        reason=machine.reason,
+        attempt=machine.attempt,
+        label=ended.label if ended else machine.label,
+        arm=ended.arm if ended else machine.arm,
+    )
+    message.header.stamp = ns_to_stamp(t_ns)
+    message.header.frame_id = BASE_FRAME
+    return message
+
+
+# --- detections
+def frame_from_msg(message: Detection3DArray) -> Frame:
+    """One frame of detections, in the frame that its header names.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for a pose that is not one.
+    """
+    found: list[Detection] = []
+    for item in message.detections:
+        if not item.results:
+            continue
+        best = max(item.results, key=lambda r: r.hypothesis.score)
+        T, size = pose_to_matrix(item.bbox.center), xyz(item.bbox.size)
+        names = {r.hypothesis.class_id for r in item.results}
+        around = bool(names & _ROUND) and abs(float(size[0] - size[1])) < _AS_LONG_AS_WIDE
+        found.append(Detection(best.hypothesis.class_id, best.hypothesis.score, T, size, around))
+    return Frame(stamp_to_ns(message.header.stamp), tuple(found))
+
+
+# --- planning
+def box_to_msg(box: Box) -> CollisionBox:
+    """A collision box; its frame is the user's affair."""
+    return CollisionBox(id=box.id, pose=matrix_to_pose(box.T_frame_box), size=vector(box.size))
+
+
+def plan_goal(effect: PlanGrasp | PlanPlace, velocity_scale: float) -> PlanApproach.Goal:
+    """The planning goal of a grasp (the target may be touched, and is carried on the retreat) or of a place."""
+    return _grasp_goal(effect, velocity_scale) if isinstance(effect, PlanGrasp) else _place_goal(effect, velocity_scale)
+
+
+def _grasp_goal(effect: PlanGrasp, velocity_scale: float) -> PlanApproach.Goal:
+    return PlanApproach.Goal(
+        arm=effect.arm,
+        targets=_targets(effect.candidates),
+        obstacles=[box_to_msg(box) for box in (*effect.obstacles, effect.target)],
+        gone=[box_to_msg(box) for box in effect.gone],
+        touchable=[effect.target.id],
+        attached_after_approach=True,
+        velocity_scale=velocity_scale,
+    )
+
+
+def _place_goal(effect: PlanPlace, velocity_scale: float) -> PlanApproach.Goal:
+    start: list[float] = []
+    if effect.after is not None:
+        points = getattr(effect.after, "points", None)
+        if not points:
+            raise OpenArmError(Code.INTERNAL, f"{type(effect.after).__name__} is not a trajectory with points")
+        start = list(points[-1].positions)
+    return PlanApproach.Goal(
+        arm=effect.arm,
+        targets=_targets(effect.targets),
+        obstacles=[box_to_msg(box) for box in effect.obstacles],
+        attached=[box_to_msg(effect.held)],
+        gone=[box_to_msg(box) for box in effect.gone],
+        detached_after_approach=True,
+        start=start,
+        velocity_scale=velocity_scale,
+    )
+
+
+def _targets(ways: Iterable[GraspCandidate | PlaceTarget]) -> list[ApproachTarget]:
+    return [
+        ApproachTarget(
+            id=way.id,
+            pose=matrix_to_pose(way.T_base_tcp),
+            approach_offset=vector(way.approach_offset),
+            retreat_offset=vector(way.retreat_offset),
+            score=way.score,
+        )
+        for way in ways
+    ]
+
+
+def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
+    """A plan, or why there is none.
+
+    Raises:
+        OpenArmError: With the planner's code, when it found no plan; INTERNAL, when it chose what was not offered.
+    """
+    refusals = {r.id: Verdict(code_from_text(r.code, Code.NO_PLAN), r.message) for r in result.refusals}
+    if not result.success:
+        raise NoWayError(code_from_text(result.code, Code.NO_PLAN), result.message or "no plan", refusals)
+    if not 0 <= result.chosen < offered:
+        raise OpenArmError(Code.INTERNAL, f"the planner chose target {result.chosen} of {offered}")
+    return Planned(
+        result.chosen,
+        result.transfer,
+        result.approach,
+        result.retreat,
+        result.planning_time,
+        refusals,
+        tuple(result.limit_margins),
+    )
+
+
+def gripper_goal(
+    action: Literal["parallel", "classic"], joint: str, position: float, effort: float = 0.0
+) -> ParallelGripperCommand.Goal | GripperCommand.Goal:
+    """Goal of either gripper action: the driving finger at a position, m, with at most an effort, N.
+
+    An effort of 0 leaves it to the controller.
+    """
+    if action == "classic":
+        goal = GripperCommand.Goal()
+        goal.command.position, goal.command.max_effort = position, effort
+        return goal
+    command = JointState(name=[joint], position=[position], effort=[effort] if effort > 0.0 else [])
+    return ParallelGripperCommand.Goal(command=command)
+
+
+def reach_request(arm: str, T_base_tcp: Array) -> ComputeIK.Request:
+    """Ask how near an arm's TCP comes to a point, in any orientation."""
+    request = ComputeIK.Request(arm=arm, free_orientation=True)
+    request.pose.header.frame_id = BASE_FRAME
+    request.pose.pose = matrix_to_pose(T_base_tcp)
+    return request
+
+
+def reach_from_msg(arm: str, answer: ComputeIK.Response, T_base_tcp: Array) -> dict[str, float]:
+    """Distance in m by arm; empty when the answer says nothing about it."""
+    if answer.success:
+        return {arm: answer.position_error}
+    if answer.code != Code.UNREACHABLE:
+        return {}
+    return {arm: float(np.linalg.norm(xyz(answer.nearest.position) - T_base_tcp[:3, 3]))}
+
+
+def home_goal(arm: str, named: str, effect: GoHome, velocity_scale: float, max_wait: float = 0.0) -> MoveArm.Goal:
+    """A free path to a named posture; it may rest first for the other arm, s."""
+    return MoveArm.Goal(
+        arm=arm,
+        kind=MoveArm.Goal.NAMED,
+        named=named,
+        obstacles=[box_to_msg(box) for box in effect.obstacles],
+        hand_empty=True,
+        velocity_scale=velocity_scale,
+        max_wait=max_wait,
+    )
+
+
+def linear_goal(effect: MoveLinear, velocity_scale: float, max_wait: float = 0.0) -> MoveArm.Goal:
+    """A straight line of the TCP; it may rest first for the other arm, s."""
+    goal = MoveArm.Goal(
+        arm=effect.arm,
+        kind=MoveArm.Goal.LINEAR,
+        velocity_scale=velocity_scale,
+        hand_empty=True,
+        max_wait=max_wait,
+    )
+    goal.pose.header.frame_id = BASE_FRAME
+    goal.pose.pose = matrix_to_pose(effect.T_base_tcp)
+    return goal
+
+
+def code_from_text(text: str, otherwise: Code) -> Code:
+    """The code that a message names; `otherwise` for one that is not of the suite, or claims success in a failure."""
+    return Code(text) if text in Code.__members__ and text != Code.OK else otherwise
+
+
+# --- pictures
+def candidate_markers(
+    candidates: Sequence[GraspCandidate], chosen: str, refused: Collection[str], t_ns: int
+) -> MarkerArray:
+    """An arrow along each approach and a bar along its opening axis: the chosen one green, what was refused red."""
+    markers = [Marker(action=Marker.DELETEALL)]
+    for i, c in enumerate(candidates):
+        tip = c.T_base_tcp[:3, 3]
+        half = 0.5 * c.width * c.T_base_tcp[:3, 1]
+        color = _CHOSEN if c.id == chosen else _REFUSED if c.id in refused else _OFFERED
+        shaft = _points(tip + c.approach_offset, tip)
+        arrow = Marker(ns="approach", id=i, type=Marker.ARROW, color=color, points=shaft)
+        arrow.scale = vector((0.004, 0.008, 0.012))
+        bar = Marker(ns="opening", id=i, type=Marker.LINE_STRIP, color=color, points=_points(tip - half, tip + half))
+        bar.scale.x = 0.003
+        markers += [arrow, bar]
+    for marker in markers:
+        marker.header.frame_id = BASE_FRAME
+        marker.header.stamp = ns_to_stamp(t_ns)
+        marker.pose.orientation.w = 1.0
+    return MarkerArray(markers=markers)
+
+
+def _points(*positions: np.ndarray) -> list[Point]:
+    return [point(p) for p in positions]

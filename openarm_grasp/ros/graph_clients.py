@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The other nodes while a grasp runs: joint states, detections, action goals, and waits that always end.
+
+A wait ends by its condition, by a deadline of the wall clock, by a cancel, or because the robot went silent; it looks
+40 times a second. Robot time is the stamp of the joint states, so the node needs no /clock. /joint_states is subscribed
+only while a grasp runs, /detections_3d only in states that look.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.action import ActionClient
+from rclpy.subscription import Subscription
+from rclpy.task import Future
+from vision_msgs.msg import Detection3DArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.node import BASE_FRAME, BaseNode, reliable
+from openarm_common.ros.tf import RobotStateListener
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.evidence.hand import Silence
+from openarm_grasp.evidence.observation import Frame
+from openarm_grasp.ros import convert
+from openarm_grasp.ros.pad_listener import Pads
+from openarm_grasp.strategy.effects import Frames
+
+#: What the detector of the camera over the table finds.
+DETECTIONS = "/detections_3d"
+_TICK_S = 0.025
+#: A longer pause between two ticks is this process being starved, not the robot being silent.
+_STARVED_S = 0.2
+_STOP_LIMIT_S = 2.0
+#: An action server that is not in the graph at so many looks in a row is gone (1.5 s; a lost robot is noticed sooner).
+_GONE = 60
+
+
+class OtherNodes:
+    """Hears the robot and the detector, and sends goals.
+
+    Args:
+        node: The node that owns subscriptions, clients and the timer.
+        config: Parameters.
+    """
+
+    def __init__(self, node: BaseNode[Any], config: GraspConfig) -> None:
+        self._node = node
+        self._config = config
+        self.robot = RobotStateListener(node, node.description, joints=False)
+        self.pads = Pads(node)
+        self._detections: Subscription | None = None
+        self._topic = DETECTIONS
+        self._frames: list[Frame] = []
+        self._frame_id = BASE_FRAME
+        self._looking_since_ns = 0
+        self._next_tick = Future()
+        self._timer = node.create_timer(_TICK_S, self._on_tick, clock=node.wall_clock)
+        self._timer.cancel()
+        self._silence = Silence(_STARVED_S)
+        self._cancelled = self._active = False
+        if node.lockstep:
+            self._look(DETECTIONS)
+            self.stop_looking()
+
+    # --- begin, end, cancel
+    async def begin(self, missing: Callable[[], list[str]]) -> None:
+        """Listen to the robot and wait until nothing is missing any more.
+
+        Raises:
+            OpenArmError: NOT_READY, naming what is missing; CANCELLED.
+        """
+        self._cancelled = False
+        self._silence = Silence(_STARVED_S)
+        self._active = True
+        self.robot.enable(True)
+        self.pads.enable(self._config.held.use_finger_force)
+        self._timer.reset()
+        deadline = self._node.monotonic() + self._config.limits.ready_timeout
+        while faults := missing():
+            self.check()
+            if self._node.monotonic() > deadline:
+                raise OpenArmError(Code.NOT_READY, f"not ready: no {'; no '.join(faults)}")
+            await self.tick()
+
+    def end(self) -> None:
+        """Stop listening."""
+        if not self._active:
+            return
+        self._active = False
+        self.stop_looking()
+        self._timer.cancel()
+        self.robot.enable(False)
+        self.pads.enable(False)
+
+    def cancel(self) -> None:
+        """Let what is waited for end with CANCELLED."""
+        self._cancelled = True
+
+    @property
+    def now_ns(self) -> int:
+        """Robot time; 0 before the first joint state."""
+        return self.robot.buffer.latest()[0] if self.hears_joints else 0
+
+    @property
+    def hears_joints(self) -> bool:
+        """Whether a joint state has come since `begin`."""
+        return self.robot.age_s() < float("inf")
+
+    def sees(self, topic: str) -> bool:
+        """Whether somebody publishes detections there."""
+        return self._node.count_publishers(self._node.resolve_topic_name(topic)) > 0
+
+    # --- waiting
+    def _on_tick(self) -> None:
+        self._silence.look(self._node.monotonic(), self.now_ns if self.hears_joints else -1)
+        done, self._next_tick = self._next_tick, Future()
+        done.set_result(None)
+
+    async def tick(self) -> None:
+        """Sleep until the next look."""
+        await self._next_tick
+
+    def check(self) -> None:
+        """Raise when the grasp shall not go on.
+
+        Raises:
+            OpenArmError: CANCELLED or ROBOT_LOST.
+        """
+        if self._cancelled:
+            raise OpenArmError(Code.CANCELLED, "cancelled; the arm holds where it is and the hand keeps what it holds")
+        self._silence.check(self._config.limits.joint_state_timeout)
+
+    async def until(
+        self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        """Wait for a condition.
+
+        Args:
+            done: The condition.
+            limit: s of wall clock.
+            what: What is waited for, for the error.
+            guard: Called at each look; may raise.
+
+        Raises:
+            OpenArmError: TIMEOUT, CANCELLED, ROBOT_LOST, or from `guard`.
+        """
+        deadline = self._node.monotonic() + limit
+        while not done():
+            self.check()
+            if guard is not None:
+                guard()
+            if self._node.monotonic() > deadline:
+                raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
+            await self.tick()
+
+    async def goal(
+        self, client: ActionClient, goal: object, limit: float, what: str, guard: Callable[[], None] | None = None
+    ) -> Any:
+        """Send a goal and return its result message; whatever ends the wait early cancels the goal.
+
+        Raises:
+            OpenArmError: NOT_READY, without a server; EXECUTION_FAILED, when it rejects the goal; as `until`.
+        """
+        limits = self._config.limits
+        try:
+            await self.until(client.server_is_ready, limits.ready_timeout, what)
+        except OpenArmError as error:
+            if error.code is Code.TIMEOUT:
+                raise OpenArmError(Code.NOT_READY, f"{what}: its action server is not there") from error
+            raise
+        sent = client.send_goal_async(goal)
+        try:
+            await self.until(sent.done, limits.answer_timeout, f"{what}: acceptance of the goal")
+        except OpenArmError:
+            # Should it be accepted yet, it is withdrawn.
+            sent.add_done_callback(lambda f: f.result().cancel_goal_async() if f.result().accepted else None)
+            raise
+        handle: Any = sent.result()
+        if not handle.accepted:
+            raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the goal was rejected")
+        result = handle.get_result_async()
+        missed = 0
+
+        def watch() -> None:
+            nonlocal missed
+            missed = 0 if client.server_is_ready() else missed + 1
+            if missed > _GONE:
+                raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: its action server is gone")
+            if guard is not None:
+                guard()
+
+        try:
+            await self.until(result.done, limit, what, watch)
+        except OpenArmError as error:
+            handle.cancel_goal_async()
+            deadline = self._node.monotonic() + (0.0 if error.code is Code.ROBOT_LOST else _STOP_LIMIT_S)
+            while not result.done() and self._node.monotonic() < deadline:
+                await self.tick()
+            raise
+        return result.result().result
+
+    # --- looking
+    async def observe(self, count: int, topic: str, limit: float) -> Frames:
+        """Collect frames of detections that are taken from now on; `limit` is s of wall clock.
+
+        Raises:
+            OpenArmError: STALE_DATA, when they do not come; CANCELLED; ROBOT_LOST.
+        """
+        self._frames = []
+        self._looking_since_ns = self.now_ns
+        self._look(topic)
+        try:
+            await self.until(lambda: len(self._frames) >= count, limit, "looking")
+        except OpenArmError as error:
+            if error.code is not Code.TIMEOUT:
+                raise
+            seen = f"{len(self._frames)} of {count} frames came from {topic} within {limit:g} s"
+            raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
+        return Frames(tuple(self._frames[-count:]), self._frame_id)
+
+    def _look(self, topic: str) -> None:
+        if self._detections is not None and self._topic != topic:
+            self.stop_looking()
+        if self._detections is None:
+            self._topic = topic
+            self._detections = self._node.create_subscription(Detection3DArray, topic, self._on_detections, reliable(5))
+
+    def _on_detections(self, message: Detection3DArray) -> None:
+        # What the camera took before this look began shows another state of the world.
+        if stamp_to_ns(message.header.stamp) < self._looking_since_ns:
+            return
+        try:
+            self._frames.append(convert.frame_from_msg(message))
+        except OpenArmError as error:
+            self._node.get_logger().warning(f"dropped a frame of detections: {error.message}")
+            return
+        self._frame_id = message.header.frame_id
+
+    def stop_looking(self) -> None:
+        """Leave /detections_3d, so that the detector may rest."""
+        if self._detections is not None:
+            self._node.destroy_subscription(self._detections)
+            self._detections = None

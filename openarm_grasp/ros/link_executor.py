@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot as the performer reaches it: joint states, detections, actions and services of the other nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from copy import copy
+from typing import Any
+
+import numpy as np
+from control_msgs.action import GripperCommand, ParallelGripperCommand
+from numpy.typing import NDArray
+from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
+from openarm_interfaces.srv import ComputeIK
+from rclpy.action import ActionClient
+from rclpy.task import Future
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.ros.node import BASE_FRAME, BaseNode
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.ros import convert
+from openarm_grasp.ros.graph_clients import DETECTIONS, OtherNodes
+from openarm_grasp.strategy import effects
+from openarm_grasp.strategy.effects import Frames, Planned, Trajectory
+from openarm_grasp.strategy.link import check_deadline
+
+Array = NDArray[np.float64]
+
+
+class GraphLink:
+    """Implements `Link` over the node graph.
+
+    Args:
+        node: The node that owns the clients.
+        config: Parameters.
+    """
+
+    def __init__(self, node: BaseNode[Any], config: GraspConfig) -> None:
+        self._node = node
+        self._config = config
+        self._nodes = OtherNodes(node, config)
+        self._plan = ActionClient(node, PlanApproach, "/motion/plan_approach")
+        self._execute = ActionClient(node, ExecuteTrajectory, "/motion/execute")
+        self._move = ActionClient(node, MoveArm, "/motion/move")
+        self._ik = node.create_client(ComputeIK, "/motion/compute_ik")
+        gripper_action = ParallelGripperCommand if config.gripper_action == "parallel" else GripperCommand
+        self._grippers = {
+            arm: ActionClient(node, gripper_action, f"/{arm}_gripper_controller/gripper_cmd") for arm in ARMS
+        }
+        self.deadline_ns = 0
+        #: Longest rest before a motion until the other arm leaves room, s; 0: the arms never move at once.
+        self.max_wait = 0.0
+
+    def beside(self) -> GraphLink:
+        """The same link for an arm that moves while the other does: its motions may rest first, its time is its own."""
+        link = copy(self)
+        link.max_wait = self._config.limits.beside_wait
+        return link
+
+    # --- begin, end, cancel
+    async def begin(self, *, moves: bool) -> None:
+        """Listen to the robot and wait until every node that a grasp needs is there.
+
+        Raises:
+            OpenArmError: NOT_READY, naming what is missing; CANCELLED.
+        """
+        await self._nodes.begin(lambda: self._missing(moves))
+
+    def end(self) -> None:
+        """Stop listening."""
+        self._nodes.end()
+
+    def close(self) -> None:
+        """Take the clients down."""
+        self._nodes.end()
+        for client in (self._plan, self._execute, self._move, *self._grippers.values()):
+            client.destroy()
+
+    def cancel(self) -> None:
+        """Let the running recipe end with CANCELLED and the arm hold."""
+        self._nodes.cancel()
+
+    def _missing(self, moves: bool) -> list[str]:
+        needed = {
+            "action /motion/plan_approach (motion node)": self._plan.server_is_ready(),
+            "action /motion/execute (motion node)": self._execute.server_is_ready(),
+            "action /motion/move (motion node)": self._move.server_is_ready(),
+            "publisher of /detections_3d (detector)": self._nodes.sees(DETECTIONS),
+            "/joint_states (bridge or robot driver)": self._nodes.hears_joints,
+        }
+        if moves:
+            for arm, client in self._grippers.items():
+                name = f"action /{arm}_gripper_controller/gripper_cmd (bridge or robot driver)"
+                needed[name] = client.server_is_ready()
+        return [what for what, there in needed.items() if not there]
+
+    # --- the robot
+    @property
+    def description(self) -> RobotDescription:
+        """The robot."""
+        return self._node.description
+
+    @property
+    def states(self) -> RobotStateBuffer:
+        """Its joint states."""
+        return self._nodes.robot.buffer
+
+    @property
+    def base_frame(self) -> str:
+        """Name of the base frame."""
+        return BASE_FRAME
+
+    @property
+    def now_ns(self) -> int:
+        """Robot time; 0 before the first joint state."""
+        return self._nodes.now_ns
+
+    def effort(self, joint: str) -> float:
+        """Newest effort of a joint, N or N m."""
+        return self._nodes.robot.efforts.get(joint, 0.0)
+
+    def pads(self, arm: str) -> tuple[float, ...]:
+        """Force on each finger pad of a hand, N; empty when no sensor tells it."""
+        return self._nodes.pads.of(arm)
+
+    def check(self) -> None:
+        """Raise when the grasp shall not go on."""
+        self._nodes.check()
+        check_deadline(self.now_ns, self.deadline_ns)
+
+    def warn(self, text: str) -> None:
+        """Write a warning into the log."""
+        self._node.get_logger().warning(text)
+
+    # --- waiting and looking
+    async def until(
+        self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        """Wait for a condition, `limit` s of wall clock."""
+        await self._nodes.until(done, limit, what, self._watched(guard))
+
+    def _watched(self, guard: Callable[[], None] | None) -> Callable[[], None]:
+        def look() -> None:
+            check_deadline(self.now_ns, self.deadline_ns)
+            if guard is not None:
+                guard()
+
+        return look
+
+    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
+        """Carry out several things at once."""
+        executor = self._node.executor
+        if executor is None:
+            raise OpenArmError(Code.INTERNAL, "the grasp node is not in an executor")
+        faults: list[Exception] = []
+
+        async def carry_out(part: Callable[[], Awaitable[None]]) -> None:
+            # An exception that leaves a task would stop the whole executor; it is raised below.
+            try:
+                await part()
+            except Exception as error:
+                faults.append(error)
+
+        tasks: list[Future] = [executor.create_task(carry_out, part) for part in parts]
+        # All end, also those beside one that failed: they watch the same cancel, robot and deadlines.
+        while not all(task.done() for task in tasks):
+            await self._nodes.tick()
+        if faults:
+            raise faults[0]
+
+    async def observe(self, count: int, *, near: bool = False) -> Frames:
+        """Frames of detections that are taken from now on."""
+        if not near:
+            return await self._nodes.observe(count, DETECTIONS, self._config.detect.frame_timeout)
+        config = self._config.near
+        if not self._nodes.sees(config.topic):
+            raise OpenArmError(Code.NOT_READY, f"nobody publishes {config.topic}")
+        return await self._nodes.observe(count, config.topic, config.timeout)
+
+    def stop_looking(self) -> None:
+        """Leave /detections_3d."""
+        self._nodes.stop_looking()
+
+    # --- planning and moving
+    async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
+        """Ask /motion/plan_approach."""
+        goal = convert.plan_goal(effect, self._config.velocity_scale)
+        what = f"{effect.arm} arm: planning"
+        result = await self._nodes.goal(self._plan, goal, self._config.limits.plan_timeout, what, self._watched(None))
+        return convert.planned_from_msg(result, len(goal.targets))
+
+    async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
+        """Ask /motion/compute_ik."""
+        if not self._ik.service_is_ready():
+            return {}
+        answered = self._ik.call_async(convert.reach_request(arm, T_base_tcp))
+        await self._nodes.until(answered.done, self._config.limits.answer_timeout, "/motion/compute_ik")
+        return convert.reach_from_msg(arm, answered.result(), T_base_tcp)
+
+    async def follow(
+        self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        """Ask /motion/execute."""
+        goal = ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_wait=self.max_wait)
+        await self._moved(self._execute, goal, what, guard)
+
+    async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
+        """Ask /motion/move for a straight line."""
+        goal = convert.linear_goal(effect, self._config.velocity_scale, self.max_wait)
+        await self._moved(self._move, goal, what)
+
+    async def move_named(self, arm: str, named: str, effect: effects.GoHome, what: str) -> None:
+        """Ask /motion/move for a free path to a posture."""
+        goal = convert.home_goal(arm, named, effect, self._config.velocity_scale, self.max_wait)
+        await self._moved(self._move, goal, what)
+
+    async def _moved(
+        self, client: ActionClient, goal: object, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        limit = self._config.limits.move_timeout + self.max_wait
+        result = await self._nodes.goal(client, goal, limit, what, self._watched(guard))
+        if not result.success:
+            code = convert.code_from_text(result.code, Code.EXECUTION_FAILED)
+            raise OpenArmError(code, f"{what}: {result.message or 'failed'}")
+
+    async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
+        """Ask the gripper's controller."""
+        goal = convert.gripper_goal(self._config.gripper_action, joint, position, effort)
+        limit = self._config.limits.gripper_timeout
+        result = await self._nodes.goal(self._grippers[arm], goal, limit, what, self._watched(None))
+        return bool(result.stalled or result.reached_goal)

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One arm's link to the robot while the other arm works, too: they look in turn, and one waits where the other stands.
+
+That two arms under way keep apart is proven by motion, which lets the later one rest first. What is left is an arm
+that stands in the way: the other waits until it has gone on. Two that wait for each other are parted: the one that
+comes second in the order of arms gives up, and goes home as after every failure. Base frame, m, rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription, Side
+from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.strategy import effects
+from openarm_grasp.strategy.effects import Frames, GoHome, Planned, Trajectory
+from openarm_grasp.strategy.link import Link
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+#: An arm that has turned a joint so far has gone on, rad.
+_GONE_ON = 0.1
+
+
+@dataclass
+class Company:
+    """What both links share.
+
+    Attributes:
+        waiting: Arms that wait until the other goes on.
+        looking: The arm that looks; "" when none does.
+        done: Arms whose work has ended.
+    """
+
+    waiting: set[str] = field(default_factory=set[str])
+    looking: str = ""
+    done: set[str] = field(default_factory=set[str])
+
+
+class BesideLink:
+    """Implements `Link` for one arm beside the other.
+
+    Args:
+        arm: Whose link.
+        link: To the robot, for this arm alone.
+        company: Shared with the other arm's link.
+        config: Parameters.
+    """
+
+    def __init__(self, arm: Side, link: Link, company: Company, config: GraspConfig) -> None:
+        self.arm: Side = arm
+        self._link, self._company, self._config = link, company, config
+        self._other: Side = "right" if arm == "left" else "left"
+        self._homes = {a: link.description.group_state(f"{a}_arm", config.home_state) for a in (arm, self._other)}
+        self.deadline_ns = 0
+
+    # --- the robot
+    @property
+    def description(self) -> RobotDescription:
+        """The robot."""
+        return self._link.description
+
+    @property
+    def states(self) -> RobotStateBuffer:
+        """Its joint states."""
+        return self._link.states
+
+    @property
+    def base_frame(self) -> str:
+        """Name of the base frame."""
+        return self._link.base_frame
+
+    @property
+    def now_ns(self) -> int:
+        """Robot time."""
+        return self._link.now_ns
+
+    def effort(self, joint: str) -> float:
+        """Newest effort of a joint, N or N m."""
+        return self._link.effort(joint)
+
+    def pads(self, arm: str) -> tuple[float, ...]:
+        """Force on each finger pad of a hand, N."""
+        return self._link.pads(arm)
+
+    def check(self) -> None:
+        """Raise when the work shall not go on."""
+        self._link.deadline_ns = self.deadline_ns
+        self._link.check()
+
+    def warn(self, text: str) -> None:
+        """Say something that does not stop the work."""
+        self._link.warn(f"{self.arm} arm: {text}")
+
+    # --- waiting and looking
+    async def until(
+        self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        """Wait for a condition."""
+        await self._link.until(done, limit, what, guard)
+
+    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
+        """Carry out several things at once."""
+        await self._link.together(parts)
+
+    async def observe(self, count: int, *, near: bool = False) -> Frames:
+        """Frames that are taken from now on.
+
+        An arm that looks from home (at what it is to grasp, or has placed) waits until the other one hides nothing any
+        more; one that is at work does not.
+        """
+        company, limit = self._company, self._config.limits.beside_timeout
+        if not near and self._is_home(self.arm):
+            await self.until(self._other_is_away, limit, f"looking: the {self._other} arm is in the view")
+        await self.until(lambda: company.looking in ("", self.arm), limit, "looking: the other arm's look")
+        company.looking = self.arm
+        try:
+            return await self._link.observe(count, near=near)
+        finally:
+            company.looking = ""
+            self._link.stop_looking()
+
+    def stop_looking(self) -> None:
+        """A look of this link ends by itself."""
+
+    # --- planning and moving
+    async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
+        """Plan; again when the other arm has gone on."""
+        return await self._patiently(lambda: self._link.plan(effect), "planning")
+
+    async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
+        """How far the arm's TCP stays from a point."""
+        return await self._link.reach(arm, T_base_tcp)
+
+    async def follow(
+        self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
+    ) -> None:
+        """Follow a planned trajectory, when there is room for it."""
+        await self._patiently(lambda: self._link.follow(arm, trajectory, what, guard), what)
+
+    async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
+        """Move the TCP on a straight line."""
+        await self._patiently(lambda: self._link.move_linear(effect, what), what)
+
+    async def move_named(self, arm: str, named: str, effect: GoHome, what: str) -> None:
+        """Move an arm on a free path to a posture."""
+        await self._patiently(lambda: self._link.move_named(arm, named, effect, what), what)
+
+    async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
+        """Move the fingers."""
+        return await self._link.grip(arm, joint, position, what, effort)
+
+    # --- the other arm
+    async def _patiently(self, work: Callable[[], Awaitable[T]], what: str) -> T:
+        end_ns = self.now_ns + round(self._config.limits.beside_timeout * 1e9)
+        while True:
+            try:
+                return await work()
+            except OpenArmError as error:
+                if error.code not in (Code.IN_COLLISION, Code.NO_PLAN) or self._other_is_away() or self.now_ns > end_ns:
+                    raise
+                if not await self._gone_on(what):
+                    raise
+
+    async def _gone_on(self, what: str) -> bool:
+        """Wait until the other arm has gone on; false when it waits for this one, and this one is to give way."""
+        company, before = self._company, self._pose(self._other)
+        gives_way = ARMS.index(self.arm) > 0
+
+        def over() -> bool:
+            moved = float(np.max(np.abs(self._pose(self._other) - before))) > _GONE_ON
+            return moved or self._other_is_away() or (gives_way and self._other in company.waiting)
+
+        company.waiting.add(self.arm)
+        try:
+            text = f"{what}: the {self._other} arm stands in the way"
+            await self.until(over, self._config.limits.beside_timeout, text)
+        finally:
+            company.waiting.discard(self.arm)
+        return not (gives_way and self._other in company.waiting)
+
+    def _pose(self, arm: Side) -> Array:
+        _, q = self.states.latest()
+        return np.array([q[name] for name in self._homes[arm]])
+
+    def _is_home(self, arm: Side) -> bool:
+        off = np.abs(self._pose(arm) - np.array(list(self._homes[arm].values())))
+        return float(np.max(off)) <= self._config.home_tolerance
+
+    def _other_is_away(self) -> bool:
+        return self._other in self._company.done or self._is_home(self._other)

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hand-over through the middle: one arm sets the object down where both reach, the other takes it from there.
+
+The way is planned before anything moves: the giver's grasp and a place in the middle, and from that place the taker's
+grasp and the place that was asked for. An object is seldom set down exactly where it was meant, so the taker must be
+able to go on from around that place, too. Base frame, m, rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.config import HandOverConfig
+from openarm_grasp.evidence.observation import Detection, Sighting
+from openarm_grasp.planning.place import PlaceTarget, grid
+from openarm_grasp.planning.rehearsal import NO_WAY, Rehearsal, standing_at
+from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.strategy.memory import Surroundings
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HandOver:
+    """A way through the middle that was planned to its end.
+
+    Attributes:
+        giver: The arm that brings the object to the middle.
+        taker: The arm that takes it from there.
+        spot: (2,) where it stands in between.
+        yaw: Of its x axis there, rad.
+    """
+
+    giver: str
+    taker: str
+    spot: Array
+    yaw: float
+
+    def __str__(self) -> str:
+        """Sentence for the status."""
+        x, y = self.spot
+        return (
+            f"the {self.giver} arm brings it to the middle, ({x:.3f}, {y:.3f}) m, and the {self.taker} arm from there"
+            " to its place"
+        )
+
+
+def middle_spots(target: Detection, others: Sequence[Detection], around: Surroundings) -> tuple[Array, ...]:
+    """Free spots that both arms reach, those with most room first, then the nearest to the object.
+
+    Raises:
+        OpenArmError: PLACE_FAILED, when none is free.
+    """
+    config, place = around.config.hand_over, around.config.place
+    ranked: list[tuple[float, float, float]] = []
+    for x in grid(*config.x, config.step):
+        for y in grid(-config.abs_y, config.abs_y, config.step):
+            spot = np.array([x, y])
+            room = min((float(np.linalg.norm(spot - d.p_base[:2])) for d in others), default=np.inf)
+            origin = float(np.linalg.norm(spot - target.p_base[:2]))
+            if room >= place.neighbour_distance and origin >= place.origin_distance:
+                ranked.append((origin - min(room, 2.0 * place.neighbour_distance), x, y))
+    if not ranked:
+        raise OpenArmError(
+            Code.PLACE_FAILED,
+            f"no free spot in the middle (x {config.x[0]:g} to {config.x[1]:g}, |y| up to {config.abs_y:g} m): none is"
+            f" {place.neighbour_distance * 1e3:.0f} mm from {len(others)} other objects",
+        )
+    return tuple(np.array([x, y]) for _, x, y in sorted(ranked))
+
+
+async def plan_hand_over(
+    rehearsal: Rehearsal, around: Surroundings, seen: Sighting, place: Array, place_yaw: float | None
+) -> HandOver:
+    """Find a way through the middle.
+
+    The giver says where and how it can set the object down; what the taker cannot use is left out, and it is asked
+    again. A place from which the taker could go on, but not from all around it, is the last resort.
+
+    Args:
+        rehearsal: To plan with.
+        around: Parameters.
+        seen: The object and its neighbours.
+        place: (2,) where it shall stand in the end.
+        place_yaw: And how it is turned there; None: any.
+
+    Raises:
+        OpenArmError: NO_PLAN or PLACE_FAILED, with what each arm lacks; what the planner's link raises.
+    """
+    spots = middle_spots(seen.target, seen.others, around)
+    order = ARMS if seen.target.p_base[1] >= 0.0 else ARMS[::-1]
+    faults: list[str] = []
+    for giver, taker in (order, order[::-1]):
+        try:
+            return await _between(rehearsal, around.config.hand_over, seen, (giver, taker), spots, place, place_yaw)
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            faults.append(f"{giver} to {taker}: {error.message}")
+    raise OpenArmError(Code.NO_PLAN, f"no hand-over through the middle: {'; '.join(faults)}")
+
+
+async def _between(
+    rehearsal: Rehearsal,
+    config: HandOverConfig,
+    seen: Sighting,
+    arms: tuple[str, str],
+    spots: Sequence[Array],
+    place: Array,
+    place_yaw: float | None,
+) -> HandOver:
+    giver, taker = arms
+    useless: list[PlaceTarget] = []
+    best: tuple[int, HandOver] | None = None
+    fault = ""
+    for _ in range(config.tries):
+        try:
+            way = await rehearsal.pick_and_place(giver, seen.target, seen.others, spots, used=useless)
+        except OpenArmError as error:
+            if error.code not in NO_WAY or not fault:
+                raise
+            break
+        found = HandOver(giver, taker, way.position[:2], seen.target.yaw + way.yaw_offset)
+        there = standing_at(seen.target, way.position, way.yaw_offset)
+        copes = 0
+        try:
+            for stands in (there, *_around(there, config)):
+                await rehearsal.pick_and_place(taker, stands, seen.others, (place,), yaw=place_yaw)
+                copes += 1
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            fault = error.message
+            useless.append(way)
+            if copes and (best is None or copes > best[0]):
+                best = (copes, found)
+            continue
+        return found
+    if best is not None:
+        return best[1]
+    raise OpenArmError(Code.NO_PLAN, f"the {taker} arm could not go on from {len(useless)} places: {fault}")
+
+
+def _around(there: Detection, config: HandOverConfig) -> tuple[Detection, ...]:
+    """The object as it may stand instead: a little off to each side, and turned."""
+    off, turn = config.margin, radians(config.margin_deg)
+    ways = ((off, 0.0, turn), (-off, 0.0, -turn), (0.0, off, -turn), (0.0, -off, turn)) if off or turn else ()
+    return tuple(standing_at(there, there.p_base[:2] + np.array([dx, dy]), by) for dx, dy, by in ways)

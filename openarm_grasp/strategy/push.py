@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Push an object into reach: a closed hand behind it, low, along a straight line, and a look afterwards.
+
+A hand comes to more places than it can grasp at: a grasp also needs room above, and one of a few yaws. Where an object
+can be pushed is not written down but planned: the way behind the object, straight down, and the line itself, with the
+object as what the hand carries, so that both keep clear of everything else. Base frame, m, rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from math import cos, hypot, inf, pi, radians, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription, Side
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.evidence.evidence import Evidence
+from openarm_grasp.evidence.observation import Detection, Sighting, find
+from openarm_grasp.planning.candidates import UP, GraspCandidate, obstacle_boxes, shifted, target_box
+from openarm_grasp.planning.rehearsal import NO_WAY, Rehearsal, standing_at
+from openarm_grasp.planning.routing import ARMS, arm_order
+from openarm_grasp.strategy.effects import (
+    Execute,
+    GoHome,
+    Measure,
+    MoveGripper,
+    MoveLinear,
+    PlanGrasp,
+    Planned,
+    Together,
+)
+from openarm_grasp.strategy.memory import Surroundings
+from openarm_grasp.strategy.performer import Performer
+
+Array = NDArray[np.float64]
+
+#: Between two points of a hand's shape, m.
+_GRAIN = 0.005
+#: Points no further behind the foremost than this are at the front, m.
+_FLAT = 0.002
+
+
+@dataclass(frozen=True)
+class Push:
+    """A push that was planned.
+
+    Attributes:
+        arm: Whose hand.
+        start: (2,) where the object stands.
+        end: (2,) where it shall stand.
+        way: How the hand stands behind it, and its line.
+        plan: The trajectories.
+    """
+
+    arm: str
+    start: Array
+    end: Array
+    way: GraspCandidate
+    plan: Planned
+
+    def __str__(self) -> str:
+        """Sentence for the status."""
+        (x0, y0), (x1, y1) = self.start, self.end
+        return f"the {self.arm} hand pushes it from ({x0:.3f}, {y0:.3f}) to ({x1:.3f}, {y1:.3f}) m, into reach"
+
+
+class Pusher:
+    """Plans pushes and carries them out.
+
+    Args:
+        around: Parameters, table and arms.
+        performer: Carries out.
+        rehearsal: Says what could be grasped where.
+        note: Is told what is done.
+    """
+
+    def __init__(
+        self, around: Surroundings, performer: Performer, rehearsal: Rehearsal, note: Callable[[str], None]
+    ) -> None:
+        self._around, self._performer, self._rehearsal, self._note = around, performer, rehearsal, note
+
+    async def plan(self, seen: Sighting) -> Push:
+        """Find a push after which the object can be grasped.
+
+        Raises:
+            OpenArmError: UNREACHABLE, with the reason, when there is none; what the link raises.
+        """
+        faults: list[str] = []
+        for end in destinations(seen.target, seen.others, self._around):
+            x, y = end
+            try:
+                taker = await self._taker(seen, end)
+                return await self._push_to(seen, end, taker)
+            except OpenArmError as error:
+                if error.code not in NO_WAY:
+                    raise
+                faults.append(f"to ({x:.3f}, {y:.3f}) m: {error.message}")
+        why = f"{faults[0]} ({len(faults) - 1} other pushes refused)" if faults else "there is no free place around it"
+        raise OpenArmError(Code.UNREACHABLE, f"it cannot be pushed into reach either: {why}")
+
+    @property
+    def _config(self) -> GraspConfig:
+        return self._around.config
+
+    async def _taker(self, seen: Sighting, end: Array) -> str:
+        """The arm that grasps the object there."""
+        fault: OpenArmError | None = None
+        for arm in arm_order("auto", float(end[1]), self._config.approach.overlap_half_width):
+            try:
+                await self._rehearsal.pick(arm, standing_at(seen.target, end), seen.others, now=seen.target)
+            except OpenArmError as error:
+                if error.code not in NO_WAY:
+                    raise
+                fault = error
+                continue
+            return arm
+        raise fault or OpenArmError(Code.UNREACHABLE, "no arm")
+
+    async def _push_to(self, seen: Sighting, end: Array, taker: str) -> Push:
+        """The other arm is asked first: it comes from the other side."""
+        config, link, faults = self._config, self._performer.link, list[str]()
+        for arm in sorted(ARMS, key=lambda arm: arm == taker):
+            ways = push_ways(seen.target, end, config, closed_hand(link.description, arm))
+            if not ways:
+                faults.append(f"{arm} hand: {seen.target.label!r} would tip over")
+                continue
+            link.check()
+            effect = PlanGrasp(arm, ways, obstacle_boxes(seen.others, config), target_box(seen.target, config))
+            try:
+                plan = await link.plan(effect)
+            except OpenArmError as error:
+                if error.code not in NO_WAY:
+                    raise
+                faults.append(error.message)
+                continue
+            return Push(arm, seen.target.p_base[:2], end, ways[plan.chosen], plan)
+        raise OpenArmError(Code.UNREACHABLE, f"no hand comes behind it: {'; '.join(faults)}")
+
+    async def carry_out(self, push: Push, label: str, number: int) -> str:
+        """Push, go home and look; returns what was seen.
+
+        Raises:
+            OpenArmError: EXECUTION_FAILED or HAND_COLLISION, when the hand did not do it; what looking raises, when the
+                object is not seen any more.
+        """
+        arm, way, gap = push.arm, push.way, self._config.push.gap
+        self._note(f"push {number} of at most {self._config.push.most}: {push}")
+        T_base_back, fault = way.T_base_tcp, None
+        try:
+            await self._go_behind(push)
+            T_base_back = shifted(way.T_base_tcp, way.retreat_offset - gap * _direction(way.retreat_offset))
+            await self._performer.do((Execute(arm, push.plan.retreat, "push"),))
+        except OpenArmError as error:
+            fault = error
+        if fault is None or fault.code not in (Code.CANCELLED, Code.ROBOT_LOST):
+            try:
+                await self._home(arm, T_base_back)
+            except OpenArmError as error:
+                fault = fault or error
+        if fault is not None:
+            raise OpenArmError(fault.code, f"push {number}: {fault.message}")
+        return await self._seen(push, label, number)
+
+    async def _go_behind(self, push: Push) -> None:
+        """Close the hand and bring it behind the object."""
+        arm, T_base_tcp, limit = push.arm, push.way.T_base_tcp, self._config.held.max_tcp_error
+        outcome = await self._performer.do(
+            (
+                Together((MoveGripper(arm, 0.0, "close"), Execute(arm, push.plan.transfer, "move behind the object"))),
+                Execute(arm, push.plan.approach, "move down behind the object"),
+                Measure(arm, 0.0, T_base_tcp),
+            )
+        )
+        if (error := outcome.last(Evidence).tcp_error) > limit:
+            text = f"the {arm} hand stopped {error * 1e3:.0f} mm from its place behind the object"
+            raise OpenArmError(Code.HAND_COLLISION, text)
+
+    async def _home(self, arm: str, T_base_back: Array) -> None:
+        """Leave the object the way the hand came, and go home."""
+        low = self._around.table.top_z + 2.0 * self._config.approach.lift_height
+        # A line that cannot be followed is a kindness that is not done; the free way home may still be there.
+        await self._performer.perform((MoveLinear(arm, T_base_back, "leave the object"),))
+        await self._performer.do((GoHome((arm,), back_off_below=low),))
+
+    async def _seen(self, push: Push, label: str, number: int) -> str:
+        """Where the camera sees the object afterwards."""
+        limits = self._config.detect
+        try:
+            frames = await self._performer.look(limits.frames)
+        except OpenArmError as error:
+            text = f"push {number}: {label!r} was not seen since: {error.message}"
+            raise OpenArmError(error.code, text) from error
+        found = find(frames.frames, label, limits).target
+        x, y = found.p_base[:2]
+        moved, off = (float(np.hypot(*(found.p_base[:2] - p))) for p in (push.start, push.end))
+        text = (
+            f"push {number} by the {push.arm} hand moved it {moved * 1e3:.0f} mm to ({x:.3f}, {y:.3f}) m,"
+            f" {off * 1e3:.0f} mm from where it was meant"
+        )
+        self._note(text)
+        return text
+
+
+def destinations(target: Detection, others: Sequence[Detection], around: Surroundings) -> tuple[Array, ...]:
+    """Places around the object, on the table and free of others: short pushes first, then those to the sides.
+
+    Args:
+        target: The object.
+        others: What else stands on the table.
+        around: Parameters and table.
+    """
+    config, place, table = around.config.push, around.config.place, around.table
+    p, half = target.p_base[:2], 0.5 * float(np.hypot(*target.size[:2]))
+    found: list[tuple[float, float, float, float]] = []
+    for length, k in product(config.lengths, range(config.directions)):
+        angle = 2.0 * pi * k / config.directions
+        x, y = float(p[0] + length * cos(angle)), float(p[1] + length * sin(angle))
+        room = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=inf)
+        on_table = table.x[0] + half <= x <= table.x[1] - half and table.y[0] + half <= y <= table.y[1] - half
+        if on_table and room >= place.neighbour_distance:
+            found.append((length, -round(abs(sin(angle)), 3), x, y))
+    return tuple(np.array([x, y]) for _, _, x, y in sorted(found))
+
+
+def push_ways(target: Detection, end: Array, config: GraspConfig, hand: Array) -> tuple[GraspCandidate, ...]:
+    """How a closed hand may stand behind the object, the most upright first.
+
+    One of its four faces looks ahead, so that a flat side of the object is met flat; it leans sideways, or with its
+    tips ahead, never over the object. Whatever part of the hand comes first must meet the object at half of its height
+    or lower, else the object would tip over.
+
+    Args:
+        target: The object.
+        end: (2,) where it shall be pushed.
+        config: Parameters.
+        hand: Points (n, 3) of the closed hand, TCP frame.
+    """
+    way = np.array([*(end - target.p_base[:2]), 0.0])
+    ahead = _direction(way)
+    aside = np.cross(UP, ahead)
+    half, half_width = (
+        0.5 * float(np.abs(target.T_base_object[:3, :2].T @ v) @ target.size[:2]) for v in (ahead, aside)
+    )
+    tall = float(target.size[2])
+    faces = (("ahead+", ahead), ("ahead-", -ahead), ("aside+", aside), ("aside-", -aside))
+    found: list[GraspCandidate] = []
+    for (name, y_tool), tilt_deg, lean in product(faces, config.push.tilts_deg, (1.0, -1.0)):
+        heading = lean * np.cross(UP, y_tool)
+        if (tilt_deg == 0.0 and lean < 0.0) or float(heading @ ahead) < -1e-6:
+            continue
+        tilt = radians(tilt_deg)
+        R = se3.rotation_from_z_y(sin(tilt) * heading - cos(tilt) * UP, y_tool)
+        height = config.hand.tip_clearance + config.hand.tip_clearance_tilted * sin(tilt)
+        front, low = _front(hand @ R.T, ahead, half_width, (-height, tall - height))
+        if low + height > 0.5 * tall:
+            continue
+        p = target.p_base - (half + front + config.push.gap) * ahead
+        p[2] = target.bottom + height
+        found.append(
+            GraspCandidate(
+                id=f"{target.label}/push/{name}/tilt{tilt_deg:g}" + (f"/lean{lean:+g}" if tilt_deg else ""),
+                T_base_tcp=se3.make(R, p),
+                approach_offset=config.approach.pregrasp_distance * UP,
+                retreat_offset=way + config.push.gap * ahead,
+                width=0.0,
+                tilt=tilt,
+                score=-tilt,
+                parts={"tilt": -tilt},
+            )
+        )
+    return tuple(sorted(found, key=lambda c: -c.score))
+
+
+@cache
+def closed_hand(description: RobotDescription, arm: Side) -> Array:
+    """Points (n, 3) of the hand and its closed fingers, some mm apart, TCP frame, m."""
+    tcp = description.tcp_link(arm)
+    palm = description.chain(tcp)[-1].parent
+    links = [palm, *(joint.child for joint in description.joints.values() if joint.parent == palm)]
+    poses = description.link_poses(dict.fromkeys(description.joints, 0.0))
+    T_tcp_base = se3.inverse(poses[tcp])
+    found = [np.zeros((1, 3))]
+    for link in links:
+        for part in description.links[link].collision:
+            if part.kind == "box":
+                steps = [np.linspace(-0.5, 0.5, max(2, round(edge / _GRAIN) + 1)) * edge for edge in part.size]
+                grid = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+                found.append(se3.apply(T_tcp_base @ poses[link] @ part.T_link_primitive, grid))
+    return np.vstack(found)
+
+
+def _front(points: Array, ahead: Array, half_width: float, height: tuple[float, float]) -> tuple[float, float]:
+    """How far the parts of the hand that can meet the object reach ahead of the TCP, and how low the foremost does, m.
+
+    Args:
+        points: (n, 3) of the hand's surface, axes of the base, from the TCP.
+        ahead: (3,) direction.
+        half_width: Of the object, across that direction, m.
+        height: Of the object's lower and upper face above the TCP, m.
+    """
+    across = np.abs(points @ np.cross(UP, ahead))
+    low, high = height
+    meets = points[(across <= half_width + _FLAT) & (points[:, 2] > low) & (points[:, 2] < high + _FLAT)]
+    reach = meets @ ahead
+    front = float(reach.max())
+    return front, float(meets[reach > front - _FLAT, 2].min())
+
+
+def _direction(v: Array) -> Array:
+    return v / np.linalg.norm(v)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Straight lines of the tool on one branch of the inverse kinematics.
+
+The tool's origin moves on the line, its orientation turns at a constant rate; the elbow's swivel angle stays (or drifts
+by a constant rate where that was asked for), so nothing flips on the way. Base frame, m, rad.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.collision.collision import CollisionScene, Contact
+from openarm_motion.kinematics.chain_kernels import ROTATION_LENGTH
+from openarm_motion.kinematics.inverse import InverseKinematics, Solution
+
+Array = NDArray[np.float64]
+
+#: Distance and turn of the tool between two points of a line.
+STEP_M = 0.005
+STEP_RAD = 0.025
+#: Fewest points: a quintic spline needs six.
+_FEWEST = 7
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A solved straight line.
+
+    Attributes:
+        q: (m, n) configurations, rad.
+        s: (m,) way of the tool from the start, m (a turn counts as if at `ROTATION_LENGTH` from its axis).
+        end: The configuration at the end with its branch.
+        deviation: How far the tool leaves the line between two points if joints are interpolated linearly, m.
+    """
+
+    q: Array
+    s: Array
+    end: Solution
+    deviation: float
+
+    def reversed(self) -> Line:
+        """The same line the other way; `end` then carries the branch of the whole line."""
+        end = Solution(self.q[0], self.end.swivel, self.end.branch)
+        return Line(self.q[::-1].copy(), self.s[-1] - self.s[::-1], end, self.deviation)
+
+
+def line_poses(T_a: Array, T_b: Array) -> tuple[Array, Array]:
+    """Poses (m, 4, 4) from one to another, `STEP_M` and `STEP_RAD` apart at most, and the way (m,) to each."""
+    length = float(np.linalg.norm(T_b[:3, 3] - T_a[:3, 3]))
+    turn = se3.angle_between(T_a[:3, :3], T_b[:3, :3])
+    m = max(_FEWEST, int(np.ceil(max(length / STEP_M, turn / STEP_RAD))) + 1)
+    u = np.linspace(0.0, 1.0, m)
+    if turn < 1e-9:
+        poses = np.repeat(T_a[None], m, axis=0)
+        poses[:, :3, 3] += u[:, None] * (T_b[:3, 3] - T_a[:3, 3])
+    else:
+        poses = np.stack([se3.interpolate(T_a, T_b, float(x)) for x in u])
+    return poses, u * (length + ROTATION_LENGTH * turn)
+
+
+def solve_line(
+    inverse: InverseKinematics,
+    start: Solution,
+    T_start: Array,
+    T_end: Array,
+    margin: float,
+    max_step: float = 0.2,
+    swivel_change: float = 0.0,
+) -> Line:
+    """Solve the line from the pose of `start` to another.
+
+    Args:
+        inverse: The arm.
+        start: Configuration at `T_start`, with its branch.
+        T_start: (4, 4).
+        T_end: (4, 4).
+        margin: Kept from the joint limits, rad.
+        max_step: Greatest change of a joint between two points, rad.
+        swivel_change: How far the elbow swivels along the line, rad.
+
+    Raises:
+        OpenArmError: UNREACHABLE, with the distance from the start at which the line ends and why.
+    """
+    poses, s = line_poses(T_start, T_end)
+    q, reached, why = inverse.follow(poses, start, margin, max_step, swivel_change)
+    if reached < len(poses):
+        raise OpenArmError(
+            Code.UNREACHABLE,
+            f"the straight line of {s[-1] * 1e3:.0f} mm ends after {s[max(reached - 1, 0)] * 1e3:.0f} mm: {why}",
+        )
+    between = inverse.kinematics.fk_many(0.5 * (q[1:] + q[:-1]))[:, :3, 3]
+    direct = 0.5 * (poses[1:, :3, 3] + poses[:-1, :3, 3])
+    deviation = float(np.max(np.linalg.norm(between - direct, axis=1)))
+    return Line(q, s, Solution(q[-1], start.swivel + swivel_change, start.branch), deviation)
+
+
+def line_contact(scene: CollisionScene, line: Line) -> Contact | None:
+    """Something that the arm would come too near to on the line, or None; the ends are looked at first."""
+    m = len(line.q)
+    order = [m - 1, 0, *range(m // 2, m - 1), *range(1, m // 2)]
+    for k in order:
+        if scene.collides(line.q[k]):
+            return scene.contacts(line.q[k])[0]
+    return None

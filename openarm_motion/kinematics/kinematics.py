@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kinematics of a serial arm from its URDF: forward, Jacobian, and damped least squares inverse.
+
+Works for any chain of revolute, continuous and prismatic joints from the description's root to a tool link; nothing
+here knows OpenArm's joint names. Poses are `T_base_tool` (4, 4) in the description's root frame; angles rad, m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_motion.kinematics import chain_kernels as kernels
+
+Array = NDArray[np.float64]
+
+#: Continuous joints have no limits; a seed and a search still need a range.
+_CONTINUOUS = np.pi
+
+
+@dataclass(frozen=True)
+class IkResult:
+    """Answer of the numeric inverse kinematics.
+
+    Attributes:
+        success: Whether the errors are within the tolerances.
+        q: (n,) rad; when not successful, the configuration nearest to the target that was found.
+        position_error: m.
+        orientation_error: rad; not a criterion when the position alone counted.
+        restarts: Random guesses used beyond the first.
+    """
+
+    success: bool
+    q: Array
+    position_error: float
+    orientation_error: float
+    restarts: int
+
+
+class ArmKinematics:
+    """One serial arm.
+
+    Args:
+        description: The robot.
+        tool_link: Link whose pose is solved for; the movable joints between the root and it are the arm's joints.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when the link is unknown or no joint moves it.
+    """
+
+    def __init__(self, description: RobotDescription, tool_link: str) -> None:
+        if tool_link not in description.links:
+            links = ", ".join(description.links)
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"tool link {tool_link!r} is not in the URDF; links: {links}")
+        placements: list[Array] = []
+        axes: list[Array] = []
+        names: list[str] = []
+        kinds: list[bool] = []
+        T = np.eye(4)
+        for joint in description.chain(tool_link):
+            T = T @ joint.T_parent_joint
+            if joint.type == "fixed":
+                continue
+            placements.append(T)
+            axes.append(joint.axis / np.linalg.norm(joint.axis))
+            names.append(joint.name)
+            kinds.append(joint.type == "prismatic")
+            T = np.eye(4)
+        if not names:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no joint moves the tool link {tool_link!r}")
+        self.tool_link = tool_link
+        self.names: tuple[str, ...] = tuple(names)
+        lower, upper = description.limits(self.names)
+        unlimited = ~(np.isfinite(lower) & np.isfinite(upper))
+        self.lower: Array = np.where(unlimited, -_CONTINUOUS, lower)
+        self.upper: Array = np.where(unlimited, _CONTINUOUS, upper)
+        self.placements: Array = np.array(placements)
+        self.axes: Array = np.array(axes)
+        self.prismatic: NDArray[np.bool_] = np.array(kinds)
+        self.tip: Array = T
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.names)
+
+    @property
+    def chain(self) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+        """The chain as the kernels take it."""
+        return self.placements, self.axes, self.prismatic, self.tip
+
+    def fk(self, q: ArrayLike) -> Array:
+        """`T_base_tool` (4, 4) of a configuration (n,)."""
+        return self._forward(q)[0]
+
+    def fk_many(self, q: ArrayLike) -> Array:
+        """Tool poses (m, 4, 4) of configurations (m, n)."""
+        return kernels.forward_many(np.ascontiguousarray(q, dtype=np.float64), *self.chain)
+
+    def jacobian(self, q: ArrayLike) -> Array:
+        """Geometric Jacobian (6, n) of the tool origin, linear rows first, base frame."""
+        pose, origins, directions = self._forward(q)
+        out = np.empty((6, self.n))
+        kernels.jacobian(origins, directions, self.prismatic, pose[:3, 3].copy(), out)
+        return out
+
+    def joint_axes(self, q: ArrayLike) -> tuple[Array, Array]:
+        """A point on each joint axis and its direction, (n, 3) each, base frame."""
+        _, origins, directions = self._forward(q)
+        return origins, directions
+
+    def margin(self, q: ArrayLike) -> float:
+        """Distance to the nearest joint limit, rad; negative outside."""
+        values = np.asarray(q, dtype=np.float64)
+        return float(np.min(np.minimum(values - self.lower, self.upper - values)))
+
+    def outside(self, q: ArrayLike, margin: float = 0.0) -> str:
+        """Sentence about the joint that is furthest outside its limits less `margin`; empty when all are inside."""
+        values = np.asarray(q, dtype=np.float64)
+        excess = np.maximum(self.lower + margin - values, values - self.upper + margin)
+        i = int(np.argmax(excess))
+        if excess[i] <= 1e-9:
+            return ""
+        allowed = f"{self.lower[i] + margin:.3f} to {self.upper[i] - margin:.3f}"
+        return f"{self.names[i]} would be at {values[i]:.3f} rad, allowed {allowed}" + (
+            f" (limits less a margin of {margin:g})" if margin else ""
+        )
+
+    def ik(
+        self,
+        target: Array,
+        seed: ArrayLike | None = None,
+        *,
+        position_only: bool = False,
+        posture: ArrayLike | None = None,
+        posture_weight: float = 0.05,
+        margin: float = 0.0,
+        tolerance: tuple[float, float] = (1e-5, 1e-4),
+        iterations: int = 100,
+        restarts: int = 60,
+        random_seed: int = 0,
+    ) -> IkResult:
+        """Solve for a tool pose; never raises for one that is out of reach but returns the nearest found.
+
+        Args:
+            target: (4, 4) `T_base_tool`.
+            seed: (n,) first guess, and the posture unless that is given; default the middle of the limits.
+            position_only: The orientation of the target is ignored.
+            posture: (n,) what redundant motion is pulled towards.
+            posture_weight: Strength of the pull.
+            margin: Kept from every joint limit, rad.
+            tolerance: Position (m) and orientation (rad).
+            iterations: Per guess.
+            restarts: Random guesses after the first.
+            random_seed: Of the guesses; the answer is the same for the same seed.
+        """
+        middle = 0.5 * (self.lower + self.upper)
+        first = middle if seed is None else np.asarray(seed, dtype=np.float64)
+        pull = first if posture is None else np.asarray(posture, dtype=np.float64)
+        best = np.empty(self.n)
+        success, error_p, error_r, used = kernels.solve_ik(
+            np.ascontiguousarray(target, dtype=np.float64),
+            np.ascontiguousarray(first),
+            np.ascontiguousarray(pull),
+            float(posture_weight),
+            bool(position_only),
+            (float(tolerance[0]), float(tolerance[1])),
+            iterations,
+            restarts,
+            random_seed,
+            np.minimum(self.lower + margin, middle),
+            np.maximum(self.upper - margin, middle),
+            *self.chain,
+            best,
+        )
+        return IkResult(bool(success), best, float(error_p), float(error_r), int(used))
+
+    def _forward(self, q: ArrayLike) -> tuple[Array, Array, Array]:
+        values = np.ascontiguousarray(q, dtype=np.float64)
+        if values.shape != (self.n,):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"got {values.size} joint positions, expected {self.n}: {', '.join(self.names)}"
+            )
+        pose, origins, directions = np.empty((4, 4)), np.empty((self.n, 3)), np.empty((self.n, 3))
+        kernels.forward(values, *self.chain, origins, directions, pose)
+        return pose, origins, directions

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Closed-form inverse kinematics of an arm with a spherical shoulder, one elbow joint and a spherical wrist.
+
+OpenArm is such an arm (both versions, either side); so are many others with seven joints. The geometry is read from
+the URDF and checked: an arm that is not built so is refused here and solved numerically instead. The left arm needs no
+law of its own; that it mirrors the right one is a test. Poses are `T_base_tool` (4, 4), angles rad.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.kinematics import srs_kernels
+from openarm_motion.kinematics.kinematics import ArmKinematics
+
+Array = NDArray[np.float64]
+
+#: How far the axes may miss each other: a rounded rpy in the URDF costs 4e-6 m.
+_MEET = 2e-5
+_PERPENDICULAR = 1e-4
+
+
+@dataclass(frozen=True)
+class SrsSolution:
+    """One configuration at a pose: (7,) rad, its swivel angle and its branch (0 to 7)."""
+
+    q: Array
+    swivel: float
+    branch: int
+
+
+@dataclass(frozen=True)
+class SrsMiss:
+    """Why a pose has no configuration within the limits.
+
+    Attributes:
+        too_far: How much further than the arm reaches the wrist would be, m; negative: how much too near; else 0.
+        joint: Index of the joint that binds, when the distance is not the reason.
+        excess: How far outside its limit it would be, rad.
+        nearest: (7,) that configuration; empty when the distance is the reason.
+    """
+
+    too_far: float
+    joint: int
+    excess: float
+    nearest: Array
+
+
+class SrsArm:
+    """Closed-form solver of one arm.
+
+    Args:
+        kinematics: The arm.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, saying in what the arm differs from such a one.
+    """
+
+    def __init__(self, kinematics: ArmKinematics) -> None:
+        self.kinematics = kinematics
+        self._geometry, self._tool = _read_geometry(kinematics)
+        self._lower, self._upper = kinematics.lower, kinematics.upper
+        self._verify()
+
+    @property
+    def shoulder(self) -> Array:
+        """Centre of the shoulder (3,), base frame, m."""
+        return self._geometry[7].copy()
+
+    def solve(self, pose: Array, swivel: float, branch: int) -> Array | None:
+        """Configuration of one branch, not limited; None when the wrist is too far from or too near to the shoulder."""
+        q = np.empty(7)
+        status = srs_kernels.solve(_c(pose), swivel, branch, self._geometry, self._tool, self._lower, self._upper, q)
+        return q if status == 0 else None
+
+    def sweep(self, pose: Array, swivels: Array, margin: float = 0.0) -> tuple[list[SrsSolution], SrsMiss]:
+        """All configurations at `swivels` (k,) within the limits less `margin`, and what is in the way when none is."""
+        rows = srs_kernels.BRANCHES * swivels.size
+        found, at, branch = np.empty((rows, 7)), np.empty(rows), np.empty(rows, dtype=np.int64)
+        nearest = np.empty(7)
+        count, status, joint, excess = srs_kernels.sweep(
+            _c(pose), swivels, self._geometry, self._tool, self._lower, self._upper, margin, found, at, branch, nearest
+        )
+        solutions = [SrsSolution(found[i].copy(), float(at[i]), int(branch[i])) for i in range(count)]
+        if status:
+            return solutions, SrsMiss(self._distance_excess(pose), 0, 0.0, np.empty(0))
+        return solutions, SrsMiss(0.0, int(joint), float(excess), nearest)
+
+    def follow(
+        self, poses: Array, swivels: Array, branch: int, margin: float, max_step: float
+    ) -> tuple[Array, int, str]:
+        """Configurations (m, 7) along poses (m, 4, 4) at swivel angles (m,), on one branch.
+
+        Returns:
+            The path, the index of the first pose that fails (m when none does), and why it fails.
+        """
+        path = np.empty((poses.shape[0], 7))
+        index, status, joint = srs_kernels.follow(
+            _c(poses),
+            _c(swivels),
+            branch,
+            self._geometry,
+            self._tool,
+            self._lower + margin,
+            self._upper - margin,
+            max_step,
+            path,
+        )
+        why = ""
+        if status in (srs_kernels.TOO_FAR, srs_kernels.TOO_NEAR):
+            why = self.distance_text(self._distance_excess(poses[index]))
+        elif status == srs_kernels.LIMIT:
+            why = self.kinematics.outside(path[index], margin)
+        elif status == srs_kernels.JUMP:
+            step = abs(path[index, joint] - path[index - 1, joint])
+            why = f"{self.kinematics.names[joint]} would jump by {step:.2f} rad between neighbouring points"
+        return path, int(index), why
+
+    def classify(self, q: ArrayLike) -> SrsSolution:
+        """Swivel angle and branch of a configuration."""
+        values = np.ascontiguousarray(q, dtype=np.float64)
+        swivel = float(srs_kernels.swivel_of(values, self._geometry))
+        pose = self.kinematics.fk(values)
+        best, least = 0, np.inf
+        for branch in range(srs_kernels.BRANCHES):
+            candidate = self.solve(pose, swivel, branch)
+            if candidate is None:
+                continue
+            distance = float(np.max(np.abs(candidate - values)))
+            if distance < least:
+                best, least = branch, distance
+        return SrsSolution(values, swivel, best)
+
+    def distance_text(self, excess: float) -> str:
+        """Sentence about a wrist that is too far away (`excess` > 0, m) or too near (< 0)."""
+        longest, shortest = self._reach()
+        if excess >= 0.0:
+            return (
+                f"the wrist would be {longest + excess:.3f} m from the shoulder, the arm reaches {longest:.3f} m"
+                f" ({excess * 1e3:.0f} mm short)"
+            )
+        return (
+            f"the wrist would be {shortest + excess:.3f} m from the shoulder, the arm folds to {shortest:.3f} m"
+            f" ({-excess * 1e3:.0f} mm too near)"
+        )
+
+    def _reach(self) -> tuple[float, float]:
+        upper, fore = (float(np.linalg.norm(self._geometry[i])) for i in (8, 9))
+        return upper + fore, abs(upper - fore)
+
+    def _distance_excess(self, pose: Array) -> float:
+        wrist = pose[:3, 3] - pose[:3, :3] @ self._tool.T @ self._geometry[10]
+        distance = float(np.linalg.norm(wrist - self._geometry[7]))
+        longest, shortest = self._reach()
+        return distance - longest if distance > shortest + 0.5 * (longest - shortest) else distance - shortest
+
+    def _verify(self) -> None:
+        """Solve a few poses and compare with forward kinematics: a wrong assumption must not pass as a wrong grasp."""
+        rng = np.random.default_rng(0)
+        for _ in range(8):
+            q = rng.uniform(self._lower, self._upper)
+            pose = self.kinematics.fk(q)
+            solution = self.solve(pose, float(srs_kernels.swivel_of(q, self._geometry)), self.classify(q).branch)
+            error = np.inf if solution is None else float(np.max(np.abs(self.kinematics.fk(solution) - pose)))
+            if error > 5.0 * _MEET:
+                raise OpenArmError(Code.INVALID_ARGUMENT, f"closed form misses forward kinematics by {error:.2g}")
+
+
+def _read_geometry(kinematics: ArmKinematics) -> tuple[Array, Array]:
+    """Rows of `geometry` and `tool` as `srs_kernels` takes them, from the arm at zero.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, saying what does not fit.
+    """
+    if kinematics.n != 7 or bool(kinematics.prismatic.any()):
+        raise _not_srs(
+            f"it has {kinematics.n} joints, {int(kinematics.prismatic.sum())} of them prismatic, expected 7 turning"
+        )
+    origins, axes = kinematics.joint_axes(np.zeros(7))
+    pose = kinematics.fk(np.zeros(7))
+    shoulder = _meet(origins[:3], axes[:3], "the shoulder (joints 1 to 3)")
+    wrist = _meet(origins[4:], axes[4:], "the wrist (joints 5 to 7)")
+    for i, j in ((0, 1), (1, 2), (4, 5), (5, 6)):
+        if abs(float(axes[i] @ axes[j])) > _PERPENDICULAR:
+            raise _not_srs(f"axes {i + 1} and {j + 1} are not perpendicular")
+    w4 = axes[3]
+    elbow = origins[3] + w4 * float(w4 @ (shoulder - origins[3]))
+    if abs(float(w4 @ (wrist - elbow))) > _MEET:
+        raise _not_srs("the wrist centre does not turn in the plane of the shoulder centre about joint 4")
+    upper, fore = elbow - shoulder, wrist - elbow
+    if min(float(np.linalg.norm(upper)), float(np.linalg.norm(fore))) < 1e-3:
+        raise _not_srs("the elbow axis goes through the shoulder or the wrist centre")
+    middle = 0.5 * (kinematics.lower[3] + kinematics.upper[3])
+    K = np.cross(np.eye(3), w4).T
+    turned = fore + np.sin(middle) * K @ fore + (1.0 - np.cos(middle)) * K @ K @ fore
+    bend = float(np.sign(upper @ np.cross(w4, upper + turned))) or 1.0
+    geometry = np.vstack([axes, shoulder, upper, fore, pose[:3, 3] - wrist, [bend, 0.0, 0.0]])
+    return np.ascontiguousarray(geometry), np.ascontiguousarray(pose[:3, :3])
+
+
+def _meet(origins: Array, axes: Array, what: str) -> Array:
+    """Point where lines meet, least squares; refuses lines that miss it."""
+    P = np.eye(3)[None] - axes[:, :, None] * axes[:, None, :]
+    point: Array = np.linalg.lstsq(P.reshape(-1, 3), (P @ origins[:, :, None]).reshape(-1), rcond=None)[0].astype(
+        np.float64
+    )
+    miss = float(np.max(np.linalg.norm(np.einsum("kij,kj->ki", P, point - origins), axis=1)))
+    if miss > _MEET:
+        raise _not_srs(f"the axes of {what} miss a common point by {miss * 1e3:.3g} mm")
+    return point
+
+
+def _not_srs(why: str) -> OpenArmError:
+    return OpenArmError(Code.INVALID_ARGUMENT, f"not a spherical-revolute-spherical arm: {why}")
+
+
+def _c(values: Array) -> Array:
+    return np.ascontiguousarray(values, dtype=np.float64)

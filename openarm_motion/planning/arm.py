@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One arm with all that planning needs: kinematics, collision shapes, limits, the table, a planner.
+
+Everything that is planned goes through here; it holds no state between requests and may serve several threads.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_motion.collision.collision import Box, CollisionScene, Contact, Surroundings
+from openarm_motion.collision.collision_robot import CollisionRobot
+from openarm_motion.collision.fast import FastScene
+from openarm_motion.collision.seen import NOTHING, Known
+from openarm_motion.config import MotionConfig
+from openarm_motion.kinematics.cartesian import Line
+from openarm_motion.kinematics.inverse import InverseKinematics
+from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.planning.failure import PlanFailedError
+from openarm_motion.planning.planner import PlannedPath, Planner, PlanQuery, never
+from openarm_motion.planning.planners import make_planner
+from openarm_motion.timing.blending import timings
+from openarm_motion.timing.certificate import Certificate, certify
+from openarm_motion.timing.trajectory import JointLimits, Trajectory, profile, time_path
+
+Array = NDArray[np.float64]
+
+#: A joint this far outside its limits is a wrong reading, not sag; rad.
+_SAG = 0.05
+
+
+#: How many times finer the steps of the searches are that follow one whose result did not pass the dense look.
+_FINENESS = (1.0, 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class CertifiedPlan:
+    """A path, the same timed, and what it was looked at with."""
+
+    path: PlannedPath
+    trajectory: Trajectory
+    certificate: Certificate
+
+
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """What a request starts from.
+
+    Attributes:
+        state: Positions of the robot's joints by name, rad or m; both arms and fingers.
+        start: (n,) where the arm starts; usually its part of `state`.
+        scale: Velocity scale; 0 means the default.
+        stopped: Whether the request was cancelled; asked often.
+        known: Bodies of the planning scene and the map.
+    """
+
+    state: Mapping[str, float]
+    start: Array
+    scale: float = 0.0
+    stopped: Callable[[], bool] = never
+    known: Known = NOTHING
+
+
+class Arm:
+    """One arm.
+
+    Args:
+        name: For messages, for example "left".
+        description: The robot.
+        config: Parameters.
+        static: Boxes that are always there (the table), base frame; held objects may stand on them.
+        planner: Finds free paths.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when the limits are not for this arm's number of joints.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        description: RobotDescription,
+        config: MotionConfig,
+        static: Sequence[Box] = (),
+        planner: Planner | None = None,
+    ) -> None:
+        self.name = name
+        self.config = config
+        self.description = description
+        self.kinematics = ArmKinematics(description, config.tool_link.format(arm=name))
+        self.inverse = InverseKinematics(self.kinematics, config.planning.swivels)
+        self.robot = CollisionRobot(description, self.kinematics)
+        self.static: tuple[Box, ...] = tuple(static)
+        self._planner: Planner = planner or make_planner(config.planning.planner)
+        limits = config.limits
+        if len(limits.velocity) != self.kinematics.n:
+            raise OpenArmError(
+                Code.CONFIG_INVALID,
+                f"limits.velocity has {len(limits.velocity)} numbers, arm {name!r} has {self.kinematics.n} joints:"
+                f" {', '.join(self.kinematics.names)}",
+            )
+        self._limits = JointLimits(
+            np.array(limits.velocity, dtype=np.float64),
+            np.array(limits.acceleration, dtype=np.float64),
+            np.array(limits.jerk, dtype=np.float64),
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The arm's joints."""
+        return self.kinematics.names
+
+    def situation(
+        self,
+        state: Mapping[str, float],
+        start: Sequence[float] = (),
+        scale: float = 0.0,
+        stopped: Callable[[], bool] = never,
+        known: Known = NOTHING,
+    ) -> Situation:
+        """Check and complete what a request starts from; an empty `start` is the present configuration.
+
+        Raises:
+            OpenArmError: NOT_READY, when the state lacks a joint of the arm; INVALID_ARGUMENT, for a start that is not
+                finite or of another size; LIMITS, for one outside the limits.
+        """
+        missing = [name for name in self.names if name not in state]
+        if missing and len(start) == 0:
+            raise OpenArmError(Code.NOT_READY, f"/joint_states lacks {', '.join(missing)}")
+        q = self.configuration(start if len(start) else [state[name] for name in self.names], "start", _SAG)
+        self.scale(scale)
+        return Situation(dict(state), q, scale, stopped, known)
+
+    def configuration(self, values: Sequence[float], what: str, tolerance: float = 1e-4) -> Array:
+        """Check joint positions and move them into the limits where they are out by no more than `tolerance`.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT or LIMITS, naming the joint, its value and its limits.
+        """
+        q = np.array(values, dtype=np.float64)
+        if q.shape != (self.kinematics.n,):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"{what} has {q.size} joint positions, expected {self.kinematics.n}: {', '.join(self.names)}",
+            )
+        if not np.all(np.isfinite(q)):
+            i = int(np.argmin(np.isfinite(q)))
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{what}: {self.names[i]} is {q[i]}, expected a finite number")
+        outside = self.kinematics.outside(q, -tolerance)
+        if outside:
+            raise OpenArmError(Code.LIMITS, f"{what}: {self.kinematics.outside(q)}")
+        return np.clip(q, self.kinematics.lower, self.kinematics.upper)
+
+    def scale(self, requested: float) -> float:
+        """Velocity scale of a request; 0 is the default.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when it is not 0 and not in (0, 1].
+        """
+        if requested == 0.0:
+            return self.config.limits.default_scale
+        if not 0.0 < requested <= 1.0:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"velocity_scale is {requested}, expected 0 < scale <= 1 (or 0 for the default)"
+            )
+        return requested
+
+    def limits(self, scale: float) -> JointLimits:
+        """Joint limits at the velocity scale of a request."""
+        return self._limits.scaled(self.scale(scale))
+
+    def scene(
+        self,
+        state: Mapping[str, float],
+        boxes: Sequence[Box] = (),
+        held: Sequence[Box] = (),
+        touchable: frozenset[str] = frozenset(),
+        *,
+        straight: bool = False,
+        gripper: float | None = None,
+        known: Known = NOTHING,
+    ) -> CollisionScene:
+        """Surroundings of the arm with the table in them.
+
+        Args:
+            state: The robot's joints; the other arm and the fingers are taken from here.
+            boxes: Obstacles, base frame.
+            held: Boxes held by this arm, tool frame.
+            touchable: Ids of boxes that the fingers may touch.
+            straight: Clearance of straight parts instead of free paths.
+            gripper: Position of the finger joints instead of the present one, m.
+            known: Bodies of the planning scene, as certain as the table, the map, and the distance of the arms.
+        """
+        clearance = self.config.straight if straight else self.config.clearance
+        if known.apart > clearance.arms:
+            clearance = clearance.model_copy(update={"arms": known.apart})
+        certain = (*self.static, *known.solids)
+        fixed = frozenset(body.id for body in certain)
+        return CollisionScene(
+            self.robot,
+            Surroundings(
+                state=state if gripper is None else self.with_gripper(state, gripper),
+                boxes=[*certain, *boxes],
+                held=held,
+                touchable=touchable,
+                supports=fixed | touchable,
+                fixed=fixed,
+                clearance=clearance,
+                map=known.map,
+            ),
+        )
+
+    def with_gripper(self, state: Mapping[str, float], position: float) -> dict[str, float]:
+        """The state with the arm's finger joints at another position, m."""
+        return {**state, **dict.fromkeys(self.robot.arm.gripper_joints, position)}
+
+    def relax(self, scene: CollisionScene, start: Array) -> None:
+        """Let the arm leave its start: where it overlaps an estimated box, the box is wrong, not the arm.
+
+        Raises:
+            OpenArmError: IN_COLLISION, when it is stuck deeper than an error of measurement explains.
+        """
+        planning = self.config.planning
+        contact = scene.relax(start, planning.start_overlap, planning.estimate_overlap)
+        if contact is not None:
+            text = f"the {self.name} arm starts in collision: {contact}; free it by hand or correct the obstacle"
+            raise PlanFailedError(Code.IN_COLLISION, text, "start", contact)
+
+    def plan(
+        self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float, fineness: float = 1.0
+    ) -> PlannedPath:
+        """Free path to one of several configurations (k, n), an earlier one preferred.
+
+        Raises:
+            OpenArmError: NO_PLAN, saying what is in the way of the straight joint line; CANCELLED.
+        """
+        search = self.config.planning
+        query = self.query(scene, now, goals, time_limit, fineness)
+        try:
+            return self._planner.plan(query)
+        except OpenArmError as error:
+            if error.code != Code.NO_PLAN:
+                raise
+            hit = scene.first_hit(now.start, goals[0], search.edge_step, search.edge_travel)
+            contact = None if hit is None else scene.contacts(hit)[0]
+            blocked = "" if contact is None else f"; on the direct way {contact}"
+            raise PlanFailedError(Code.NO_PLAN, error.message + blocked, "search", contact) from error
+
+    def plan_certified(self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float) -> CertifiedPlan:
+        """Free path to one of several configurations, timed, and looked at densely on the exact layer.
+
+        Where the dense look finds what the search stepped over, the search is repeated with finer steps.
+
+        Raises:
+            OpenArmError: as `plan`; IN_COLLISION, when the finest search did not help.
+        """
+        end = time.monotonic() + time_limit
+        fault, contact = "", None
+        for fineness in _FINENESS:
+            path = self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
+            for trajectory in self.timings(path, now.scale):
+                try:
+                    return CertifiedPlan(path, trajectory, certify(scene, trajectory))
+                except PlanFailedError as error:
+                    fault, contact = error.message, error.contact
+        text = f"the {self.name} arm's plan did not pass the dense look: {fault}"
+        raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
+
+    def query(
+        self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float, fineness: float = 1.0
+    ) -> PlanQuery:
+        """What a planner is asked for a path to one of several goals (k, n); steps are `fineness` times finer."""
+        search = self.config.planning
+        step, travel = search.edge_step / fineness, search.edge_travel / fineness
+        limits = self.limits(now.scale)
+
+        def edge_free(a: Array, b: Array) -> bool:
+            return scene.edge_free(a, b, step, travel)
+
+        return PlanQuery(
+            start=now.start,
+            goals=goals,
+            lower=self.kinematics.lower,
+            upper=self.kinematics.upper,
+            collides=scene.collides,
+            edge_free=edge_free,
+            cost=lambda a, b: segment_time(a, b, limits),
+            time_limit=time_limit,
+            iterations=search.iterations,
+            seed=search.seed,
+            stopped=now.stopped,
+            fast=cache(lambda: FastScene([scene], scene.distances)),
+            resolution=(step, travel),
+            limits=(limits.velocity, limits.acceleration, limits.jerk),
+        )
+
+    def timings(self, path: PlannedPath, scale: float) -> Iterator[Trajectory]:
+        """Timed free paths, the best first; see `blending.timings`."""
+        search = self.config.planning
+        return timings(search.timing, self.names, path.waypoints, self.limits(scale), search.period)
+
+    def time_line(self, line: Line, scale: float) -> Trajectory:
+        """Timed straight line."""
+        speed = self.config.limits.straight_speed * self.scale(scale)
+        return time_path(self.names, line.q, line.s, self.limits(scale), speed, self.config.planning.period)
+
+
+def segment_time(a: Array, b: Array, limits: JointLimits) -> float:
+    """Duration of a straight joint segment from rest to rest, s."""
+    size = np.maximum(np.abs(b - a), 1e-12)
+    if float(size.max()) < 1e-9:
+        return 0.0
+    v, acceleration, j = (float(np.min(x / size)) for x in (limits.velocity, limits.acceleration, limits.jerk))
+    return profile(1.0, v, acceleration, j).duration
+
+
+def first_contact(scene: CollisionScene, q: Array) -> Contact | None:
+    """The worst pair that is too near at a configuration, or None."""
+    return scene.contacts(q)[0] if scene.collides(q) else None

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Why a plan failed: at which stage, which pair was in the way, and how near it came."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.collision.surroundings import Contact
+
+Array = NDArray[np.float64]
+
+#: How far planning got: the request itself, the start, the goal, the straight line, the search, the dense look at the
+#: timed plan, the planning scene, beside another arm under way.
+Stage = Literal["request", "start", "goal", "line", "search", "certificate", "scene", "execution"]
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """A goal that a plan was found for.
+
+    Attributes:
+        q: (n,) rad.
+        pose: (4, 4) of the tool there, base frame, m.
+        distance: Of the tool from where it was asked to be, m.
+    """
+
+    q: Array
+    pose: Array
+    distance: float
+
+
+class PlanFailedError(OpenArmError):
+    """An error that knows where it happened.
+
+    Args:
+        code: As `OpenArmError`.
+        message: As `OpenArmError`.
+        stage: How far planning got.
+        contact: The pair in the way, where there is one.
+        alternative: The nearest goal that works, where one was looked for and found.
+    """
+
+    def __init__(
+        self,
+        code: Code,
+        message: str,
+        stage: Stage,
+        contact: Contact | None = None,
+        alternative: Alternative | None = None,
+    ) -> None:
+        super().__init__(code, message)
+        self.stage: Stage = stage
+        self.contact = contact
+        self.alternative = alternative

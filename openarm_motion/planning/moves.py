@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans of single motions of one arm: to joints, to a pose, along a line, to a named posture. Base frame, m, rad."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.collision.collision import Box, CollisionScene
+from openarm_motion.kinematics.cartesian import line_contact, solve_line
+from openarm_motion.planning.arm import Arm, Situation, first_contact, segment_time
+from openarm_motion.planning.failure import PlanFailedError
+from openarm_motion.timing.certificate import certify
+from openarm_motion.timing.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+#: A joint that is told to go no further than this from its limit is taken at its word, rad.
+_ROUNDING = 1e-3
+#: Goals of one search.
+_GOALS = 24
+#: How far the elbow may swivel along a line when it can't keep its angle, rad; the smallest that works is taken.
+_DRIFTS = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5, 0.8, -0.8)
+
+
+@dataclass(frozen=True, eq=False)
+class Around:
+    """Boxes of one request: obstacles (base frame) and what the arm holds (tool frame)."""
+
+    obstacles: Sequence[Box] = ()
+    attached: Sequence[Box] = ()
+
+
+def to_joints(arm: Arm, now: Situation, goal: Sequence[float], around: Around, what: str = "goal") -> Trajectory:
+    """Free path to a configuration.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT or LIMITS, naming the joint; IN_COLLISION, naming the pair; NO_PLAN; CANCELLED.
+    """
+    q = arm.configuration(goal, what, _ROUNDING)
+    scene = free_scene(arm, now, around)
+    contact = first_contact(scene, q)
+    if contact is not None:
+        raise PlanFailedError(Code.IN_COLLISION, f"{what} of the {arm.name} arm: {contact}", "goal", contact)
+    return _plan(arm, scene, now, q[None])
+
+
+def to_named(arm: Arm, now: Situation, posture: str, around: Around) -> Trajectory:
+    """Free path to a posture of the SRDF.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, listing the postures there are; as `to_joints`.
+    """
+    state = arm.description.group_state(arm.config.group.format(arm=arm.name), posture)
+    start: dict[str, float] = dict(zip(arm.names, now.start.tolist(), strict=True))
+    goal = [state.get(name, start[name]) for name in arm.names]
+    return to_joints(arm, now, goal, around, f"posture {posture!r}")
+
+
+def to_pose(arm: Arm, now: Situation, pose: Array, around: Around, *, free_orientation: bool = False) -> Trajectory:
+    """Free path to the tool pose (4, 4), in whichever configuration is nearest.
+
+    Raises:
+        OpenArmError: UNREACHABLE, with the nearest reachable pose; IN_COLLISION, naming the pair; NO_PLAN; CANCELLED.
+    """
+    margin = arm.config.planning.joint_margin
+    scene = free_scene(arm, now, around)
+    if free_orientation:
+        solutions = arm.inverse.position_solutions(pose, margin, now.start)
+    else:
+        solutions = arm.inverse.solutions(pose, margin, now.start)
+    if not solutions:
+        raise unreachable(arm, pose, free_orientation=free_orientation)
+    limits = arm.limits(now.scale)
+    ordered = sorted((s.q for s in solutions), key=lambda q: segment_time(now.start, q, limits))
+    goals = [q for q in ordered if not scene.collides(q)][:_GOALS]
+    if not goals:
+        contact = scene.contacts(ordered[0])[0]
+        text = f"pose of the {arm.name} arm: {contact} (all {len(ordered)} configurations collide)"
+        raise PlanFailedError(Code.IN_COLLISION, text, "goal", contact)
+    return _plan(arm, scene, now, np.array(goals))
+
+
+def to_pose_on_line(arm: Arm, now: Situation, pose: Array, around: Around) -> Trajectory:
+    """Straight line of the tool to a pose (4, 4), without a change of branch, looked at densely when it is timed.
+
+    Raises:
+        OpenArmError: UNREACHABLE, saying where the line ends and why; IN_COLLISION, naming the pair.
+    """
+    start = arm.inverse.classify(now.start)
+    T_start = arm.kinematics.fk(now.start)
+    # a start nearer to a limit than the margin may go on as near
+    margin = max(0.0, min(arm.config.planning.joint_margin, arm.kinematics.margin(now.start)))
+    scene = arm.scene(now.state, around.obstacles, around.attached, straight=True, known=now.known)
+    arm.relax(scene, now.start)
+    faults: list[PlanFailedError] = []
+    for drift in _DRIFTS if not np.isnan(start.swivel) else (0.0,):
+        try:
+            line = solve_line(arm.inverse, start, T_start, pose, margin, swivel_change=drift)
+        except OpenArmError as error:
+            faults.append(PlanFailedError(error.code, error.message, "line"))
+            continue
+        contact = line_contact(scene, line)
+        if contact is not None:
+            faults.append(PlanFailedError(Code.IN_COLLISION, f"on the straight line {contact}", "line", contact))
+            continue
+        trajectory = arm.time_line(line, now.scale)
+        try:
+            certify(scene, trajectory)
+        except PlanFailedError as error:
+            faults.append(error)
+            continue
+        return trajectory
+    worst = next((fault for fault in faults if fault.code == Code.IN_COLLISION), faults[0])
+    raise PlanFailedError(worst.code, f"{arm.name} arm: {worst.message}", "line", worst.contact)
+
+
+def unreachable(
+    arm: Arm, pose: Array, *, free_orientation: bool, margin: float | None = None, near: Array | None = None
+) -> OpenArmError:
+    """The error for a pose that the arm can't reach: the reason, and the nearest pose to it, looked for from `near`."""
+    x, y, z = pose[:3, 3]
+    kept = arm.config.planning.joint_margin if margin is None else margin
+    why = arm.inverse.why_not(pose, kept, near, position_only=free_orientation)
+    hint = "" if free_orientation else "; or leave the orientation free"
+    text = f"{arm.name} arm can't reach ({x:.3f}, {y:.3f}, {z:.3f}) m: {why}{hint}"
+    return PlanFailedError(Code.UNREACHABLE, text, "goal")
+
+
+def free_scene(arm: Arm, now: Situation, around: Around) -> CollisionScene:
+    """What free paths of a request are planned in, the start freed of what it is in contact with.
+
+    Raises:
+        PlanFailedError: IN_COLLISION, when the arm starts in collision.
+    """
+    scene = arm.scene(now.state, around.obstacles, around.attached, known=now.known)
+    arm.relax(scene, now.start)
+    return scene
+
+
+def _plan(arm: Arm, scene: CollisionScene, now: Situation, goals: Array) -> Trajectory:
+    return arm.plan_certified(scene, now, goals, arm.config.planning.time_limit).trajectory

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion's messages to core data and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from geometry_msgs.msg import Point, PoseStamped
+from numpy.typing import NDArray
+from openarm_interfaces.action import PlanApproach
+from openarm_interfaces.msg import ApproachTarget, CollisionBox, CollisionObject, PlanFailure, Refusal
+from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import Marker, MarkerArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix, trajectory_to_msg, vector, xyz
+from openarm_motion.collision.solids import Box, Cylinder, Mesh, Solid, Sphere
+from openarm_motion.planning.approach import ApproachRequest, Refused, Target
+from openarm_motion.planning.failure import PlanFailedError
+from openarm_motion.timing.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+_HELD_COLOR = (0.2, 0.8, 0.4, 0.5)
+_SCENE_COLOR = (0.8, 0.3, 0.2, 0.5)
+_PREVIEW_COLOR = (0.2, 0.5, 0.9, 0.9)
+
+
+def boxes_from_msg(messages: Sequence[CollisionBox]) -> tuple[Box, ...]:
+    """Boxes; the frame is what the using message states.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, naming the box.
+    """
+    return tuple(Box(box.id, pose_to_matrix(box.pose), xyz(box.size)) for box in messages)
+
+
+def box_msg(box: Box) -> CollisionBox:
+    """Message of a box; the frame is what the using message states."""
+    return CollisionBox(id=box.id, pose=matrix_to_pose(box.T), size=vector(box.size))
+
+
+def solid_from_msg(message: CollisionObject, pose: Callable[[PoseStamped], Array]) -> Solid:
+    """A body of the planning scene; `pose` brings its pose to the base frame.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, naming the body and what is wrong with it; NO_TRANSFORM, for an unknown frame.
+    """
+    T, size = pose(message.pose), xyz(message.size)
+    if message.shape == "box":
+        return Box(message.id, T, size)
+    if message.shape == "cylinder":
+        if abs(size[0] - size[1]) > 1e-6:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"cylinder {message.id!r} has diameters {size[0]:g} and {size[1]:g} m; one only"
+            )
+        return Cylinder(message.id, T, 0.5 * float(size[0]), float(size[2]))
+    if message.shape == "sphere":
+        return Sphere(message.id, T, 0.5 * float(size[0]))
+    if message.shape == "mesh":
+        return Mesh(message.id, T, np.array([[v.x, v.y, v.z] for v in message.vertices], np.float64).reshape(-1, 3))
+    raise OpenArmError(
+        Code.INVALID_ARGUMENT, f"body {message.id!r} has shape {message.shape!r}; shapes: box, cylinder, sphere, mesh"
+    )
+
+
+def solid_msg(solid: Solid, frame: str) -> CollisionObject:
+    """Message of a body in the base frame."""
+    message = CollisionObject(id=solid.id, shape=type(solid).__name__.lower(), size=vector(solid.extents))
+    message.pose.header.frame_id = frame
+    message.pose.pose = matrix_to_pose(solid.T)
+    if isinstance(solid, Mesh):
+        message.vertices = [Point(x=float(x), y=float(y), z=float(z)) for x, y, z in solid.vertices]
+    return message
+
+
+def failure_msg(error: OpenArmError) -> PlanFailure:
+    """Where and why planning failed."""
+    message = PlanFailure(stage="request")
+    if not isinstance(error, PlanFailedError):
+        return message
+    message.stage = error.stage
+    if error.contact is not None:
+        message.first, message.second = error.contact.first, error.contact.second
+        message.distance = error.contact.distance
+    if error.alternative is not None:
+        message.has_alternative, message.alternative = True, error.alternative.q.tolist()
+        message.alternative_pose = matrix_to_pose(error.alternative.pose)
+        message.alternative_distance = error.alternative.distance
+    return message
+
+
+def scene_markers(solids: Sequence[Solid], frame: str) -> MarkerArray:
+    """Bodies of the planning scene; replaces what was shown before. A mesh is shown by the box about it."""
+    array = MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
+    kinds: dict[type[Solid], int] = {Cylinder: Marker.CYLINDER, Sphere: Marker.SPHERE}
+    for k, solid in enumerate(solids):
+        marker = Marker(ns=solid.id, id=k, type=kinds.get(type(solid), Marker.CUBE), action=Marker.ADD)
+        marker.header.frame_id = frame
+        T = solid.T.copy()
+        T[:3, 3] += T[:3, :3] @ solid.centre
+        marker.pose, marker.scale = matrix_to_pose(T), vector(solid.extents)
+        marker.color.r, marker.color.g, marker.color.b, marker.color.a = _SCENE_COLOR
+        array.markers.append(marker)
+    return array
+
+
+def preview_markers(ways: Mapping[str, Array], frame: str) -> MarkerArray:
+    """The way of each arm's tool (n, 3), its start and its end; replaces what was shown before."""
+    array = MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
+    for k, (arm, points) in enumerate(ways.items()):
+        line = Marker(ns=f"{arm}/way", id=3 * k, type=Marker.LINE_STRIP, action=Marker.ADD)
+        line.points = [Point(x=float(x), y=float(y), z=float(z)) for x, y, z in points]
+        line.scale.x = 0.005
+        ends = [Marker(ns=f"{arm}/{what}", type=Marker.SPHERE, action=Marker.ADD) for what in ("start", "end")]
+        for i, (end, at) in enumerate(zip(ends, (points[0], points[-1]), strict=True)):
+            end.id = 3 * k + 1 + i
+            end.pose.position = Point(x=float(at[0]), y=float(at[1]), z=float(at[2]))
+            end.scale = vector(np.full(3, 0.02 + 0.01 * i))
+        for marker in (line, *ends):
+            marker.header.frame_id = frame
+            marker.color.r, marker.color.g, marker.color.b, marker.color.a = _PREVIEW_COLOR
+            array.markers.append(marker)
+    return array
+
+
+def request_from_msg(goal: PlanApproach.Goal) -> ApproachRequest:
+    """What a goal of /motion/plan_approach asks.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for a pose or a box that is none.
+    """
+    return ApproachRequest(
+        targets=tuple(_target(target) for target in goal.targets),
+        obstacles=boxes_from_msg(goal.obstacles),
+        attached=boxes_from_msg(goal.attached),
+        touchable=frozenset(goal.touchable),
+        attached_after=goal.attached_after_approach,
+        detached_after=goal.detached_after_approach,
+    )
+
+
+def trajectory_msg(trajectory: Trajectory) -> JointTrajectory:
+    """Message of a trajectory."""
+    return trajectory_to_msg(trajectory.names, trajectory.t, trajectory.q, trajectory.v, trajectory.a)
+
+
+def refusals_msg(refusals: Sequence[Refused]) -> list[Refusal]:
+    """Messages of refusals."""
+    return [Refusal(id=refused.id, code=refused.code.value, message=refused.message) for refused in refusals]
+
+
+def markers_msg(held: Mapping[str, tuple[str, Sequence[Box]]]) -> MarkerArray:
+    """Everything that is held: by arm, the tool frame and the boxes in it; replaces what was shown before."""
+    array = MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
+    for arm, (frame, boxes) in held.items():
+        for k, box in enumerate(boxes):
+            marker = Marker(ns=f"{arm}/{box.id}", id=k, type=Marker.CUBE, action=Marker.ADD, frame_locked=True)
+            marker.header.frame_id = frame
+            marker.pose = matrix_to_pose(box.T)
+            marker.scale = vector(box.size)
+            marker.color.r, marker.color.g, marker.color.b, marker.color.a = _HELD_COLOR
+            array.markers.append(marker)
+    return array
+
+
+def _target(message: ApproachTarget) -> Target:
+    return Target(
+        id=message.id,
+        pose=pose_to_matrix(message.pose),
+        approach_offset=xyz(message.approach_offset),
+        retreat_offset=xyz(message.retreat_offset),
+        score=message.score,
+    )

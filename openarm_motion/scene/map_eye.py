@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map from shared memory, if it is there and fresh, without the cells that something known explains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.octree.distance_field import DistanceField, DistanceFieldReader
+from openarm_common.robot.description import RobotDescription
+from openarm_motion.collision.seen import SeenMap, robot_bodies
+from openarm_motion.collision.solids import Solid
+from openarm_motion.config import MapConfig
+from openarm_motion.planning.failure import PlanFailedError
+
+#: How often a map is read again that was written over meanwhile.
+_TRIES = 3
+
+
+@dataclass(frozen=True)
+class Look:
+    """What there is of the map: `seen` is None where plans go without it, and `why` says so."""
+
+    seen: SeenMap | None
+    version: int = 0
+    age_s: float = -1.0
+    why: str = ""
+
+
+class MapEye:
+    """Looks at the map.
+
+    Args:
+        config: Whether it is needed, and how old it may be.
+        path: Of the shared distance field.
+        frames: Names of the base frame; the map must be in it.
+    """
+
+    def __init__(self, config: MapConfig, path: Path, frames: Sequence[str]) -> None:
+        self._config, self._frames = config, tuple(frames)
+        self._reader = DistanceFieldReader(path)
+        self._cells: SeenMap | None = None
+
+    def look(self, now_ns: int) -> Look:
+        """The present map.
+
+        Args:
+            now_ns: The machine's monotonic clock.
+
+        Raises:
+            PlanFailedError: NOT_READY or STALE_DATA, with what is missing or how old, when the map is required.
+        """
+        if self._config.use == "off":
+            return Look(None, why="switched off")
+        version, age = 0, -1.0
+        try:
+            field = self._reader.latest()
+            version, age = field.version, (now_ns - field.now_ns) * 1e-9
+            field.require_fresh(now_ns, self._config.max_age, self._config.cameras or None)
+            if field.frame not in self._frames:
+                text = f"the map is in {field.frame!r}, expected {' or '.join(self._frames)}"
+                raise OpenArmError(Code.NO_TRANSFORM, text)
+            return Look(self._read(field), version, age)
+        except OpenArmError as error:
+            if self._config.use == "required":
+                text = f"{error.message} (parameter map.use is required)"
+                raise PlanFailedError(error.code, text, "scene") from error
+            return Look(None, version, age, error.message)
+
+    def _read(self, field: DistanceField) -> SeenMap:
+        for _ in range(_TRIES):
+            if self._cells is not None and self._cells.version == field.version:
+                return self._cells
+            cells = SeenMap.of(field)
+            if self._reader.intact(field):
+                self._cells = cells
+                return cells
+            field = self._reader.latest()
+        raise OpenArmError(Code.STALE_DATA, f"the map was written over {_TRIES} times while it was read")
+
+
+def unexplained(
+    seen: SeenMap,
+    config: MapConfig,
+    robot: RobotDescription,
+    state: Mapping[str, float],
+    certain: Sequence[Solid],
+    estimates: Sequence[Solid],
+) -> SeenMap:
+    """The map without the robot, the bodies of the scene, and those of the request and the hands (base frame)."""
+    left = seen.without(certain, config.certain_padding)
+    left = left.without(estimates, config.estimate_padding)
+    return left.without(robot_bodies(robot, state), config.robot_padding)

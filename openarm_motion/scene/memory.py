@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each arm holds, as far as plans say so: a plan tells what will be held on each of its parts."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.collision.collision import Box
+from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import Trajectory
+
+#: Plans that are remembered; a caller executes what it planned last.
+_PLANS = 32
+
+
+class HeldMemory:
+    """The one thing that the motion node remembers between requests."""
+
+    def __init__(self) -> None:
+        self._held: dict[str, tuple[Box, ...]] = {}
+        self._expected: OrderedDict[tuple[str, bytes], tuple[Box, ...]] = OrderedDict()
+
+    @property
+    def held(self) -> Mapping[str, tuple[Box, ...]]:
+        """Boxes in the tool frame by arm; arms that hold nothing are left out."""
+        return MappingProxyType({arm: boxes for arm, boxes in self._held.items() if boxes})
+
+    def on_request(self, arm: str, attached: Sequence[Box], hand_empty: bool) -> tuple[tuple[Box, ...], str]:
+        """What an arm holds on a motion that is asked for, and what the answer says of it.
+
+        Args:
+            arm: The arm.
+            attached: What the request says it holds; nothing said is what it is known to hold.
+            hand_empty: The request says that it holds nothing.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when the request says both.
+        """
+        if attached and hand_empty:
+            ids = ", ".join(box.id for box in attached)
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"attached names {ids}, and hand_empty is true; expected one of them"
+            )
+        known = self._held.get(arm, ())
+        if attached or hand_empty or not known:
+            return tuple(attached), ""
+        ids = ", ".join(box.id for box in known)
+        return known, f", with {ids} in the hand as before (hand_empty: true if it holds nothing any more)"
+
+    def hold(self, arm: str, boxes: Sequence[Box]) -> bool:
+        """Set what an arm holds; whether that is a change."""
+        before, self._held[arm] = self._held.get(arm, ()), tuple(boxes)
+        return not _same(before, self._held[arm])
+
+    def expect(self, arm: str, trajectories: Sequence[Trajectory], boxes: Sequence[Box]) -> None:
+        """Note what the arm will hold when it executes one of the trajectories."""
+        for trajectory in trajectories:
+            self._expected[arm, _key(trajectory.q)] = tuple(boxes)
+        while len(self._expected) > _PLANS:
+            self._expected.popitem(last=False)
+
+    def expected(self, arm: str, motion: Motion) -> tuple[Box, ...] | None:
+        """What the arm holds on a motion; None for one that was not planned here."""
+        return self._expected.get((arm, _key(motion.q)))
+
+
+def _key(q: NDArray[np.float64]) -> bytes:
+    """A trajectory is known by where it starts and ends and by its number of samples; + 0.0 turns -0.0 into 0.0."""
+    return (np.round(np.concatenate([q[0], q[-1], [float(len(q))]]), 6) + 0.0).tobytes()
+
+
+def _same(a: Sequence[Box], b: Sequence[Box]) -> bool:
+    return len(a) == len(b) and all(
+        x.id == y.id and np.allclose(x.T, y.T) and np.allclose(x.size, y.size) for x, y in zip(a, b, strict=True)
+    )

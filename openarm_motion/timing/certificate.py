@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Proof that a timed trajectory is free: looked at densely on the exact layer, with room for a robot that lags behind.
+
+A plan keeps the clearance of its scene where the search looked. The certificate looks again, as the controller will
+interpolate, so closely that no point of the arm moves further than `travel` between two looks, and asks for a share of
+the clearance there. Half a look away from a sample no point has moved further than half of `travel`. m, rad, s.
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from openarm_common.errors import Code
+from openarm_motion.collision.collision import Contact
+from openarm_motion.planning.failure import PlanFailedError
+from openarm_motion.timing.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+#: Share of the clearance that must be left between the looks of the search.
+_SHARE = 0.5
+#: The same to the other arm: 27 mm of 30, so that there is room for it when that one sets out.
+_ARMS = 0.9
+#: No point of the arm moves further between two looks, m.
+_TRAVEL = 0.004
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What was looked at.
+
+    Attributes:
+        states: How many states.
+        travel: No point of the arm moves further between two of them, m.
+        share: Share of each pair's clearance that was found everywhere.
+    """
+
+    states: int
+    travel: float
+    share: float
+
+
+class Checked(Protocol):
+    """What a trajectory is looked at in: a scene of one arm, or of two."""
+
+    levers: Array
+
+    def collides(self, q: Array) -> bool:
+        """Whether some pair is nearer than it may be."""
+        ...
+
+    def contacts(self, q: Array) -> list[Contact]:
+        """All pairs that are nearer than they may be, the deepest first."""
+        ...
+
+    def lenient(self, share: float, arms: float | None = None) -> AbstractContextManager[None]:
+        """Ask for only a share of each positive distance meanwhile, `arms` of that to the other arm."""
+        ...
+
+
+def certify(scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL, share: float = _SHARE) -> Certificate:
+    """Look at a trajectory densely.
+
+    Args:
+        scene: What it was planned in; its clearances are reduced meanwhile, not for good.
+        trajectory: As it goes to the controller.
+        travel: Greatest way of a point between two looks, m.
+        share: Share of each positive clearance to ask for; overlaps that are allowed stay so.
+
+    Raises:
+        PlanFailedError: IN_COLLISION, with the time and the pair.
+    """
+    times = dense_times(trajectory, scene.levers, travel)
+    states = trajectory.at(times)[0]
+    with scene.lenient(share, max(share, _ARMS)):
+        for k in ends_first(len(states)):
+            if scene.collides(states[k]):
+                contact = scene.contacts(states[k])[0]
+                text = f"after {times[k]:.2f} s of the trajectory {contact}"
+                raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
+    return Certificate(len(states), travel, share)
+
+
+def dense_times(trajectory: Trajectory, levers: Array, travel: float = _TRAVEL) -> Array:
+    """Moments between which no point moves further than `travel`, by the way that each joint turns."""
+    way = np.abs(np.diff(trajectory.q, axis=0)) @ levers
+    return subdivided(trajectory.t, way, travel)
+
+
+def subdivided(times: Array, way: Array, travel: float) -> Array:
+    """Times (m,), and as many between them as make each of the ways (m - 1,) from one to the next `travel` or less."""
+    parts = [
+        np.linspace(times[i], times[i + 1], max(1, int(np.ceil(w / travel))), endpoint=False) for i, w in enumerate(way)
+    ]
+    return np.concatenate([*parts, times[-1:]])
+
+
+def ends_first(n: int) -> list[int]:
+    """All indices, each tenth first: a collision is found early."""
+    return [*range(0, n, 10), *(k for k in range(n) if k % 10)]

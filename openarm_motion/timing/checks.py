@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of a trajectory before it is sent to a controller: joints, numbers, limits, where it starts, the other arm.
+
+s, rad, rad/s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_motion.collision.collision import Clearance, CollisionScene, Surroundings
+from openarm_motion.planning.arm import Arm
+from openarm_motion.timing.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+#: What rounding (or another interpolation between the points) may add to a limit.
+_SLACK = 1.02
+_ROUNDING = 1e-3
+#: Time between two looks at a pair of moving arms, s.
+_PAIR_STEP = 0.04
+#: Arms on their way keep this distance, m: less than plans keep, so that a plan is not refused for rounding.
+_PAIR_CLEARANCE = 0.005
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Positions (m, n) of the joints `names` at times (m,), in between as a controller interpolates.
+
+    With velocities and accelerations (m, n) that is quintic, with velocities alone cubic, without either linear.
+    """
+
+    names: tuple[str, ...]
+    t: Array
+    q: Array
+    v: Array | None = None
+    a: Array | None = None
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Motion:
+        """A planned one."""
+        return cls(trajectory.names, trajectory.t, trajectory.q, trajectory.v, trajectory.a)
+
+    @property
+    def duration(self) -> float:
+        """Time of the last point, s."""
+        return float(self.t[-1])
+
+    def at(self, t: float) -> dict[str, float]:
+        """Positions by joint name; held beyond the ends."""
+        return dict(zip(self.names, self.states(np.array([t]))[0].tolist(), strict=True))
+
+    def states(self, times: Array) -> Array:
+        """Positions (k, n) at times (k,); held beyond the ends."""
+        if self.t.size == 1:
+            return np.repeat(self.q, times.size, axis=0)
+        if self.v is not None and self.a is not None:
+            return Trajectory(self.names, self.t, self.q, self.v, self.a).at(times)[0]
+        if self.v is not None:
+            return np.asarray(CubicHermiteSpline(self.t, self.q, self.v)(np.clip(times, self.t[0], self.t[-1])))
+        return np.stack([np.interp(times, self.t, column) for column in self.q.T], axis=1)
+
+    def later(self, seconds: float) -> Motion:
+        """The same, begun later; the arm rests before."""
+        return replace(self, t=self.t + seconds)
+
+
+def check_trajectory(
+    arm: Arm,
+    names: Sequence[str],
+    t: Array,
+    q: Array,
+    v: Array | None,
+    state: Mapping[str, float],
+    a: Array | None = None,
+) -> Motion:
+    """Refuse a trajectory that the arm should not be told to follow.
+
+    Args:
+        arm: The arm.
+        names: Joints, in the order of the columns; all joints of the arm and no others.
+        t: (m,) times from the start.
+        q: (m, n) positions.
+        v: (m, n) velocities, or None.
+        state: Present positions by joint name.
+        a: (m, n) accelerations, or None.
+
+    Returns:
+        The motion, columns in the arm's order.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT or LIMITS, with the joint, the point and the value.
+    """
+    unknown = [name for name in names if name not in arm.names]
+    missing = [name for name in arm.names if name not in names]
+    if unknown or missing or len(names) != len(arm.names):
+        fault = ", ".join(filter(None, [_list("unknown", unknown), _list("missing", missing)])) or "a joint named twice"
+        raise _invalid(arm, f"{fault}; expected {', '.join(arm.names)}")
+    if t.size == 0:
+        raise _invalid(arm, "no points")
+    for values, what in ((q, "position"), (v, "velocity"), (a, "acceleration")):
+        if values is not None and not np.all(np.isfinite(values)):
+            k, i = (int(x) for x in np.argwhere(~np.isfinite(values))[0])
+            raise _invalid(arm, f"{what} of {names[i]} at point {k} is {values[k, i]}, expected a finite number")
+    if not np.all(np.isfinite(t)) or t[0] < 0.0 or np.any(np.diff(t) <= 0.0):
+        k = int(np.argmax(np.diff(t, prepend=-1.0) <= 0.0))
+        raise _invalid(arm, f"time of point {k} is {t[k]:g} s, expected times that rise from 0 or later")
+    order = [list(names).index(name) for name in arm.names]
+    q = q[:, order]
+    lower, upper = arm.kinematics.lower - _ROUNDING, arm.kinematics.upper + _ROUNDING
+    outside = (q < lower) | (q > upper)
+    if np.any(outside):
+        k, i = (int(x) for x in np.argwhere(outside)[0])
+        raise OpenArmError(
+            Code.LIMITS,
+            f"{arm.names[i]} at point {k} is {q[k, i]:.4f} rad, limits {arm.kinematics.lower[i]:.4f}"
+            f" to {arm.kinematics.upper[i]:.4f}",
+        )
+    fastest = arm.limits(1.0).velocity * _SLACK
+    speed = np.abs(v[:, order]) if v is not None else np.abs(np.diff(q, axis=0)) / np.diff(t)[:, None]
+    if np.any(speed > fastest):
+        k, i = (int(x) for x in np.argwhere(speed > fastest)[0])
+        raise OpenArmError(
+            Code.LIMITS,
+            f"{arm.names[i]} at point {k} moves at {speed[k, i]:.2f} rad/s, limit {fastest[i] / _SLACK:.2f}",
+        )
+    now = np.array([state[name] for name in arm.names])
+    gap = np.abs(q[0] - now)
+    i = int(np.argmax(gap))
+    if gap[i] > arm.config.execution.start_tolerance:
+        raise _invalid(
+            arm,
+            f"it starts with {arm.names[i]} at {q[0, i]:.3f} rad, the arm is at {now[i]:.3f}, expected within"
+            f" {arm.config.execution.start_tolerance:g} rad; plan again from where the arm is",
+        )
+    return Motion(arm.names, t, q, None if v is None else v[:, order], None if a is None else a[:, order])
+
+
+def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float], others: Sequence[Motion]) -> None:
+    """Refuse a motion during which the arm would meet another arm, at rest or on its way.
+
+    Args:
+        arm: The arm that is to move.
+        motion: Its motion, beginning now.
+        state: Present positions by joint name.
+        others: What the other arms still have before them, beginning now.
+
+    Raises:
+        OpenArmError: IN_COLLISION, with the pair and the time.
+    """
+    keep = Clearance(arms=_PAIR_CLEARANCE)
+    scene = CollisionScene(arm.robot, Surroundings(state=state, clearance=keep, own=False))
+    if scene.relax(motion.q[0], arm.config.planning.start_overlap) is not None:
+        return  # it is in contact already: any way out is better than none, and the plan has looked at it
+    end = max([motion.duration, *(other.duration for other in others)])
+    for t in np.linspace(0.0, end, max(2, int(np.ceil(end / _PAIR_STEP)) + 1)):
+        if others:
+            scene.set_state({**state, **{k: x for other in others for k, x in other.at(float(t)).items()}})
+        q = np.array([motion.at(float(t))[name] for name in arm.names])
+        if scene.collides(q):
+            contact = scene.contacts(q)[0]
+            raise OpenArmError(
+                Code.IN_COLLISION,
+                f"{arm.name} arm after {t:.1f} s: {contact}; wait until the other arm is out of the way",
+            )
+
+
+def _invalid(arm: Arm, fault: str) -> OpenArmError:
+    return OpenArmError(Code.INVALID_ARGUMENT, f"trajectory for the {arm.name} arm: {fault}")
+
+
+def _list(what: str, names: list[str]) -> str:
+    return f"{what} {', '.join(names)}" if names else ""

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map as messages."""
+
+from __future__ import annotations
+
+import array
+
+import numpy as np
+from geometry_msgs.msg import Point, Pose
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
+from numpy.typing import NDArray
+from octomap_msgs.msg import Octomap
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from openarm_common.octree.codec import TREE_ID, Payload
+from openarm_common.octree.lattice import Lattice
+from openarm_common.ros.convert import byte_array, cloud_from_points, ns_to_stamp
+from openarm_common.ros.node import BASE_FRAME
+from openarm_octomap.kernels import FREE, OCCUPIED
+
+#: Colours of cells from the bottom of the workspace to its top.
+_BOTTOM, _TOP = np.array([0.12, 0.35, 0.75]), np.array([0.95, 0.65, 0.20])
+
+
+def header(t_ns: int) -> Header:
+    """Header in the base frame."""
+    return Header(frame_id=BASE_FRAME, stamp=ns_to_stamp(t_ns))
+
+
+def octomap_msg(payload: Payload, resolution: float, t_ns: int) -> Octomap:
+    """An octree as octomap_server publishes it."""
+    message = Octomap(header=header(t_ns), binary=payload.binary, id=TREE_ID, resolution=resolution)
+    # an array of the field's own type is taken as it is; a list costs a thousand times more
+    message.data = array.array("b", payload.data.tobytes())
+    return message
+
+
+def centres_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> PointCloud2:
+    """Centres of the occupied cells."""
+    points = lattice.centres(np.argwhere(states == OCCUPIED)).astype(np.float32)
+    return cloud_from_points(points, BASE_FRAME, t_ns)
+
+
+def changes_msg(lattice: Lattice, states: NDArray[np.uint8], changed: NDArray[np.int32], t_ns: int) -> PointCloud2:
+    """Cells whose state changed, with a field `state`: 0 unknown, 1 free, 2 occupied."""
+    index = np.stack(np.unravel_index(changed, lattice.shape), axis=-1)
+    rows = np.empty((changed.size, 4), np.float32)
+    rows[:, :3] = lattice.centres(index)
+    rows[:, 3] = states.reshape(-1)[changed]
+    message = PointCloud2(header=header(t_ns), height=1, width=changed.size, point_step=16, row_step=16 * changed.size)
+    message.fields = [
+        PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
+        for i, name in enumerate(("x", "y", "z", "state"))
+    ]
+    message.is_dense = True
+    message.data = byte_array(rows)
+    return message
+
+
+def markers_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> MarkerArray:
+    """The occupied cells as cubes, coloured by height."""
+    marker = Marker(header=header(t_ns), ns="occupied", type=Marker.CUBE_LIST, action=Marker.ADD)
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = marker.scale.y = marker.scale.z = lattice.resolution
+    centres = lattice.centres(np.argwhere(states == OCCUPIED))
+    height = np.clip((centres[:, 2] - lattice.lower[2]) / (lattice.upper[2] - lattice.lower[2]), 0.0, 1.0)
+    layers = {
+        float(u): ColorRGBA(**dict(zip("rgba", (*(_BOTTOM + u * (_TOP - _BOTTOM)).tolist(), 1.0), strict=True)))
+        for u in np.unique(height)
+    }
+    marker.points = [Point(x=x, y=y, z=z) for x, y, z in centres.tolist()]
+    marker.colors = [layers[u] for u in height.tolist()]
+    if not marker.points:
+        marker.action = Marker.DELETE
+    return MarkerArray(markers=[marker])
+
+
+def projected_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> OccupancyGridMsg:
+    """The map seen from above: 100 where a column has an occupied cell, 0 where it has a free one only, else -1."""
+    occupied, free = (states == OCCUPIED).any(axis=2), (states == FREE).any(axis=2)
+    cells = np.where(occupied, 100, np.where(free, 0, -1)).astype(np.int8)
+    message = OccupancyGridMsg(header=header(t_ns))
+    message.info.map_load_time = message.header.stamp
+    message.info.resolution = lattice.resolution
+    message.info.width, message.info.height = lattice.shape[0], lattice.shape[1]
+    x, y, z = lattice.lower.tolist()
+    message.info.origin = Pose(position=Point(x=x, y=y, z=z))
+    message.info.origin.orientation.w = 1.0
+    message.data = array.array("b", np.ascontiguousarray(cells.T).tobytes())  # rows run along x
+    return message

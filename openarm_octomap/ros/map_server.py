@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The services of the map: those of octomap_server, and those that say what became of a request.
+
+Boxes and points are in the base frame, m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from octomap_msgs.srv import BoundingBoxQuery, GetOctomap
+from openarm_interfaces.srv import ClearMap, MapFile, QueryMap
+from rclpy.node import Node
+from std_srvs.srv import Empty
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import ns_to_stamp, xyz
+from openarm_octomap.config import UnknownPolicy
+from openarm_octomap.kernels import FREE, UNKNOWN
+from openarm_octomap.mapper import Mapper
+from openarm_octomap.ros import convert
+
+ResponseT = TypeVar("ResponseT")
+
+_STATES = {"free": FREE, "unknown": UNKNOWN}
+_POLICIES: dict[str, UnknownPolicy] = {"occupied": "occupied", "free": "free"}
+
+
+class MapServices:
+    """Offers the services.
+
+    Args:
+        node: Its node.
+        mapper: The map.
+        depths: Further depths of the tree that are answered, below 16.
+        stamp: Of the newest image in the map, ns.
+        show: Publishes a map that a request has changed.
+    """
+
+    def __init__(
+        self, node: Node, mapper: Mapper, depths: tuple[int, ...], stamp: Callable[[], int], show: Callable[[], None]
+    ) -> None:
+        self._log = node.get_logger()
+        self._mapper = mapper
+        self._stamp = stamp
+        self._show = show
+        node.create_service(GetOctomap, "octomap_binary", self._on_binary)
+        node.create_service(GetOctomap, "octomap_full", self._on_full)
+        for depth in depths:
+            node.create_service(GetOctomap, f"~/depth_{depth}/octomap_binary", self._answer_at(depth))
+        node.create_service(BoundingBoxQuery, "~/clear_bbox", self._on_clear_bbox)
+        node.create_service(Empty, "~/reset", self._on_reset)
+        node.create_service(ClearMap, "~/clear", self._on_clear)
+        node.create_service(QueryMap, "~/query", self._on_query)
+        node.create_service(MapFile, "~/save", self._on_save)
+        node.create_service(MapFile, "~/load", self._on_load)
+
+    # --- octomap_server's
+    def _on_binary(self, _: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
+        snapshot = self._mapper.snapshot()
+        response.map = convert.octomap_msg(snapshot.binary, snapshot.lattice.resolution, self._stamp())
+        return response
+
+    def _on_full(self, _: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
+        snapshot = self._mapper.snapshot({"full"})
+        if snapshot.full is not None:
+            response.map = convert.octomap_msg(snapshot.full, snapshot.lattice.resolution, self._stamp())
+        return response
+
+    def _answer_at(self, depth: int) -> Any:
+        def answer(_: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
+            lattice, payload = self._mapper.coarse(depth)
+            response.map = convert.octomap_msg(payload, lattice.resolution, self._stamp())
+            return response
+
+        return answer
+
+    def _on_clear_bbox(
+        self, request: BoundingBoxQuery.Request, response: BoundingBoxQuery.Response
+    ) -> BoundingBoxQuery.Response:
+        try:
+            self._mapper.clear_box(xyz(request.min), xyz(request.max), FREE)
+            self._show()
+        except OpenArmError as error:  # the service has no field for a reason
+            self._log.error(str(error))
+        return response
+
+    def _on_reset(self, _: Empty.Request, response: Empty.Response) -> Empty.Response:
+        self._mapper.reset()
+        self._show()
+        return response
+
+    # --- the suite's
+    def _on_clear(self, request: ClearMap.Request, response: ClearMap.Response) -> ClearMap.Response:
+        def clear() -> str:
+            state = _choose("state", request.state or "free", _STATES)
+            response.cells = self._mapper.clear_box(xyz(request.min), xyz(request.max), state)
+            self._show()
+            return f"{response.cells} cells are {request.state or 'free'}"
+
+        return _answer(response, clear)
+
+    def _on_query(self, request: QueryMap.Request, response: QueryMap.Response) -> QueryMap.Response:
+        def query() -> str:
+            policy = _choose("unknown", request.unknown or "occupied", _POLICIES)
+            points = np.array([(p.x, p.y, p.z) for p in request.points], np.float64).reshape(-1, 3)
+            found = self._mapper.query(points, request.resolution, policy)
+            response.resolution, response.stamp = found.resolution, ns_to_stamp(self._stamp())
+            response.states, response.blocked = found.states.tolist(), found.blocked.tolist()
+            return f"{int(found.blocked.sum())} of {len(points)} points are blocked at {found.resolution:g} m"
+
+        return _answer(response, query)
+
+    def _on_save(self, request: MapFile.Request, response: MapFile.Response) -> MapFile.Response:
+        def save() -> str:
+            path = _path(request.path)
+            response.nodes = self._mapper.save(path)
+            return f"{path}: {response.nodes} nodes"
+
+        return _answer(response, save)
+
+    def _on_load(self, request: MapFile.Request, response: MapFile.Response) -> MapFile.Response:
+        def load() -> str:
+            path = _path(request.path)
+            response.nodes, response.outside = self._mapper.load(path)
+            self._show()
+            return f"{path}: {response.nodes} nodes; {response.outside} leaves outside of the workspace"
+
+        return _answer(response, load)
+
+
+def _answer(response: ResponseT, work: Callable[[], str]) -> ResponseT:
+    """Fill in what became of the work: its sentence, or the reason why it was refused."""
+    answer: Any = response
+    try:
+        answer.message = work()
+        answer.success, answer.code = True, Code.OK.value
+    except OpenArmError as error:
+        answer.success, answer.code, answer.message = False, error.code.value, error.message
+    return response
+
+
+ChoiceT = TypeVar("ChoiceT")
+
+
+def _choose(field: str, value: str, choices: dict[str, ChoiceT]) -> ChoiceT:
+    if value not in choices:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{field} is {value!r}; valid: {', '.join(choices)}")
+    return choices[value]
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise OpenArmError(Code.INVALID_ARGUMENT, "path is empty; expected a file that ends in .bt or .ot")
+    return Path(text).expanduser()

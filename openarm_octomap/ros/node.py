@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `octomap`: the surroundings of the robot as an octree, from depth images, under octomap_server's names.
+
+Publishes octomap_binary, octomap_full (latched), centres, markers, projected map, and the distance field in shared
+memory (`openarm_common.octree.distance_field`). Everything is in the base frame.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from sensor_msgs.msg import Image, PointCloud2
+
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.housings import with_housings
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.octree.distance_field import CameraMoment, DistanceFieldWriter, field_path
+from openarm_common.robot.held import HeldBox
+from openarm_common.ros.held_listener import HeldListener
+from openarm_common.ros.lifecycle_node import ManagedNode
+from openarm_common.ros.node import BASE_FRAME, run
+from openarm_common.ros.tf import RobotStateListener
+from openarm_octomap.config import OctomapNodeConfig
+from openarm_octomap.mapper import Frame, Mapper, Report
+from openarm_octomap.ros.camera_client import CloudSource, DepthSource, Source
+from openarm_octomap.ros.map_publisher import MapPublisher
+from openarm_octomap.ros.map_server import MapServices
+
+
+class OctomapNode(ManagedNode[OctomapNodeConfig]):
+    """Keeps the map, publishes it, answers what it knows; looks at the cameras while its state is active."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("octomap", OctomapNodeConfig, **kwargs)
+        config = self.config
+        body = with_housings(self.description, load_cameras().values())
+        self._mapper = Mapper(body, config.grid, config.filter, config.field)
+        if config.map_file:
+            self._mapper.load(Path(config.map_file).expanduser())
+        self._cameras = [DepthSource(self, c, config.depth_topic, config.info_topic) for c in _cameras(config.cameras)]
+        self._sources: list[Source[Image] | Source[PointCloud2]] = [*self._cameras]
+        if config.cloud_topic:
+            self._sources.append(CloudSource(self, config.cloud_topic))
+        self._states = RobotStateListener(self, self.description, joints=False, depth=100, wait=config.transform_wait)
+        self._held = HeldListener(self, config.held_topic)
+        self._t_ns = 0
+        self._busy = False
+        self._edition = 0
+        self._updates = self._overruns = 0
+        self._elapsed_ms = 0.0
+        self._last: Report | None = None
+        self._fault = ""
+        self._field = self._open_field() if config.field.enabled else None
+        self._publisher = MapPublisher(self, full=config.publish_full)
+        MapServices(self, self._mapper, config.coarse_depths, lambda: self._t_ns, self._show)
+        self._timer = self.create_timer(config.period, self._on_timer, clock=self.wall_clock)
+        self._timer.cancel()
+        self.create_timer(1.0, self._report, clock=self.wall_clock)
+        if config.map_file:
+            self._show()
+        if config.autostart:
+            self.autostart()
+
+    def close(self) -> None:
+        """Wait for a running update, then take the distance field away."""
+        super().close()
+        if self._field is not None:
+            self._field.close()
+
+    # --- lifecycle
+    def begin(self) -> None:
+        """Listen to cameras and joints, and update."""
+        self._states.enable(True)
+        for source in self._sources:
+            source.listen(True)
+        self._timer.reset()
+
+    def rest(self) -> None:
+        """Leave the map as it is: who asks how old it is will hear it."""
+        self._timer.cancel()
+        for source in self._sources:
+            source.listen(False)
+        self._states.enable(False)
+
+    def forget(self) -> None:
+        """Everything becomes unknown."""
+        self._mapper.reset()
+        self._show()
+
+    @property
+    def idle(self) -> bool:
+        """Whether no update runs and no frame waits for one."""
+        return not self._busy and not any(source.waiting for source in self._sources)
+
+    # --- updates
+    async def _on_timer(self) -> None:
+        if self._busy:
+            self._overruns += 1
+            return
+        found = [source.take(self._states, filtering=self.config.filter.enabled) for source in self._sources]
+        frames = [frame for frame in found if frame is not None]
+        if not frames:
+            return
+        self._busy, edition = True, self._edition
+        try:
+            report: Report = await self.in_thread(self._update, frames, self._held.boxes, self._publisher.wanted())
+        except OpenArmError as error:
+            self._fault = error.message
+            return
+        finally:
+            self._busy = False
+        self._fault, self._last = "", report
+        self._updates += 1
+        self._t_ns = max(frame.t_ns for frame in frames)
+        if edition == self._edition:
+            self._publisher.publish(report.snapshot, self._t_ns, report.changed)
+        else:  # the map was reset, loaded or edited meanwhile: what the update saw is out of date
+            self._show()
+
+    def _update(self, frames: list[Frame], held: tuple[HeldBox, ...], wanted: set[str]) -> Report:
+        """One update, in a worker thread."""
+        begin = time.thread_time()
+        slot = self._field.begin() if self._field is not None else None
+        report = self._mapper.update(frames, held, slot, wanted)
+        by_name = {source.name: source for source in self._sources}
+        for frame in frames:
+            by_name[frame.source].took(frame.t_ns)
+        if self._field is not None:
+            self._field.commit(max(frame.t_ns for frame in frames), time.monotonic_ns(), self._moments())
+        self._elapsed_ms = (time.thread_time() - begin) * 1e3
+        return report
+
+    def _show(self) -> None:
+        """Make a map that did not come from an image visible everywhere, at once."""
+        self._edition += 1
+        self._publisher.publish(self._mapper.snapshot(self._publisher.wanted(everything=True)), self._t_ns)
+        if self._field is not None and not self._busy:
+            self._mapper.compute_distances(self._field.begin())
+            self._field.commit(self._t_ns, time.monotonic_ns(), self._moments())
+
+    def _moments(self) -> dict[str, CameraMoment]:
+        return {camera.name: CameraMoment(camera.used_t_ns, camera.used_at_ns) for camera in self._cameras}
+
+    # --- health
+    def _report(self) -> None:
+        if not self.active:
+            self.diagnose(True, "rests: /octomap/change_state activates it", updates=self._updates)
+            return
+        limit = self.config.stale_after
+        faults = [self._fault] if self._fault else []
+        values: dict[str, object] = {"updates": self._updates, "overruns": self._overruns}
+        for source in self._sources:
+            camera = source in self._cameras
+            age = source.age_s()
+            if camera and age > limit:
+                since = "never used" if age == float("inf") else f"not used for {age:.1f} s"
+                faults.append(f"{source.name} {since}" + (f" ({source.fault})" if source.fault else ""))
+            elif source.fault:
+                faults.append(source.fault)
+            values |= {f"{source.name}_used": source.used, f"{source.name}_refused": source.refused}
+            values |= {f"{source.name}_late": source.late, f"{source.name}_age_s": f"{age:.2f}"}
+        if self._last is not None:
+            values |= {"changed": self._last.changed.size, "robot_cells": self._last.reset, "ends": self._last.ends}
+            values |= self._mapper.counts(self._t_ns)
+            for source_name, links in self._last.removed.items():
+                values |= {f"{source_name}_removed/{link}": n for link, n in links.items()}
+            values |= {f"{source_name}_flying": n for source_name, n in self._last.flying.items()}
+        values |= {
+            "update_ms": f"{self._elapsed_ms:.1f}",
+            "held": ", ".join(b.name for b in self._held.boxes) or "nothing",
+        }
+        self.diagnose(not faults, "; ".join(faults) or f"map of {', '.join(self.config.cameras)}", **values)
+
+    def _open_field(self) -> DistanceFieldWriter:
+        domain = str(self.context.get_domain_id())
+        path = field_path(self.config.field.name or domain)
+        names = [camera.name for camera in self._cameras]
+        return DistanceFieldWriter(path, self._mapper.lattice, self.config.field.reach, BASE_FRAME, names)
+
+
+def _cameras(names: tuple[str, ...]) -> list[Any]:
+    cameras = load_cameras()
+    for name in names:
+        if name not in cameras or not cameras[name].depth:
+            there = ", ".join(key for key, camera in cameras.items() if camera.depth)
+            raise OpenArmError(Code.CONFIG_INVALID, f"camera {name!r} is unknown or has no depth; cameras: {there}")
+    return [cameras[name] for name in names]
+
+
+def main() -> None:
+    """Run the node."""
+    run(OctomapNode)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,329 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a detection in the image to an object in the base frame: position, yaw, size. Usable without ROS.
+
+The base frame has z up; the table is a horizontal plane at a known height. The object is taken for a prism that stands
+on it (a box, an upright cylinder or can): its top gives the height, the outline of the top centre, yaw and footprint.
+
+The outline is found where neighbouring pixels part. Where the far pixel lies lower, the edge is the ray between the
+two, cut with the plane of the top. Points on the sides of the object stand on its outline already. So edges are known
+to a fraction of a pixel and nothing is eroded. Where the far pixel is nearer to the camera, something hides the object;
+such places are left out of the fit. What is no prism (a lying cylinder) gets the smallest rectangle around its points,
+and says so.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.config import Config, metres_by_name
+from openarm_common.errors import Code, OpenArmError
+from openarm_perception.detection.detector import Detection2D, Mask
+from openarm_perception.geometry import footprint, plane
+from openarm_perception.geometry.depth import DepthImage, DepthLimits
+from openarm_perception.geometry.patch import Patch, cut
+
+Array = NDArray[np.float64]
+
+#: As many points of the sides as this are enough; tall objects show thousands.
+_SIDE_POINTS = 150
+#: What is robot to a larger share is no object on the table.
+_MOSTLY = 0.5
+
+
+class LocalizerConfig(Config):
+    """What counts as the object in the depth image."""
+
+    min_points: int = Field(default=40, ge=12, description="fewest pixels with depth on the object")
+    table_margin: float = Field(default=0.008, gt=0.0, le=0.05, description="what is lower above the table is table, m")
+    top_band: float = Field(default=0.003, gt=0.0, le=0.02, description="what lies within this of the top is top, m")
+    depth_gate: float = Field(default=0.15, gt=0.0, description="points farther from the median depth are strays, m")
+    hidden_step: float = Field(default=0.010, gt=0.0, description="a neighbour nearer by this hides the object, m")
+    side_step: float = Field(default=0.015, gt=0.0, description="a lower neighbour within this is a side, m")
+    prism_rms: float = Field(
+        default=0.0025, gt=0.0, description="an outline farther from its shape (rms) is no prism's, m"
+    )
+    std_floor: float = Field(default=0.0005, gt=0.0, description="smallest standard deviation of the position, m")
+    heights: tuple[str, ...] = Field(
+        default=(), description="known heights, as `label=metres`: such objects are located without depth too"
+    )
+    height_std: float = Field(default=0.002, gt=0.0, le=0.1, description="standard deviation of those heights, m")
+
+    @model_validator(mode="after")
+    def _pairs(self) -> LocalizerConfig:
+        self.known_heights()
+        return self
+
+    def known_heights(self) -> dict[str, float]:
+        """The known heights by label, m."""
+        return metres_by_name(self.heights, "heights", "red=0.05", 0.005, 0.5)
+
+
+@dataclass(frozen=True)
+class Detection3D:
+    """An object in the base frame.
+
+    Attributes:
+        source: The detection in the image.
+        score: How certain, 0 to 1; less for what is partly hidden.
+        T_base_object: (4, 4); origin in the middle of the object, x along the smaller horizontal extent, z up.
+        size: Smaller and larger horizontal extent, height, m.
+        covariance: (6, 6) of x, y, z, roll, pitch, yaw in the base frame, m and rad.
+        points: Pixels with depth that were used.
+        visible: Share of the outline of the top that was in view, 0 to 1.
+        method: `rectangle` or `circle` through the outline of the top; `bound`: rectangle around all points.
+        measured: Whether depth was measured; else the height is what the configuration says.
+    """
+
+    source: Detection2D
+    score: float
+    T_base_object: Array
+    size: tuple[float, float, float]
+    covariance: Array
+    points: int
+    visible: float
+    method: footprint.Kind
+    measured: bool = True
+
+    @property
+    def label(self) -> str:
+        """What it is."""
+        return self.source.label
+
+    @property
+    def position(self) -> Array:
+        """(3,) middle of the object in the base frame, m."""
+        return self.T_base_object[:3, 3].copy()
+
+    @property
+    def yaw(self) -> float:
+        """Direction of the smaller horizontal extent, rad in (-pi/2, pi/2]."""
+        return float(np.arctan2(self.T_base_object[1, 0], self.T_base_object[0, 0]))
+
+
+class Localizer:
+    """Finds where detections are.
+
+    Args:
+        config: What counts as the object.
+        limits: Depths that the camera can be trusted with.
+        table_height: Height of the table in the base frame, m.
+    """
+
+    def __init__(self, config: LocalizerConfig, limits: DepthLimits, table_height: float) -> None:
+        self.config = config
+        self.limits = limits
+        self.table_height = table_height
+        self._heights = config.known_heights()
+
+    def cut(
+        self,
+        found: Detection2D,
+        depth: DepthImage,
+        intrinsics: Intrinsics,
+        T_base_camera: Array,
+        robot: Mask | None = None,
+    ) -> Patch:
+        """The surroundings of a detection, for the methods below; arguments and errors are those of `patch.cut`."""
+        return cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
+
+    def coarse(self, patch: Patch) -> Array:
+        """Point on the visible surface: the median pixel of the mask at the median of its valid depths.
+
+        A single pixel carries the whole noise of the sensor; the median of hundreds carries next to none of it.
+
+        Returns:
+            (3,) in the base frame, m.
+
+        Raises:
+            OpenArmError: BAD_IMAGE, when there are too few valid depths.
+        """
+        v, u = np.nonzero(self._on_object(patch))
+        ray = patch.rays[int(np.median(v)), int(np.median(u))]
+        return patch.T_base_camera[:3, 3] + ray * float(np.median(patch.z[v, u]))
+
+    def locate(self, patch: Patch) -> Detection3D:
+        """The object of a detection.
+
+        Raises:
+            OpenArmError: BAD_IMAGE, when the image border cuts the object or depths are missing; NOTHING_DETECTED, when
+                nothing stands above the table there, too much of it is hidden, or most of it is the robot.
+        """
+        found = patch.found
+        if found.truncated:
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"{found.label} at pixel {_pixel(found)} is cut by the border of the image; its size is unknown",
+            )
+        if found.label in self._heights and self._valid(patch).sum() < self.config.min_points:
+            return self.locate_on_plane(found, self._heights[found.label], patch.intrinsics, patch.T_base_camera)
+        solid = self._solid(patch)
+        top = self._top_height(patch.points[..., 2][solid], patch.band)
+        face = self._top_face(patch, top)
+        pixel = float(np.median(patch.z[solid])) / patch.intrinsics.fx
+        # not beside its borders: where depth jumps, a real sensor reports any value between both sides
+        flank = solid & (patch.points[..., 2] < top - patch.band)
+        sides = patch.points[cv2.erode(flank.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, :2]
+        sides = sides[:: max(1, len(sides) // _SIDE_POINTS)]
+        edges, visible = self._edges(patch, face, flank, top)
+        try:
+            shape = footprint.fit(np.concatenate([edges, sides]), pixel)
+            if shape.rms > self.config.prism_rms:
+                shape = footprint.bound(patch.points[solid][:, :2], pixel)
+        except OpenArmError as error:
+            where = f"{found.label} at pixel {_pixel(found)}"
+            raise OpenArmError(error.code, f"{where}: {error.message}") from error
+        return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
+
+    def enclose(self, patch: Patch) -> Detection3D:
+        """A box around what is seen of a detection that cannot be measured: in the way at least there. Its score is 0.
+
+        Errors as for `locate`; what is hidden or beyond the border of the image is not in the box.
+        """
+        solid = self._solid(patch)
+        # at its borders a real sensor reports any depth
+        inner = cv2.erode(solid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        points = patch.points[inner if inner.any() else solid]
+        top = self._top_height(points[:, 2], patch.band)
+        shape = footprint.bound(points[:, :2], 3.0 * float(np.median(patch.z[solid])) / patch.intrinsics.fx)
+        return replace(self._detection(patch.found, shape, top, len(points), 0.0), score=0.0)
+
+    def locate_on_plane(
+        self, found: Detection2D, height: float, intrinsics: Intrinsics, T_base_camera: Array
+    ) -> Detection3D:
+        """The object of a detection without depth: an upright convex prism of known height on the table.
+
+        Args:
+            found: In the colour image.
+            height: Of the object, m.
+            intrinsics: Of the camera.
+            T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image; any attitude.
+
+        Raises:
+            OpenArmError: NOTHING_DETECTED, when no such prism has this silhouette.
+        """
+        camera, top = T_base_camera[:3, 3], self.table_height + height
+        middle = plane.intersect(found.centre, intrinsics, T_base_camera, (0.0, 0.0, 1.0), top)
+        distance = float(np.linalg.norm(middle - camera))
+        pixel = distance / intrinsics.fx
+        try:
+            points = plane.outline(found, intrinsics, T_base_camera, self.table_height, top, 0.5 * pixel)
+            shape = footprint.fit(points, pixel)
+            if shape.rms > self.config.prism_rms:
+                shape = footprint.bound(points, 0.0)
+        except OpenArmError as error:
+            raise OpenArmError(error.code, f"{found.label} at pixel {_pixel(found)}: {error.message}") from error
+        # a wrong height moves the object along the view: half of it, as its bottom stays where it is
+        lean = 0.5 * self.config.height_std * float(np.linalg.norm(middle[:2] - camera[:2])) / (camera[2] - top)
+        stds = (math.hypot(shape.centre_std[0], lean), math.hypot(shape.centre_std[1], lean))
+        located = self._detection(found, replace(shape, centre_std=stds), top, 0, 1.0)
+        located.covariance[2, 2] = (0.5 * self.config.height_std) ** 2
+        return replace(located, measured=False)
+
+    @staticmethod
+    def _valid(patch: Patch) -> Mask:
+        return np.asarray(patch.mask & np.isfinite(patch.z))
+
+    def _on_object(self, patch: Patch) -> Mask:
+        found, valid = patch.found, self._valid(patch)
+        count = int(np.count_nonzero(valid))
+        if count < self.config.min_points:
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"{found.label} at pixel {_pixel(found)} has {count} of {found.area} pixels with a depth of"
+                f" {self.limits.near} to {self.limits.far} m, expected at least {self.config.min_points}",
+            )
+        gate = np.abs(patch.z - np.median(patch.z[valid])) <= self.config.depth_gate
+        return valid & gate
+
+    def _solid(self, patch: Patch) -> Mask:
+        """Points of the object above the table."""
+        found = patch.found
+        share = float(np.count_nonzero(patch.robot & patch.coloured)) / found.area
+        if share > _MOSTLY:
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"{found.label} at pixel {_pixel(found)} is to {share:.0%} the robot or what it holds; it does not"
+                " stand on the table",
+            )
+        solid = self._on_object(patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
+        count = int(np.count_nonzero(solid))
+        if count < self.config.min_points:
+            raise OpenArmError(
+                Code.NOTHING_DETECTED,
+                f"{found.label} at pixel {_pixel(found)} has {count} points above the table at"
+                f" {self.table_height:.3f} m, expected at least {self.config.min_points};"
+                " is it flat, or is the table height wrong?",
+            )
+        return solid
+
+    @staticmethod
+    def _top_height(heights: Array, band: float) -> float:
+        # the quantile lies on the top as long as the top is a tenth of what is seen; the median takes the noise off
+        near_top = np.quantile(heights, 0.95)
+        return float(np.median(heights[np.abs(heights - near_top) <= band]))
+
+    @staticmethod
+    def _top_face(patch: Patch, top: float) -> Mask:
+        """The largest patch at the height of the top; depth, not colour, says where it ends."""
+        grown = cv2.dilate(patch.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        level = grown & ~patch.robot & (np.abs(patch.points[..., 2] - top) <= patch.band)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(level.astype(np.uint8), connectivity=4)
+        return labels == 1 + int(np.argmax(stats[1:count, cv2.CC_STAT_AREA]))
+
+    def _edges(self, patch: Patch, face: Mask, flank: Mask, top: float) -> tuple[Array, float]:
+        """Points (n, 2) on the edges of the top, base frame, m, and the share of its outline that is in view.
+
+        An edge lies between the face and what is far from it, or what belongs to the `flank`.
+        """
+        h, w = face.shape
+        camera = patch.T_base_camera[:3, 3]
+        found: list[Array] = []
+        seen = hidden = 0
+        margin = self.config.table_margin
+        for dv, du in ((0, -1), (0, 1), (-1, 0), (1, 0)):
+            v, u = np.nonzero(face)
+            inside = (v + dv >= 0) & (v + dv < h) & (u + du >= 0) & (u + du < w)
+            hidden += int(np.count_nonzero(~inside))
+            v, u = v[inside], u[inside]
+            parted = ~face[v + dv, u + du]
+            v, u = v[parted], u[parted]
+            near, far = (v, u), (v + dv, u + du)
+            step = patch.z[far] - patch.z[near]
+            hides = (step < -self.config.hidden_step) | patch.robot[far]
+            hidden += int(np.count_nonzero(hides))
+            distance = np.linalg.norm(patch.points[far] - patch.points[near], axis=1)
+            # a near neighbour is a hole in the mask, another colour or a side of the object: no silhouette
+            close = (distance <= self.config.side_step) & (patch.points[far][:, 2] > self.table_height + margin)
+            seen += int(np.count_nonzero(~hides))
+            ridge = flank[far] & close & ~hides
+            edge = ~(close | hides) | ridge
+            ray = 0.5 * (patch.rays[near] + patch.rays[far])[edge]
+            # the face goes on down the flank as far as heights count as top
+            height = np.where(ridge[edge], top - patch.band, top)
+            found.append(camera[:2] + ray[:, :2] * ((height - camera[2]) / ray[:, 2])[:, None])
+        return np.concatenate(found), seen / max(seen + hidden, 1)
+
+    def _detection(
+        self, found: Detection2D, shape: footprint.Footprint, top: float, count: int, visible: float
+    ) -> Detection3D:
+        height = top - self.table_height
+        R = se3.rot_z(shape.yaw)
+        T = se3.make(R, (*shape.centre, self.table_height + height / 2.0))
+        std = np.maximum([*shape.centre_std, 0.5 * self.config.std_floor], self.config.std_floor)
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = R @ np.diag(std**2) @ R.T
+        covariance[5, 5] = shape.yaw_std**2
+        size = (*shape.size, height)
+        return Detection3D(found, found.score * visible, T, size, covariance, count, visible, shape.kind)
+
+
+def _pixel(found: Detection2D) -> str:
+    return f"({found.centre[0]:.0f}, {found.centre[1]:.0f})"

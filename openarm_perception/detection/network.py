@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A detector that is a network in an ONNX file, run on the CPU by onnxruntime in one thread.
+
+Any file in the layout of YOLOv8 will do: input (1, 3, h, w) of red, green, blue 0 to 1; output (1, 4 + classes, n) of
+cx, cy, width, height in input pixels and a score per class, 0 to 1. Boxes of the same thing are sorted out here.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from openarm_common.config import AT_RUN_TIME, Config, load_yaml
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import models_dir
+from openarm_perception.detection.boxes import Candidates, Letterbox, blob, decode
+from openarm_perception.detection.detector import Detection2D
+
+Image = NDArray[np.uint8]
+
+#: Boxes that come this near to the border of the image may be cut by it, pixels.
+_BORDER = 2.0
+#: What the file is read with; the rest of the configuration says what to make of its boxes.
+_OF_THE_FILE = {"model", "names", "width", "height"}
+_LAYOUT = "expected the layout of YOLOv8: input (1, 3, h, w), output (1, 4 + classes, n)"
+
+
+class NetworkConfig(Config):
+    """Which network, and what counts as found."""
+
+    model: str = Field(
+        default="shapes_640x480",
+        description="ONNX file, or a name in models/detector",
+        json_schema_extra=AT_RUN_TIME,
+    )
+    names: tuple[str, ...] = Field(
+        default=(),
+        description="of the classes; empty: those of the file, or `names` of the YAML beside it",
+        json_schema_extra=AT_RUN_TIME,
+    )
+    classes: tuple[str, ...] = Field(
+        default=(), description="classes that are looked for; empty: all", json_schema_extra=AT_RUN_TIME
+    )
+    threshold: float = Field(
+        default=0.5, gt=0.0, lt=1.0, description="least score, 0..1", json_schema_extra=AT_RUN_TIME
+    )
+    max_overlap: float = Field(
+        default=0.6,
+        gt=0.0,
+        lt=1.0,
+        description="boxes of one class that overlap more are one thing (IoU)",
+        json_schema_extra=AT_RUN_TIME,
+    )
+    width: int = Field(
+        default=640, ge=32, le=1920, multiple_of=32, description="of the input, where the file leaves it free, pixels"
+    )
+    height: int = Field(
+        default=480, ge=32, le=1920, multiple_of=32, description="of the input, where the file leaves it free, pixels"
+    )
+
+
+class NetworkDetector:
+    """Finds what a network was trained for. The masks of its detections are their whole boxes.
+
+    Args:
+        config: Which network.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, naming the file and what is wrong with it: missing, damaged, of another layout,
+            without names for its classes; INVALID_ARGUMENT, when a class is looked for that it does not know.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        self.config = config
+        self.path = model_path(config.model)
+        self._session = _open(self.path)
+        self._input, self.size = self._check_input()
+        classes = self._check_output()
+        self.names = self._find_names(classes)
+        self._wanted: frozenset[int] = frozenset()
+        self.set_classes(config.classes)
+
+    def changed(self, config: NetworkConfig) -> NetworkDetector:
+        """The same network with other numbers; the file is read only where the configuration asks for another one.
+
+        Raises:
+            OpenArmError: As the constructor; this detector is as it was.
+        """
+        if config.model_dump(include=_OF_THE_FILE) != self.config.model_dump(include=_OF_THE_FILE):
+            return NetworkDetector(config)
+        other = copy.copy(self)
+        other.config = config
+        other.set_classes(config.classes)
+        return other
+
+    def set_classes(self, names: Sequence[str]) -> None:
+        """Look only for classes of these names from now on; for all when there are none.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing the classes that the network knows.
+        """
+        unknown = [name for name in names if name not in self.names]
+        if unknown:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"{self.path.name} knows no {', '.join(map(repr, unknown))}; classes: {', '.join(self.names)}",
+            )
+        self._wanted = frozenset(self.names.index(name) for name in (names or self.names))
+
+    def detect(self, rgb: Image) -> tuple[Detection2D, ...]:
+        """Objects of an image (h, w, 3) uint8, largest first.
+
+        Raises:
+            OpenArmError: BAD_IMAGE, for another shape or type.
+        """
+        found = self.candidates(rgb, self.config.threshold)
+        height, width = rgb.shape[:2]
+        out: list[Detection2D] = []
+        for kind, score, box in zip(found.classes, found.scores, found.boxes, strict=True):
+            left, top, right, bottom = (round(float(edge)) for edge in box)
+            if kind not in self._wanted or right <= left or bottom <= top:
+                continue
+            cut = box[0] < _BORDER or box[1] < _BORDER or box[2] > width - _BORDER or box[3] > height - _BORDER
+            centre = ((left + right - 1) / 2.0, (top + bottom - 1) / 2.0)
+            size = (right - left, bottom - top)
+            mask = np.ones((size[1], size[0]), np.bool_)
+            out.append(Detection2D(self.names[kind], float(score), centre, size, mask, bool(cut)))
+        return tuple(sorted(out, key=lambda d: -d.area))
+
+    def candidates(self, rgb: Image, threshold: float) -> Candidates:
+        """Everything from a score on, boxes in pixels of the image."""
+        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+            raise OpenArmError(
+                Code.BAD_IMAGE, f"colour image has shape {rgb.shape} and type {rgb.dtype}; expected (h, w, 3) of uint8"
+            )
+        letterbox = Letterbox.fit((rgb.shape[1], rgb.shape[0]), self.size)
+        output = self.run(blob(letterbox.place(rgb)))
+        found = decode(output, threshold, self.config.max_overlap)
+        return Candidates(found.classes, found.scores, letterbox.back(found.boxes))
+
+    def run(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The network alone: (4 + classes, n) of an input (1, 3, h, w)."""
+        return cast(NDArray[np.float32], self._session.run(None, {self._input: image})[0])[0]
+
+    # --- what the file says
+    def _check_input(self) -> tuple[str, tuple[int, int]]:
+        inputs = self._session.get_inputs()
+        shape: list[Any] = list(inputs[0].shape)
+        if len(inputs) != 1 or len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":
+            told = "; ".join(f"{item.name} {item.shape} {item.type}" for item in inputs)
+            raise self._wrong(f"its input is {told}, of tensor(float); {_LAYOUT}")
+        if shape[0] not in (1, None) and not isinstance(shape[0], str):
+            raise self._wrong(f"it takes {shape[0]} images at a time, expected one; export it with a batch of 1")
+        height, width = (
+            size if isinstance(size, int) else free
+            for size, free in zip(shape[2:], (self.config.height, self.config.width), strict=True)
+        )
+        return inputs[0].name, (width, height)
+
+    def _check_output(self) -> int:
+        """Classes, by the shape of what a grey image gives."""
+        image = np.full((1, 3, self.size[1], self.size[0]), 0.5, np.float32)
+        try:
+            outputs = self._session.run(None, {self._input: image})
+        # onnxruntime raises types of its own, which it does not document
+        except Exception as error:
+            raise self._wrong(f"it does not run on a {self.size[0]}x{self.size[1]} image: {error}") from error
+        first = np.asarray(outputs[0])
+        if first.ndim != 3 or first.shape[0] != 1 or first.shape[1] < 5 or first.shape[1] > first.shape[2]:
+            hint = ""
+            if first.ndim == 3 and first.shape[1] > first.shape[2] >= 5:
+                hint = "; that is the layout of YOLOv5, or a file exported with its own non-maximum suppression"
+            raise self._wrong(f"its output has shape {first.shape}{hint}; {_LAYOUT}")
+        scores = first[0, 4:]
+        if not np.isfinite(first).all() or scores.min() < -1e-3 or scores.max() > 1.0 + 1e-3:
+            raise self._wrong(
+                f"its scores go from {scores.min():.3g} to {scores.max():.3g}, expected 0 to 1; export it with"
+                " its sigmoid"
+            )
+        return int(first.shape[1]) - 4
+
+    def _find_names(self, classes: int) -> tuple[str, ...]:
+        if self.config.names:
+            names, where = self.config.names, "the parameter names"
+        else:
+            names, where = _names_of(self.path, dict(self._session.get_modelmeta().custom_metadata_map))
+        if not names:
+            raise self._wrong(
+                f"its {classes} classes have no names: give them in the parameter names, or in"
+                f" {self.path.with_suffix('.yaml').name} beside it (names: [a, b, …])"
+            )
+        if len(names) != classes:
+            raise self._wrong(f"it has {classes} classes, but {where} names {len(names)}: {', '.join(names)}")
+        return names
+
+    def _wrong(self, text: str) -> OpenArmError:
+        return OpenArmError(Code.CONFIG_INVALID, f"network {self.path}: {text}")
+
+
+def model_path(model: str) -> Path:
+    """The file of a model: a path, or a name in `models/detector`.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, listing the models that there are.
+    """
+    folder = models_dir() / "detector"
+    path = Path(model) if model.endswith(".onnx") else folder / f"{model}.onnx"
+    if not path.is_file():
+        names = ", ".join(sorted(file.stem for file in folder.glob("*.onnx"))) or "none"
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"there is no network {path}; models: {names}, or the path of an ONNX file"
+        )
+    return path
+
+
+def _open(path: Path) -> Any:
+    """A session of onnxruntime, which is imported here alone: who sees by colour does without."""
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise OpenArmError(
+            Code.ENVIRONMENT, f"network {path} needs onnxruntime, which is not installed: pip install onnxruntime"
+        ) from error
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # cores are for the other nodes
+    options.log_severity_level = 4  # what is wrong is told by the exception
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    # onnxruntime raises types of its own, which it does not document
+    except Exception as error:
+        raise OpenArmError(
+            Code.CONFIG_INVALID,
+            f"network {path} ({path.stat().st_size} bytes) is damaged or no ONNX file: {error}; export or copy it"
+            " again",
+        ) from error
+
+
+def _names_of(path: Path, metadata: Mapping[str, str]) -> tuple[tuple[str, ...], str]:
+    """Names of the classes and who says so: the metadata of the file (a Python or JSON mapping or list), or a YAML."""
+    names: Any = None
+    where = "its metadata"
+    if "names" in metadata:
+        try:
+            names = ast.literal_eval(metadata["names"])
+        except (ValueError, SyntaxError) as error:
+            raise OpenArmError(
+                Code.CONFIG_INVALID,
+                f"network {path}: its metadata has names {metadata['names']!r}; expected {{0: 'a', 1: 'b', …}} or"
+                " a list",
+            ) from error
+    elif path.with_suffix(".yaml").is_file():
+        where = path.with_suffix(".yaml").name
+        names = load_yaml(path.with_suffix(".yaml")).get("names")
+    if isinstance(names, dict):
+        by_number = {int(key): str(value) for key, value in cast(dict[Any, Any], names).items()}
+        return tuple(by_number[key] for key in sorted(by_number)), where
+    return tuple(str(name) for name in cast(list[Any], names or [])), where

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Moving one gripper, the way parallel_gripper_action_controller does.
+
+Position is that of the driving finger joint, m from the middle (0 closed, 0.044 open: the gap is twice that); velocity
+m/s, effort N. The command ramps to the goal and stays there, so a gripper that is stopped by an object goes on
+pressing with the effort limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+from openarm_sim_bridge.control.actuation import End
+from openarm_sim_bridge.control.tracker import Tracker
+from openarm_sim_bridge.control.trajectory import JointGroup
+
+_LIMIT_SLACK = 1e-4
+
+
+class GripperConfig(Config):
+    """How grippers move and when they are done."""
+
+    velocity: float = Field(default=0.075, gt=0.0, description="largest speed of a finger, m/s: 0.044 m in 0.6 s")
+    acceleration: float = Field(default=1.0, gt=0.0, description="largest acceleration of a finger, m/s2")
+    goal_tolerance: float = Field(default=0.001, gt=0.0, description="a finger this near its goal has reached it, m")
+    stall_velocity: float = Field(default=0.001, gt=0.0, description="a finger slower than this does not move, m/s")
+    stall_time: float = Field(default=0.2, gt=0.0, description="for how long it must not move to have stalled, s")
+    timeout: float = Field(default=3.0, gt=0.0, description="after the ramp, neither reached nor stalled: aborted, s")
+
+
+@dataclass(frozen=True)
+class GripperOutcome:
+    """How a gripper goal ended, with the finger's position (m) and effort (N) then."""
+
+    end: End
+    position: float
+    effort: float
+    stalled: bool
+    reached_goal: bool
+    text: str
+
+
+@dataclass(frozen=True)
+class GripperGoal:
+    """Where a finger shall go.
+
+    Args:
+        position: m.
+        max_effort: N; 0 or less is the limit of the gripper.
+        max_velocity: m/s; 0 or less is the configured one, which is never exceeded.
+    """
+
+    position: float
+    max_effort: float = 0.0
+    max_velocity: float = 0.0
+
+
+class GripperFollower:
+    """Makes the command of one gripper. Used by the thread that steps the world; `check` by any.
+
+    Args:
+        group: The one driving finger joint.
+        config: Speeds and tolerances.
+        position: Where the command starts, m.
+        max_effort: Limit of the gripper, N.
+    """
+
+    def __init__(self, group: JointGroup, config: GripperConfig, position: float, max_effort: float) -> None:
+        self.group = group
+        self._config = config
+        self._command = Tracker([position], [config.velocity], [config.acceleration])
+        self._target = np.array([position])
+        self._velocity = config.velocity
+        self._done: Callable[[GripperOutcome], None] | None = None
+        self._cancelled = False
+        self._still_ns = 0
+        self._arrived_ns: int | None = None
+        self._max_effort = max_effort
+        self.effort_limit = max_effort
+
+    @property
+    def busy(self) -> bool:
+        """Whether a goal is being worked on."""
+        return self._done is not None
+
+    def check(self, goal: GripperGoal) -> GripperGoal:
+        """Return the goal.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT or LIMITS, naming joint and value.
+        """
+        name, lower, upper = self.group.names[0], float(self.group.lower[0]), float(self.group.upper[0])
+        for what, value in (("position", goal.position), ("effort", goal.max_effort), ("velocity", goal.max_velocity)):
+            if not np.isfinite(value):
+                raise OpenArmError(Code.INVALID_ARGUMENT, f"{what} of {name} is {value}, expected a finite number")
+        if not lower - _LIMIT_SLACK <= goal.position <= upper + _LIMIT_SLACK:
+            raise OpenArmError(
+                Code.LIMITS,
+                f"position of {name} is {goal.position:.4f} m, out of its limits {lower:.3f} (closed) to {upper:.3f}"
+                " (open)",
+            )
+        return goal
+
+    def reset(self, position: float) -> None:
+        """Hold another position, because the world was reset; a running goal is aborted."""
+        self._finish(End.ABORTED, position, 0.0, "the simulated world was reset")
+        self._command.hold(position)
+        self._target[0] = position
+        self.effort_limit = self._max_effort
+
+    def abort(self, why: str) -> None:
+        """Give up a running goal."""
+        self._finish(End.ABORTED, float(self._command.position[0]), 0.0, why)
+
+    def set_target(self, position: float) -> None:
+        """Go to a position, m, with the default effort; ignored while a goal is worked on."""
+        if self._done is None:
+            self._aim(position, 0.0, 0.0)
+
+    def halt(self) -> None:
+        """Stop the ramp where it is, because commands ceased; what is held stays held, a goal goes on."""
+        if self._done is None:
+            self._target[:] = self._command.position
+
+    def start(self, goal: GripperGoal, position: float, effort: float, done: Callable[[GripperOutcome], None]) -> None:
+        """Work on a checked goal from now on; one that runs is aborted.
+
+        Args:
+            goal: From `check`.
+            position: Measured now, m.
+            effort: Measured now, N.
+            done: Called once, from `update` or `start`, when the goal ends.
+        """
+        self._finish(End.ABORTED, position, effort, "a newer goal took its place")
+        self._aim(goal.position, goal.max_velocity, goal.max_effort)
+        self._done, self._cancelled, self._still_ns, self._arrived_ns = done, False, 0, None
+
+    def cancel(self) -> None:
+        """Stop the ramp where it is; what is held stays held."""
+        self._cancelled = self.busy
+
+    def update(self, t_ns: int, dt_ns: int, position: float, velocity: float, effort: float) -> float:
+        """Actuator target, m, for the tick that begins at `t_ns`; measured position, velocity and effort."""
+        if self._done is not None:
+            self._judge(t_ns, dt_ns, position, velocity, effort)
+        if self._command.position[0] != self._target[0]:
+            self._command.step(self._target, dt_ns * 1e-9, self._velocity)
+        return float(self._command.position[0])
+
+    def _judge(self, t_ns: int, dt_ns: int, position: float, velocity: float, effort: float) -> None:
+        config = self._config
+        if self._cancelled:
+            self._target[:] = self._command.position
+            self._finish(End.CANCELLED, position, effort, "cancelled; the gripper holds")
+            return
+        still = abs(velocity) <= config.stall_velocity
+        self._still_ns = self._still_ns + dt_ns if still else 0
+        if self._command.position[0] != self._target[0]:
+            return
+        if self._arrived_ns is None:
+            self._arrived_ns = t_ns
+        if still and abs(position - self._target[0]) <= config.goal_tolerance:
+            self._finish(End.SUCCEEDED, position, effort, "goal reached", reached=True)
+        elif self._still_ns >= config.stall_time * 1e9:
+            self._finish(End.SUCCEEDED, position, effort, "stalled", stalled=True)
+        elif t_ns - self._arrived_ns > config.timeout * 1e9:
+            self._finish(
+                End.ABORTED,
+                position,
+                effort,
+                f"{self.group.names[0]} still moves at {velocity:.4f} m/s, {config.timeout:g} s after its command"
+                f" arrived at {self._target[0]:.4f} m",
+            )
+
+    def _aim(self, position: float, velocity: float, effort: float) -> None:
+        self._target[0] = min(max(position, float(self.group.lower[0])), float(self.group.upper[0]))
+        self._velocity = velocity if velocity > 0.0 else self._config.velocity
+        self.effort_limit = min(effort, self._max_effort) if effort > 0.0 else self._max_effort
+
+    def _finish(
+        self, end: End, position: float, effort: float, text: str, *, stalled: bool = False, reached: bool = False
+    ) -> None:
+        if self._done is not None:
+            done, self._done = self._done, None
+            done(GripperOutcome(end, position, effort, stalled, reached, text))

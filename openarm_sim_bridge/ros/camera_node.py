@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Node `mujoco_cameras`: draws the cameras in a process of its own and publishes what they see.
+
+Started by the bridge, which hands over the states to draw (see `handover`); it ends with the bridge. It listens to
+nothing on the graph and has no executor: one thread draws and publishes.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import socket
+import sys
+import time
+
+import rclpy
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_sim_bridge.cameras.handover import CameraReport, StateReceiver, Work
+from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
+from openarm_sim_bridge.ros.camera_publisher import CameraPublisher
+
+NODE_NAME = "mujoco_cameras"
+#: How often it looks who listens and tells the bridge, s.
+_REPORT_S = 0.2
+
+
+class CameraNode(Node):
+    """Draws what it is handed.
+
+    Args:
+        receiver: Where states come from.
+    """
+
+    def __init__(self, receiver: StateReceiver) -> None:
+        super().__init__(NODE_NAME, start_parameter_services=False, enable_rosout=False)
+        self._receiver = receiver
+        self._cameras = {camera.name: camera for camera in receiver.setup.cameras}
+        self._images = CameraPublisher(self, receiver.setup)
+        self._renderer: SnapshotRenderer | None = None
+        self._rendered = dict.fromkeys(self._cameras, 0)
+        self._spent_s = 0.0
+        self._drawn = 0
+        self._ready = False
+        self._fault = ""
+        self._faults = receiver.faults
+        self._report_at = 0.0
+        self._last_ns = -1
+
+    def work(self) -> None:
+        """Draw until the bridge ends.
+
+        Raises:
+            EOFError: The bridge has ended.
+        """
+        while True:
+            work = self._receiver.take(min(_REPORT_S, self._images.publish_late()))
+            if self._receiver.faults is not self._faults:
+                self._faults = self._receiver.faults
+                self._images.set_faults(self._faults)
+            if work is not None and not self._fault:
+                self._attempt(work)
+                self._last_ns = work.snapshot.t_ns
+                if self._receiver.setup.lockstep:
+                    self._tell()
+            if time.monotonic() >= self._report_at:
+                self._tell()
+
+    def _attempt(self, work: Work) -> None:
+        try:
+            self._draw(work)
+        except OpenArmError as error:
+            self._fault = str(error)
+        except Exception as error:  # what OpenGL raises is not known beforehand, and images must not end unnoticed
+            self._fault = str(OpenArmError(Code.INTERNAL, f"drawing failed: {error!r}"))
+        if self._fault:
+            self._tell()
+
+    def _draw(self, work: Work) -> None:
+        if self._renderer is None:
+            self._renderer = SnapshotRenderer(self._cameras)
+        if not self._ready:  # the first frame of a camera takes long
+            self._renderer.load(work.snapshot)
+            for name in self._cameras:
+                self._images.draw(self._renderer, name)
+            self._ready = True
+            gc.collect()
+            gc.freeze()
+            self._tell()
+        if not work.names:
+            return
+        began = time.monotonic()
+        wanted = [name for name in self._cameras if name in work.names and self._images.wants_image(name)]
+        if wanted:
+            self._images.faults.apply(work.snapshot.model)
+            self._renderer.load(work.snapshot)
+        for name in self._cameras:
+            if name not in work.names:
+                continue
+            if name in wanted:
+                self._images.draw(self._renderer, name)
+                self._rendered[name] += 1
+            self._images.publish(name, work.snapshot.t_ns, drawn=name in wanted)
+        self._spent_s += time.monotonic() - began
+        self._drawn += len(wanted)
+
+    def _tell(self) -> None:
+        self._report_at = time.monotonic() + _REPORT_S
+        sent, listeners = self._images.counts() if self._receiver.setup.lockstep else ({}, {})
+        self._receiver.report(
+            CameraReport(
+                t_ns=self._last_ns,
+                sent=sent,
+                listeners=listeners,
+                ready=self._ready,
+                fault=self._fault,
+                watched=self._images.poll(),
+                rendered=dict(self._rendered),
+                dropped=self._receiver.dropped,
+                draw_ms=1e3 * self._spent_s / max(self._drawn, 1),
+            )
+        )
+        self._spent_s, self._drawn = 0.0, 0
+
+
+def main() -> None:
+    """Run the node; the only argument is the descriptor of its end of the socket."""
+    # Signals of the terminal are for the bridge; this process ends when the bridge lets go of the socket.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.nice(1)  # a late image is a late image; a late joint state is a fault
+    end = socket.socket(fileno=int(sys.argv[1]))
+    node: CameraNode | None = None
+    try:
+        receiver = StateReceiver(end)
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        node = CameraNode(receiver)
+        node.work()
+    except EOFError:
+        pass  # the normal end
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the robot description and a scene to a MuJoCo model.
+
+The URDF goes through MuJoCo's own importer, links and names kept; what a URDF cannot say is added: actuators,
+armature, finger coupling, gravity compensation, pad friction, pairs without contact, sites; and what is not the robot:
+cameras, table, objects, lights. World frame: x forward, y left, z up; SI units. Geom groups: 0 surroundings, 1 objects,
+2 looks of the robot, 3 its collision shapes (not drawn).
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import mujoco
+import numpy as np
+from pydantic import Field
+
+from openarm_common.camera.cameras import CameraConfig
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import SIDES, RobotDescription, Side
+from openarm_common.scene.scene import Scene
+from openarm_sim_bridge.world import scenery
+from openarm_sim_bridge.world.touch import add_wrist_sensor, hand_link
+
+Positive = Annotated[float, Field(gt=0.0)]
+Seven = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive]
+Friction = tuple[Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)]]
+
+_INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+}
+_CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+_JACOBIANS = {
+    "dense": mujoco.mjtJacobian.mjJAC_DENSE,
+    "sparse": mujoco.mjtJacobian.mjJAC_SPARSE,
+    "auto": mujoco.mjtJacobian.mjJAC_AUTO,
+}
+#: Specular and shininess of the materials that are not matt.
+_GLOSS = {"silver": (0.45, 0.45), "steel": (0.35, 0.4), "finger_grey": (0.3, 0.4)}
+_MATT = (0.12, 0.15)
+_SHAPES_GROUP, _LOOKS_GROUP = 3, 2
+
+
+class PhysicsConfig(Config):
+    """Solver, contact and actuator settings with which grasps hold by friction alone.
+
+    Joint damping and dry friction come from the URDF, force limits of the arm from its efforts. `impratio` and a few
+    no-slip iterations keep a held object from creeping. The finger force is `finger_kp` times the remaining travel, up
+    to `finger_force`.
+    """
+
+    timestep: float = Field(
+        default=0.002, gt=0.0, le=0.01, description="s; the control tick of 10 ms is a multiple of it"
+    )
+    integrator: Literal["euler", "implicit", "implicitfast"] = Field(default="implicitfast", description="of MuJoCo")
+    cone: Literal["pyramidal", "elliptic"] = Field(default="elliptic", description="friction cone")
+    impratio: float = Field(default=10.0, ge=1.0, le=1000.0, description="friction impedance over normal impedance")
+    iterations: int = Field(default=100, ge=1, le=1000, description="of the solver, at most")
+    noslip_iterations: int = Field(default=4, ge=0, le=100, description="of the no-slip pass")
+    jacobian: Literal["dense", "sparse", "auto"] = Field(
+        default="auto",
+        description="of the constraints; auto: sparse from eight objects on, where it takes less time",
+    )
+    contact_solref: tuple[float, float] = Field(default=(0.005, 1.0), description="time constant (s) and damping ratio")
+    contact_solimp: tuple[float, float, float, float, float] = Field(
+        default=(0.95, 0.99, 0.001, 0.5, 2.0), description="impedance of contacts and of the finger coupling"
+    )
+    pad_friction: Friction = Field(
+        default=(1.0, 0.01, 0.001), description="finger pads: sliding, torsional (m), rolling (m)"
+    )
+    pad_condim: Literal[1, 3, 4, 6] = Field(default=4, description="contact dimensions of the pads")
+    object_friction: Friction = Field(
+        default=(0.8, 0.005, 0.0001), description="objects, table: sliding, torsional, rolling"
+    )
+    object_condim: Literal[1, 3, 4, 6] = Field(default=4, description="contact dimensions of objects")
+    arm_kp: Seven = Field(default=(230, 230, 190, 190, 100, 100, 100), description="N m/rad, joints 1 to 7")
+    arm_kv: Seven = Field(default=(2.7, 2.7, 2.2, 2.2, 1.5, 1.5, 1.5), description="N m s/rad")
+    arm_armature: Seven = Field(default=(0.0081, 0.0081, 0.16, 0.16, 0.01, 0.01, 0.01), description="kg m2")
+    finger_kp: float = Field(default=2000.0, gt=0.0, description="N/m")
+    finger_kv: float = Field(default=40.0, ge=0.0, description="N s/m")
+    finger_force: float = Field(default=30.0, gt=0.0, description="N; each pad presses with half of it")
+    finger_armature: float = Field(default=0.05, ge=0.0, description="kg")
+    gravity_compensation: float = Field(
+        default=1.0, ge=0.0, le=1.0, description="share of the arms' own weight that is carried"
+    )
+
+
+def build_spec(
+    description: RobotDescription,
+    scene: Scene,
+    cameras: Mapping[str, CameraConfig],
+    mount_seed: int | None = None,
+    physics: PhysicsConfig | None = None,
+    robot: mujoco.MjSpec | None = None,
+) -> mujoco.MjSpec:
+    """Compose the world.
+
+    Args:
+        description: The robot, from `RobotDescription.load()`.
+        scene: Table and objects.
+        cameras: By name; those of a mount with an error stand where `mount_seed` puts them.
+        mount_seed: Of the mount errors; None is the nominal mounts.
+        physics: None is the defaults.
+        robot: Of `robot_spec` with the same physics, to spare the reading of the URDF; it stays as it is.
+
+    Returns:
+        An editable model: bodies are named like links, joints and actuators like joints, objects by their names.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when what carries a camera or a fixture is not a link, or MuJoCo does not read the
+            URDF or a fixture.
+    """
+    settings = physics or PhysicsConfig()
+    spec = robot_spec(description, settings) if robot is None else robot.copy()
+    contact = contact_of(settings)
+    scenery.add_surroundings(spec, contact)
+    scenery.add_table(spec, scene.table, contact)
+    for item in scene.objects:
+        scenery.add_object(spec, item, scene.table, contact, settings.object_condim)
+    for fixture in scene.fixtures:
+        scenery.add_fixture(spec, fixture)
+    scenery.add_cameras(spec, cameras.values(), mount_seed)
+    return spec
+
+
+def compile_model(
+    description: RobotDescription,
+    scene: Scene,
+    cameras: Mapping[str, CameraConfig],
+    mount_seed: int | None = None,
+    physics: PhysicsConfig | None = None,
+) -> mujoco.MjModel:
+    """Compose and compile the world; arguments and errors as `build_spec`."""
+    spec = build_spec(description, scene, cameras, mount_seed, physics)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"MuJoCo refuses the model: {error}") from error
+
+
+def contact_of(physics: PhysicsConfig) -> dict[str, Any]:
+    """Geom attributes of objects, table and floor."""
+    return {
+        "friction": physics.object_friction,
+        "solref": physics.contact_solref,
+        "solimp": physics.contact_solimp,
+    }
+
+
+def robot_spec(description: RobotDescription, physics: PhysicsConfig) -> mujoco.MjSpec:
+    """The robot alone, ready to move.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, when MuJoCo does not read the URDF.
+    """
+    spec = _import_urdf(description)
+    _set_options(spec, physics)
+    _dress(spec, description)
+    for side in SIDES:
+        _actuate_arm(spec, description, side, physics)
+        _actuate_gripper(spec, description, side, physics)
+    for body in spec.bodies:
+        if body.name.startswith(tuple(f"openarm_{side}_" for side in SIDES)):
+            body.gravcomp = physics.gravity_compensation
+    for pair in sorted(sorted(pair) for pair in description.allowed_collisions):
+        spec.add_exclude(name=" ".join(pair), bodyname1=pair[0], bodyname2=pair[1])
+    return spec
+
+
+def _import_urdf(description: RobotDescription) -> mujoco.MjSpec:
+    root = ET.fromstring(description.urdf)
+    # By default the importer merges links that are fixed to each other, with their names, and drops the looks.
+    extension = ET.SubElement(root, "mujoco")
+    ET.SubElement(extension, "compiler", fusestatic="false", discardvisual="false")
+    try:
+        spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+    except ValueError as error:
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"MuJoCo does not read the URDF of {description.name!r}: {error}"
+        ) from error
+    spec.compiler.autolimits = True
+    return spec
+
+
+def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
+    option = spec.option
+    option.timestep = physics.timestep
+    option.integrator = _INTEGRATORS[physics.integrator]
+    option.cone = _CONES[physics.cone]
+    option.impratio = physics.impratio
+    option.iterations = physics.iterations
+    option.noslip_iterations = physics.noslip_iterations
+    option.jacobian = _JACOBIANS[physics.jacobian]
+
+
+def _dress(spec: mujoco.MjSpec, description: RobotDescription) -> None:
+    """Sort the geoms into looks and shapes, and give the looks materials (URDF materials have a colour only)."""
+    for link in description.links.values():
+        for primitive in link.visual:
+            geom = spec.geom(primitive.name)
+            geom.group = _LOOKS_GROUP
+            geom.mass = 0.0
+            if primitive.material and primitive.rgba is not None:
+                if spec.material(primitive.material) is None:
+                    specular, shininess = _GLOSS.get(primitive.material, _MATT)
+                    spec.add_material(
+                        name=primitive.material, rgba=primitive.rgba, specular=specular, shininess=shininess
+                    )
+                geom.material = primitive.material
+                geom.rgba = (0.5, 0.5, 0.5, 1.0)  # the default: anything else would override the material
+        for primitive in link.collision:
+            geom = spec.geom(primitive.name)
+            geom.group = _SHAPES_GROUP
+            geom.mass = 0.0  # masses are those of the URDF
+
+
+def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: Side, physics: PhysicsConfig) -> None:
+    for i, name in enumerate(description.arm_joints(side)):
+        effort = description.joints[name].effort
+        joint = spec.joint(name)
+        joint.armature = physics.arm_armature[i]
+        joint.actfrclimited = False  # one limit is enough: the actuator's
+        _add_servo(spec, description, name, physics.arm_kp[i], physics.arm_kv[i], effort)
+    add_wrist_sensor(spec, hand_link(side))
+    tcp = description.tcp_link(side)
+    spec.body(tcp).add_site(name=tcp, size=(0.004, 0.004, 0.004), group=4)
+
+
+def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: Side, physics: PhysicsConfig) -> None:
+    leader = description.finger_joint(side)
+    follower = next(joint.name for joint in description.joints.values() if joint.mimic == leader)
+    for name in (leader, follower):
+        joint = spec.joint(name)
+        joint.armature = physics.finger_armature
+        joint.actfrclimited = False
+        pad = spec.geom(f"{description.joints[name].child}_pad_collision")
+        # Priority: the pad's values decide over those of what it touches.
+        pad.priority = 1
+        pad.friction = physics.pad_friction
+        pad.condim = physics.pad_condim
+        pad.solref = physics.contact_solref
+        pad.solimp = physics.contact_solimp
+    _add_servo(spec, description, leader, physics.finger_kp, physics.finger_kv, physics.finger_force)
+    # The importer couples mimic joints too, but softly: the fingers would drift apart under load.
+    for equality in list(spec.equalities):
+        if follower in (equality.name1, equality.name2):
+            spec.delete(equality)
+    coupling = spec.add_equality(
+        name=follower,
+        type=mujoco.mjtEq.mjEQ_JOINT,
+        objtype=mujoco.mjtObj.mjOBJ_JOINT,
+        name1=follower,
+        name2=leader,
+        solref=physics.contact_solref,
+        solimp=physics.contact_solimp,
+    )
+    polynomial = np.zeros(len(coupling.data))
+    polynomial[0] = description.joints[follower].offset
+    polynomial[1] = description.joints[follower].multiplier
+    coupling.data = polynomial
+
+
+def _add_servo(
+    spec: mujoco.MjSpec, description: RobotDescription, name: str, kp: float, kv: float, force: float
+) -> None:
+    """A position actuator named like its joint, its range the joint's."""
+    joint = description.joints[name]
+    actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    actuator.set_to_position(kp=kp, kv=kv)
+    actuator.ctrlrange = (joint.lower, joint.upper)
+    if math.isfinite(force):
+        actuator.forcerange = (-force, force)

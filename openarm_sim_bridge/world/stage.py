@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which world is simulated: the robot and its cameras in a scene that can be exchanged and added to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+
+from openarm_common.camera.cameras import CameraConfig
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.scene.scene import Scene, SceneObject, parse_object
+from openarm_sim_bridge.control.trajectory import JointGroup
+from openarm_sim_bridge.world.compiled import CompiledWorld, TrackedObject
+from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, robot_spec
+from openarm_sim_bridge.world.world import World
+
+
+class Stage:
+    """Makes worlds from scenes.
+
+    Args:
+        description: The robot.
+        cameras: By name.
+        mount_seed: Of the camera mounts' errors; None is the nominal mounts.
+        physics: Solver, contacts, actuators.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        cameras: Mapping[str, CameraConfig],
+        mount_seed: int | None,
+        physics: PhysicsConfig,
+    ) -> None:
+        self._description = description
+        self._cameras = cameras
+        self._mount_seed = mount_seed
+        self._physics = physics
+        self._robot = robot_spec(description, physics)
+        self.joint_names = tuple(
+            name for side in SIDES for name in (*description.arm_joints(side), description.finger_joint(side))
+        )
+        self.home: dict[str, float] = {}
+        for side in SIDES:
+            self.home |= description.group_state(f"{side}_arm", "home") | {description.finger_joint(side): 0.0}
+
+    def arms(self) -> dict[str, JointGroup]:
+        """Joint group of each arm, by side."""
+        return {side: self._group(self._description.arm_joints(side)) for side in SIDES}
+
+    def grippers(self) -> dict[str, JointGroup]:
+        """Joint group (the driving finger joint) of each gripper, by side."""
+        return {side: self._group((self._description.finger_joint(side),)) for side in SIDES}
+
+    def world(self, scene: Scene) -> World:
+        """Make a world; the robot stands in its home posture, grippers closed.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when the model can't be built.
+        """
+        return World(self._spec(scene), joint_names=self.joint_names, home=self.home, objects=tracked(scene))
+
+    def compile(self, world: World, scene: Scene) -> CompiledWorld:
+        """Compile another scene for a world to take; slow, changes nothing.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when the model can't be built.
+        """
+        return world.compile(self._spec(scene), tracked(scene))
+
+    def posture(self, keyframe: str) -> dict[str, float]:
+        """Joint positions of a keyframe, rad: the SRDF's state of that name of either arm; an arm without one is home.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, naming the keyframes there are.
+        """
+        states = self._description.semantics.states
+        groups = [f"{side}_arm" for side in SIDES]
+        known = sorted({name for group, name in states if group in groups})
+        if keyframe not in known:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no keyframe {keyframe!r}; keyframes: {', '.join(known)}")
+        found = [states[group, keyframe] for group in groups if (group, keyframe) in states]
+        return self.home | {joint: position for state in found for joint, position in state.items()}
+
+    def _spec(self, scene: Scene) -> mujoco.MjSpec:
+        return build_spec(self._description, scene, self._cameras, self._mount_seed, self._physics, robot=self._robot)
+
+    def _group(self, names: tuple[str, ...]) -> JointGroup:
+        lower, upper = self._description.limits(names)
+        return JointGroup(names, lower, upper, self._description.velocity_limits(names))
+
+
+def tracked(scene: Scene) -> tuple[TrackedObject, ...]:
+    """What the judge is told of a scene."""
+    return tuple(TrackedObject(item.name, item.label, item.size) for item in scene.objects)
+
+
+def without_object(scene: Scene, name: str) -> Scene:
+    """Return the scene with one object less.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, naming the objects that exist.
+    """
+    rest = tuple(item for item in scene.objects if item.name != name)
+    if len(rest) == len(scene.objects):
+        names = ", ".join(item.name for item in scene.objects) or "none"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {names}")
+    return scene.model_copy(update={"objects": rest})
+
+
+def with_object(scene: Scene, data: Mapping[str, Any]) -> Scene:
+    """Return the scene with one more object.
+
+    Args:
+        scene: The present scene.
+        data: Keys of `SceneObject`.
+
+    Raises:
+        OpenArmError: SCENE_INVALID, when the object is wrong, off the table, or its name is taken.
+    """
+    item: SceneObject = parse_object(data, scene.table, "object")
+    if any(item.name == other.name for other in scene.objects):
+        names = ", ".join(other.name for other in scene.objects)
+        raise OpenArmError(Code.SCENE_INVALID, f"there is an object {item.name!r} already; names in use: {names}")
+    return scene.model_copy(update={"objects": (*scene.objects, item)})
