@@ -46,7 +46,8 @@ def _message_packages(package: str) -> set[str]:
     return found
 
 
-def test_a02_sources_parameters_descriptions_messages_and_graphs_are_all_here() -> None:
+@pytest.mark.requirement("A-02")
+def test_sources_parameters_descriptions_messages_and_graphs_are_all_here() -> None:
     assert len(PACKAGES) >= 7
     for package in PACKAGES:
         assert (ROOT / package / "package.xml").is_file(), package
@@ -55,7 +56,8 @@ def test_a02_sources_parameters_descriptions_messages_and_graphs_are_all_here() 
         assert list(ROOT.glob(pattern)), pattern
 
 
-def test_a03_ros_2_jazzy_on_the_pythons_it_has_wheels_for() -> None:
+@pytest.mark.requirement("A-03")
+def test_ros_2_jazzy_on_the_pythons_it_has_wheels_for() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["requires-python"] == ">=3.11,<3.14"
     assert {"ros-jazzy-rclpy", "ros-jazzy-common-interfaces", "ros-jazzy-rmw-fastrtps-cpp"} <= set(
@@ -67,12 +69,14 @@ def test_a03_ros_2_jazzy_on_the_pythons_it_has_wheels_for() -> None:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_a09_messages_come_from_wheels_or_from_interfaces(package: str) -> None:
+@pytest.mark.requirement("A-09")
+def test_messages_come_from_wheels_or_from_interfaces(package: str) -> None:
     unknown = _message_packages(package) - FROM_WHEELS - FROM_INTERFACES
     assert unknown == set(), f"{package} needs an apt ROS for {', '.join(sorted(unknown))}"
 
 
-def test_a14_the_viewer_example_steps_a_thousand_times_without_a_display() -> None:
+@pytest.mark.requirement("A-14")
+def test_the_viewer_example_steps_a_thousand_times_without_a_display() -> None:
     done = subprocess.run(
         [sys.executable, str(ROOT / "examples" / "view_world.py"), "empty", "--headless"],
         env={key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")},
@@ -86,7 +90,8 @@ def test_a14_the_viewer_example_steps_a_thousand_times_without_a_display() -> No
     assert int(match[1]) >= 2
 
 
-def test_b02_the_readme_states_who_offers_what() -> None:
+@pytest.mark.requirement("B-02")
+def test_the_readme_states_who_offers_what() -> None:
     """tests/graph/test_contract.py holds these tables against the running graph."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     for part in ("/overhead/color/image_raw", "/detections_3d", "/tf_static", "/motion/execute", "gripper_cmd"):

@@ -76,7 +76,8 @@ def act(node: Node, executor: SingleThreadedExecutor, kind: Any, name: str, goal
     return result.result().result
 
 
-def test_b66_step_1_robot_alone_tells_its_joints_and_moves_a_gripper(start_graph: Any) -> None:
+@pytest.mark.requirement("B-66")
+def test_step_1_robot_alone_tells_its_joints_and_moves_a_gripper(start_graph: Any) -> None:
     up = start_graph("sim_only")
     up.wait_ready()
     with user(up.domain) as (node, executor):
@@ -91,7 +92,8 @@ def test_b66_step_1_robot_alone_tells_its_joints_and_moves_a_gripper(start_graph
     assert up.stop() == 0
 
 
-def test_b66_step_2_every_object_is_seen_and_marked_where_it_stands(start_graph: Any) -> None:
+@pytest.mark.requirement("B-66")
+def test_step_2_every_object_is_seen_and_marked_where_it_stands(start_graph: Any) -> None:
     up = start_graph("perception")
     up.wait_ready()
     scene = {item.label: item for item in load_scene("demo").objects}
@@ -107,7 +109,8 @@ def test_b66_step_2_every_object_is_seen_and_marked_where_it_stands(start_graph:
     assert up.stop() == 0
 
 
-def test_b66_step_3_an_arm_moves_to_a_posture_without_eyes(start_graph: Any) -> None:
+@pytest.mark.requirement("B-66")
+def test_step_3_an_arm_moves_to_a_posture_without_eyes(start_graph: Any) -> None:
     up = start_graph("motion")
     up.wait_ready()
     with user(up.domain) as (node, executor):
@@ -133,9 +136,8 @@ def test_b66_step_3_an_arm_moves_to_a_posture_without_eyes(start_graph: Any) -> 
     assert up.stop() == 0
 
 
-def test_a77_b66_the_map_shows_the_objects_and_not_the_arms_and_the_step_is_recorded(
-    start_graph: Any, tmp_path: Path
-) -> None:
+@pytest.mark.requirement("A-77", "B-66")
+def test_the_map_shows_the_objects_and_not_the_arms_and_the_step_is_recorded(start_graph: Any, tmp_path: Path) -> None:
     """The step between eyes and hands, and what a recording of it holds."""
     up = start_graph("map")
     up.wait_ready()

@@ -23,7 +23,8 @@ SEED = 3
 LATE_MS = 20.0
 
 
-def test_a33_a40_n09_the_wrist_camera_is_calibrated_and_its_delay_measured(tmp_path: Path, monkeypatch) -> None:
+@pytest.mark.requirement("A-33", "A-40", "N-09")
+def test_the_wrist_camera_is_calibrated_and_its_delay_measured(tmp_path: Path, monkeypatch) -> None:
     """Six poses: 0.3 mm and 0.03° from the true mount; images whose stamps are 20 ms late are told to 1 ms."""
     for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):  # set anew for the graph, put back afterwards
         monkeypatch.setenv(name, os.environ.get(name, ""))

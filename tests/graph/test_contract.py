@@ -129,7 +129,8 @@ def _services(node: Node) -> dict[str, tuple[str, str]]:
     return found
 
 
-def test_a73_one_publisher_for_each_edge_of_the_frame_tree(graph: Node) -> None:
+@pytest.mark.requirement("A-73")
+def test_one_publisher_for_each_edge_of_the_frame_tree(graph: Node) -> None:
     from tf2_msgs.msg import TFMessage
 
     from openarm_common.ros.node import QOS_STATIC_TF, QOS_TF

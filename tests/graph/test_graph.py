@@ -81,7 +81,8 @@ def call_grasp(domain: int, **fields: object) -> Grasp.Response:
         context.try_shutdown()
 
 
-def test_b12_one_command_brings_up_every_node(up: Any) -> None:
+@pytest.mark.requirement("B-12")
+def test_one_command_brings_up_every_node(up: Any) -> None:
     record = up.record()
     assert record["ready"]
     assert set(record["nodes"]) == set(load_graph("sim").nodes)
@@ -107,7 +108,8 @@ def test_dry_run_plans_and_moves_nothing(up: Any, observer: Observer) -> None:
     assert max(float(abs(sample.p_world - track[0].p_world).max()) for sample in track) < 1e-3
 
 
-def test_a01_b06_grasp_by_service_lifts_and_places_and_a_second_one_is_refused_at_once(
+@pytest.mark.requirement("A-01", "B-06")
+def test_grasp_by_service_lifts_and_places_and_a_second_one_is_refused_at_once(
     domain: int, observer: Observer, client: GraspClient
 ) -> None:
     wait_scene(observer, load_scene("demo"), 0, JudgeConfig())
@@ -134,9 +136,8 @@ def test_a01_b06_grasp_by_service_lifts_and_places_and_a_second_one_is_refused_a
         assert state in states
 
 
-def test_a65_two_objects_are_picked_at_once_and_the_arms_keep_20_mm_apart(
-    observer: Observer, client: GraspClient
-) -> None:
+@pytest.mark.requirement("A-65")
+def test_two_objects_are_picked_at_once_and_the_arms_keep_20_mm_apart(observer: Observer, client: GraspClient) -> None:
     scene = load_scene("demo")
     after_ns = observer.reset_world("demo", 0)
     red, blue = run_pair(observer, client, scene, ("red", "blue"), after_ns=after_ns)
@@ -181,7 +182,8 @@ def test_graph_that_has_come_back_grasps_again(observer: Observer, client: Grasp
     assert result.success, f"{result.code}: {result.message}"
 
 
-def test_p34_ctrl_c_leaves_no_process_and_no_shared_memory(up: Any) -> None:
+@pytest.mark.requirement("P-34")
+def test_ctrl_c_leaves_no_process_and_no_shared_memory(up: Any) -> None:
     pids = up.pids()
     assert len(pids) >= 7
     began = time.monotonic()
@@ -193,7 +195,8 @@ def test_p34_ctrl_c_leaves_no_process_and_no_shared_memory(up: Any) -> None:
     assert "no process is left" in up.output.read_text()
 
 
-def test_p34_a_second_start_in_the_same_domain_works(start_graph: Any) -> None:
+@pytest.mark.requirement("P-34")
+def test_a_second_start_in_the_same_domain_works(start_graph: Any) -> None:
     first = start_graph("sim_only")
     first.wait_ready()
     assert first.stop(signal.SIGTERM) == 0

@@ -30,7 +30,8 @@ def run_script(start_graph: Callable[..., Any], result: Path) -> dict[str, Any]:
     return json.loads(result.read_text())
 
 
-def test_n18_the_same_seed_is_the_same_run_also_beside_a_busy_process(
+@pytest.mark.requirement("N-18")
+def test_the_same_seed_is_the_same_run_also_beside_a_busy_process(
     start_graph: Callable[..., Any], tmp_path: Path
 ) -> None:
     first = run_script(start_graph, tmp_path / "first.json")

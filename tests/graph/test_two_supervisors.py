@@ -19,7 +19,8 @@ pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 BLIND = {Code.NOTHING_DETECTED, Code.STALE_DATA, Code.NOT_READY, Code.TIMEOUT}
 
 
-def test_a05_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_holds(
+@pytest.mark.requirement("A-05")
+def test_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_holds(
     start_graph: Any, tmp_path: Path
 ) -> None:
     """The nodes of `sim` by two supervisors; a detector that is lost for good leaves a graph that refuses by name."""

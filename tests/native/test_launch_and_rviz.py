@@ -66,7 +66,8 @@ def start(launch_file: Any, **given: str) -> list[Any]:
 
 
 @pytest.mark.parametrize("graph", STAGES)
-def test_a77_each_stage_starts_the_processes_of_its_graph_and_its_view(
+@pytest.mark.requirement("A-77")
+def test_each_stage_starts_the_processes_of_its_graph_and_its_view(
     launch_file: Any, graph: str, tmp_path: Path
 ) -> None:
     *nodes, rviz = start(launch_file, graph=graph, rviz="true", domain="7")
@@ -90,7 +91,8 @@ def test_arguments_reach_the_parameters(launch_file: Any, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a77_views_show_topics_that_are_offered_as_they_are_offered(stage: str) -> None:
+@pytest.mark.requirement("A-77")
+def test_views_show_topics_that_are_offered_as_they_are_offered(stage: str) -> None:
     offered = dict(ROW.findall((ROOT / "README.md").read_text(encoding="utf-8")))
     view = yaml.safe_load((config_dir() / "rviz" / f"{stage}.rviz").read_text(encoding="utf-8"))
     manager = view["Visualization Manager"]

@@ -20,7 +20,8 @@ ROOT = Path(__file__).parents[2]
 )
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("mode", ["multicast", "server"])
-def test_a05_perception_and_control_on_two_hosts_place_the_object_as_one_does(mode: str, tmp_path: Path) -> None:
+@pytest.mark.requirement("A-05")
+def test_perception_and_control_on_two_hosts_place_the_object_as_one_does(mode: str, tmp_path: Path) -> None:
     command = [str(ROOT / "tools" / "two_machines.sh"), mode, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 
+import pytest
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState, PointCloud2
 from std_srvs.srv import Empty
@@ -69,7 +70,8 @@ class Arm(Bench):
         return points, tree
 
 
-def test_b61_clouds_and_maps_do_not_depend_on_what_arrives_first(ros, tmp_path) -> None:
+@pytest.mark.requirement("B-61")
+def test_clouds_and_maps_do_not_depend_on_what_arrives_first(ros, tmp_path) -> None:
     bench = Arm(ros, tmp_path)
 
     bench.state_at(-3, 0.0)

@@ -32,7 +32,8 @@ class _Example(Config):
     limits: _Limits = _Limits()
 
 
-def test_b62_parameters_come_from_the_model_and_take_overrides(ros) -> None:
+@pytest.mark.requirement("B-62")
+def test_parameters_come_from_the_model_and_take_overrides(ros) -> None:
     node = ros.add(
         BaseNode(
             "example", _Example, parameter_overrides=[Parameter("rate", value=50), Parameter("limits.force", value=5.0)]
@@ -116,7 +117,8 @@ _SCRIPT = textwrap.dedent(
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_p34_a_signal_ends_the_process_in_order_with_exit_code_0(stop: signal.Signals) -> None:
+@pytest.mark.requirement("P-34")
+def test_a_signal_ends_the_process_in_order_with_exit_code_0(stop: signal.Signals) -> None:
     with subprocess.Popen(
         [sys.executable, "-c", _SCRIPT], stdout=subprocess.PIPE, text=True, env=os.environ
     ) as process:

@@ -17,7 +17,8 @@ from openarm_common.ros.convert import (
 from openarm_common.ros.node import QOS_COMMAND
 
 
-def test_a25_a_trajectory_is_followed(bench) -> None:
+@pytest.mark.requirement("A-25")
+def test_a_trajectory_is_followed(bench) -> None:
     feedback: list = []
     handle, future = bench.follow(bench.goal((1.0, bench.NEAR_HOME)), feedback_callback=feedback.append)
     assert handle.accepted
@@ -77,7 +78,8 @@ Result = FollowJointTrajectory.Result
     ],
     ids=["unknown", "missing", "duplicate", "nan", "limits", "empty", "times"],
 )
-def test_p21_bad_trajectories_end_with_the_joint_and_the_value(bench, points, names, code: int, text: str) -> None:
+@pytest.mark.requirement("P-21")
+def test_bad_trajectories_end_with_the_joint_and_the_value(bench, points, names, code: int, text: str) -> None:
     _, future = bench.follow(bench.goal(*points, names=names))
     answer = bench.ros.result(future, 5.0)
     assert answer.status == GoalStatus.STATUS_ABORTED
@@ -86,7 +88,8 @@ def test_p21_bad_trajectories_end_with_the_joint_and_the_value(bench, points, na
     assert np.abs(bench.arm - bench.HOME).max() < 0.01
 
 
-def test_p21_cancel_holds(bench) -> None:
+@pytest.mark.requirement("P-21")
+def test_cancel_holds(bench) -> None:
     handle, future = bench.follow(bench.goal((4.0, bench.NEAR_HOME)))
     bench.spin_sim(2.0)
     bench.ros.result(handle.cancel_goal_async())
@@ -99,7 +102,8 @@ def test_p21_cancel_holds(bench) -> None:
     np.testing.assert_allclose(bench.arm, held, atol=0.003)
 
 
-def test_p21_a_newer_trajectory_takes_over_and_a_bad_one_does_not(bench) -> None:
+@pytest.mark.requirement("P-21")
+def test_a_newer_trajectory_takes_over_and_a_bad_one_does_not(bench) -> None:
     _, first = bench.follow(bench.goal((3.0, bench.NEAR_HOME)))
     bench.spin_sim(0.5)
     _, bad = bench.follow(bench.goal())
@@ -110,7 +114,8 @@ def test_p21_a_newer_trajectory_takes_over_and_a_bad_one_does_not(bench) -> None
     assert bench.ros.result(second, 10.0).status == GoalStatus.STATUS_SUCCEEDED
 
 
-def test_p21_a_newer_trajectory_is_refused_where_that_is_asked_for(bridge) -> None:
+@pytest.mark.requirement("P-21")
+def test_a_newer_trajectory_is_refused_where_that_is_asked_for(bridge) -> None:
     bench = bridge(images=False, trajectory__new_goal="refuse")
     _, first = bench.follow(bench.goal((1.5, bench.NEAR_HOME)))
     bench.spin_sim(0.5)
@@ -139,7 +144,8 @@ def test_a_blocked_arm_ends_with_its_tolerance_and_holds(bench) -> None:
 
 
 # --- commands
-def test_a16_a23_b55_position_commands_may_be_partial_and_unknown_names_are_ignored(bench) -> None:
+@pytest.mark.requirement("A-16", "A-23", "B-55")
+def test_position_commands_may_be_partial_and_unknown_names_are_ignored(bench) -> None:
     publisher = bench.ros.node.create_publisher(JointState, "/joint_commands", QOS_COMMAND)
     bench.ros.spin_until(lambda: publisher.get_subscription_count(), 5.0)
     publisher.publish(JointState(name=["openarm_right_joint4", "tail", bench.FINGER], position=[1.5, 9.0, 0.02]))

@@ -30,7 +30,8 @@ from openarm_common.ros.convert import (
 from openarm_common.ros.node import QOS_SENSOR, QOS_STATIC_TF, QOS_TF
 
 
-def test_a26_a28_a30_images_info_and_joint_states_belong_together(seeing) -> None:
+@pytest.mark.requirement("A-26", "A-28", "A-30")
+def test_images_info_and_joint_states_belong_together(seeing) -> None:
     colour = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
     depth = seeing.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
     infos = seeing.collect(CameraInfo, "/overhead/color/camera_info", QOS_SENSOR)
@@ -73,7 +74,8 @@ def test_a26_a28_a30_images_info_and_joint_states_belong_together(seeing) -> Non
 
 
 @pytest.mark.parametrize(("camera", "keyframe"), [("overhead", "home"), ("wrist", "wrist_look")])
-def test_p27_a30_a_cube_is_seen_where_camera_info_and_tf_say(bridge, camera: str, keyframe: str) -> None:
+@pytest.mark.requirement("P-27", "A-30")
+def test_a_cube_is_seen_where_camera_info_and_tf_say(bridge, camera: str, keyframe: str) -> None:
     """Its eight corners, from the world over /tf and /tf_static into the image, outline the red pixels."""
     bench = bridge()
     bench.ros.add(PublisherNode())
@@ -114,7 +116,8 @@ def test_p27_a30_a_cube_is_seen_where_camera_info_and_tf_say(bridge, camera: str
     assert nearest == pytest.approx(in_camera[:, 2].min(), abs=0.002)  # the nearest corner, to a pixel
 
 
-def test_p24_cameras_without_subscribers_draw_nothing(seeing) -> None:
+@pytest.mark.requirement("P-24")
+def test_cameras_without_subscribers_draw_nothing(seeing) -> None:
     seeing.spin_sim(0.5)
     assert not any(seeing.node._images.rendered.values())
     subscription = seeing.ros.node.create_subscription(Image, "/wrist/color/image_raw", lambda _m: None, QOS_SENSOR)
@@ -160,7 +163,8 @@ def test_the_drawn_world_is_the_one_that_was_loaded(seeing) -> None:
     seeing.ros.spin_until(lambda: red() == 0, 5.0, "an image without the cube")
 
 
-def test_a47_depth_in_metres_by_parameter(bridge) -> None:
+@pytest.mark.requirement("A-47")
+def test_depth_in_metres_by_parameter(bridge) -> None:
     bench = bridge(depth_encoding="32FC1", scene="empty")
     depth = bench.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
     bench.ros.spin_until(lambda: depth, 20.0, "a depth image")
@@ -168,7 +172,8 @@ def test_a47_depth_in_metres_by_parameter(bridge) -> None:
     assert np.nanmedian(depth_to_metres(depth[-1])) == pytest.approx(0.8, abs=0.2)
 
 
-def test_a52_noisy_depth_by_parameter(bridge) -> None:
+@pytest.mark.requirement("A-52")
+def test_noisy_depth_by_parameter(bridge) -> None:
     bench = bridge(depth_noise__enabled=True, scene="empty")
     depth = bench.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
     bench.ros.spin_until(lambda: len(depth) > 1, 20.0, "depth images")

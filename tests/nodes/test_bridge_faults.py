@@ -60,7 +60,8 @@ def test_camera_drop_delay_and_freeze(seeing) -> None:
     assert bytes(seeing.fresh(images, 3)[-1].data) != bytes(before.data)
 
 
-def test_a72_stamp_offset_and_intrinsics_bias(seeing) -> None:
+@pytest.mark.requirement("A-72")
+def test_stamp_offset_and_intrinsics_bias(seeing) -> None:
     infos = seeing.collect(CameraInfo, "/overhead/depth/camera_info", QOS_SENSOR)
     true = seeing.fresh(infos)[0]
     assert np.all(stamps(infos[-3:]) % 10_000_000 == 0)
@@ -234,7 +235,8 @@ def test_active_faults_are_told_on_diagnostics(bench) -> None:
 
 
 # --- objects
-def test_p25_objects_are_moved_and_removed(bench) -> None:
+@pytest.mark.requirement("P-25")
+def test_objects_are_moved_and_removed(bench) -> None:
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
 
     def objects() -> dict:

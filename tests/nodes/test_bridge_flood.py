@@ -52,7 +52,8 @@ while True:
 
 
 @pytest.mark.alone
-def test_n23_four_thousand_commands_a_second_leave_the_rate_or_are_told(ros, tmp_path) -> None:
+@pytest.mark.requirement("N-23")
+def test_four_thousand_commands_a_second_leave_the_rate_or_are_told(ros, tmp_path) -> None:
     published: list[int] = []
     told: list[DiagnosticArray] = []
     ros.node.create_subscription(

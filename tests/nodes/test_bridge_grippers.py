@@ -19,7 +19,8 @@ from openarm_common.ros.node import QOS_SENSOR
 
 
 @pytest.mark.parametrize("position", [0.005, 0.035])
-def test_p22_b55_the_gripper_reaches_its_goal(bench, position: float) -> None:
+@pytest.mark.requirement("P-22", "B-55")
+def test_the_gripper_reaches_its_goal(bench, position: float) -> None:
     answer = bench.grip(position)
     assert answer.status == GoalStatus.STATUS_SUCCEEDED
     assert answer.result.reached_goal
@@ -28,7 +29,8 @@ def test_p22_b55_the_gripper_reaches_its_goal(bench, position: float) -> None:
     assert bench.position(bench.FINGER) == pytest.approx(position, abs=0.001)
 
 
-def test_p22_a_gripper_stalls_on_an_object_and_says_so(bench) -> None:
+@pytest.mark.requirement("P-22")
+def test_a_gripper_stalls_on_an_object_and_says_so(bench) -> None:
     """A box is put between fingers that are nearly closed, in a world that stands still."""
     level = bench.posture(lambda T: [10.0 * T[2, 1], *(T[:3, 3] - [0.40, -0.39, 0.75])])  # opening axis horizontal
     bench.ros.result(bench.follow(bench.goal((1.5, level)))[1], 15.0)

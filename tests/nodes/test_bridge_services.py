@@ -20,7 +20,8 @@ from openarm_common.ros.convert import (
 from openarm_common.ros.node import QOS_COMMAND
 
 
-def test_p25_pause_and_step(bench) -> None:
+@pytest.mark.requirement("P-25")
+def test_pause_and_step(bench) -> None:
     assert not bench.call(StepSimulation, "/sim/step", steps=5).success  # it runs
     assert bench.call(SetPause, "/sim/set_pause", paused=True).success
     bench.ros.spin_until(
@@ -40,7 +41,8 @@ def test_p25_pause_and_step(bench) -> None:
     bench.spin_sim(0.2)
 
 
-def test_p25_reset_puts_the_robot_back_and_aborts_what_runs(bench) -> None:
+@pytest.mark.requirement("P-25")
+def test_reset_puts_the_robot_back_and_aborts_what_runs(bench) -> None:
     _, future = bench.follow(bench.goal((3.0, bench.NEAR_HOME)))
     bench.spin_sim(1.5)
     before, began = bench.t_ns, time.monotonic()
@@ -55,7 +57,8 @@ def test_p25_reset_puts_the_robot_back_and_aborts_what_runs(bench) -> None:
     assert np.all(np.diff(stamps) > 0)
 
 
-def test_p25_reset_takes_a_keyframe_and_overrides(bench) -> None:
+@pytest.mark.requirement("P-25")
+def test_reset_takes_a_keyframe_and_overrides(bench) -> None:
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
     pose = PoseStamped()
     pose.pose.position.x, pose.pose.position.y = 0.45, 0.30
@@ -81,7 +84,8 @@ def test_p25_reset_takes_a_keyframe_and_overrides(bench) -> None:
     bench.ros.spin_until(lambda: np.allclose(bench.arm, bench.HOME, atol=0.01), 5.0, "home again")
 
 
-def test_p25_a_reset_that_makes_no_sense_changes_nothing(bench) -> None:
+@pytest.mark.requirement("P-25")
+def test_a_reset_that_makes_no_sense_changes_nothing(bench) -> None:
     elbow = "openarm_right_joint4"
     _, running = bench.follow(bench.goal((3.0, bench.NEAR_HOME)))
     for fields, parts in (
@@ -124,7 +128,8 @@ def test_a_diverged_world_takes_no_command_until_it_is_reset(bench, tmp_path, mo
     assert bench.grip(0.02).result.reached_goal
 
 
-def test_p25_another_scene_is_loaded_while_time_goes_on(bench) -> None:
+@pytest.mark.requirement("P-25")
+def test_another_scene_is_loaded_while_time_goes_on(bench) -> None:
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
     answer = bench.call(ResetWorld, "/sim/reset_world", scene="random", seed=7)
     assert answer.success, answer.message
@@ -141,7 +146,8 @@ def test_p25_another_scene_is_loaded_while_time_goes_on(bench) -> None:
     assert [o.name for o in got[-1].objects] == names
 
 
-def test_b16_spawn_adds_an_object_on_the_table_and_names_what_is_wrong(bench) -> None:
+@pytest.mark.requirement("B-16")
+def test_spawn_adds_an_object_on_the_table_and_names_what_is_wrong(bench) -> None:
     got = bench.collect(ObjectStateArray, "/sim/ground_truth/objects", 5)
     size, pose = Vector3(x=0.04, y=0.04, z=0.04), PoseStamped()
     pose.pose.position.x, pose.pose.position.y = 0.4, 0.0

@@ -14,7 +14,8 @@ from openarm_common.ros.node import QOS_COMMAND, reliable
 
 @pytest.mark.alone
 @pytest.mark.parametrize("speed", [0.5, 3.0])
-def test_a20_the_speed_that_was_asked_for_shows_on_the_wire_or_it_says_why_not(bridge, speed: float) -> None:
+@pytest.mark.requirement("A-20")
+def test_the_speed_that_was_asked_for_shows_on_the_wire_or_it_says_why_not(bridge, speed: float) -> None:
     bench = bridge(images=False, speed=speed)
     factors = bench.collect(Float64, "/sim/real_time_factor", reliable(5))
     told = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)

@@ -33,7 +33,8 @@ from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SEN
 from openarm_sim_bridge.ros.state_publisher import JOINT_STATE_DEADLINE
 
 
-def test_a15_a16_a17_names_types_and_qos(seeing) -> None:
+@pytest.mark.requirement("A-15", "A-16", "A-17")
+def test_names_types_and_qos(seeing) -> None:
     node = seeing.ros.node
     assert "mujoco_bridge" in node.get_node_names()
     seeing.ros.spin_until(lambda: node.count_publishers("/spectator/color/image_raw"), 5.0, "the cameras' node")
@@ -80,7 +81,8 @@ def test_a15_a16_a17_names_types_and_qos(seeing) -> None:
 
 
 @pytest.mark.alone
-def test_a18_a19_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
+@pytest.mark.requirement("A-18", "A-19")
+def test_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
     factors = bench.collect(Float64, "/sim/real_time_factor", 5)
     clocks = bench.collect(Clock, "/clock", QOS_CLOCK)
     bench.spin_sim(1.0)  # discovery is over
@@ -98,7 +100,8 @@ def test_a18_a19_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
     assert np.median(np.diff(bench.joint_arrivals[-300:])) == pytest.approx(0.01, abs=0.0015)
 
 
-def test_a04_a_subscriber_that_asks_for_a_deadline_is_told_of_a_gap(bench) -> None:
+@pytest.mark.requirement("A-04")
+def test_a_subscriber_that_asks_for_a_deadline_is_told_of_a_gap(bench) -> None:
     """Lateness is noticed by the middleware; who asks for no deadline, or for best effort, hears all the same."""
     got: list[JointState] = []
     missed: list[int] = []
@@ -116,7 +119,8 @@ def test_a04_a_subscriber_that_asks_for_a_deadline_is_told_of_a_gap(bench) -> No
     bench.ros.spin_until(lambda: len(got) > n + 50, 5.0, "joint states again")
 
 
-def test_a04_a_sensor_can_not_be_had_reliably_and_that_is_told(seeing) -> None:
+@pytest.mark.requirement("A-04")
+def test_a_sensor_can_not_be_had_reliably_and_that_is_told(seeing) -> None:
     refused: list[QoSPolicyKind] = []
     events = SubscriptionEventCallbacks(incompatible_qos=lambda event: refused.append(event.last_policy_kind))
     seeing.ros.node.create_subscription(
@@ -126,7 +130,8 @@ def test_a04_a_sensor_can_not_be_had_reliably_and_that_is_told(seeing) -> None:
     assert refused[0] == QoSPolicyKind.RELIABILITY
 
 
-def test_a73_the_tree_of_frames_is_complete_and_has_no_gaps(bench) -> None:
+@pytest.mark.requirement("A-73")
+def test_the_tree_of_frames_is_complete_and_has_no_gaps(bench) -> None:
     static = bench.collect(TFMessage, "/tf_static", QOS_STATIC_TF)
     moving = bench.collect(TFMessage, "/tf", QOS_TF)
     bench.ros.spin_until(lambda: static, 5.0, "/tf_static")
@@ -192,7 +197,8 @@ def test_diagnostics_tell_how_well_it_keeps_up(seeing) -> None:
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_p34_a_signal_ends_the_process_in_order(ros, stop: signal.Signals) -> None:
+@pytest.mark.requirement("P-34")
+def test_a_signal_ends_the_process_in_order(ros, stop: signal.Signals) -> None:
     """With cameras on and a trajectory under way: no error is told, and the exit code is 0."""
     joints: list[JointState] = []
     images: list[Image] = []

@@ -60,7 +60,8 @@ def flat(millimetres: int = 700):
     return depth
 
 
-def test_b29_a47_a48_organised_points_of_every_pixel(ros) -> None:
+@pytest.mark.requirement("B-29", "A-47", "A-48")
+def test_organised_points_of_every_pixel(ros) -> None:
     """Frame and stamp of the image; x = (u - cx) z / fx; what is invalid or nearer than the camera can is NaN."""
     bench = Bench(ros)
     bench.watch()
@@ -76,7 +77,8 @@ def test_b29_a47_a48_organised_points_of_every_pixel(ros) -> None:
     assert sorted(map(tuple, np.argwhere(invalid).tolist())) == [(10, 20), (30, 40)]
 
 
-def test_a47_a48_filtered_points_from_metres(ros) -> None:
+@pytest.mark.requirement("A-47", "A-48")
+def test_filtered_points_from_metres(ros) -> None:
     """32FC1, valid points only."""
     bench = Bench(ros, organised=False)
     bench.watch()
@@ -86,7 +88,8 @@ def test_a47_a48_filtered_points_from_metres(ros) -> None:
     assert bench.clouds[0].is_dense
 
 
-def test_a50_a51_filters_thin_the_cloud(ros) -> None:
+@pytest.mark.requirement("A-50", "A-51")
+def test_filters_thin_the_cloud(ros) -> None:
     """One point a centimetre, flying pixels gone."""
     bench = Bench(ros, organised=False, **{"filter.voxel": 0.01, "filter.flying": 0.03, "filter.median": 3})
     bench.watch()
@@ -125,7 +128,8 @@ def test_what_takes_points_away_is_not_organised(ros, params) -> None:
         CloudNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()])
 
 
-def test_a58_images_are_listened_to_only_while_somebody_wants_points(ros) -> None:
+@pytest.mark.requirement("A-58")
+def test_images_are_listened_to_only_while_somebody_wants_points(ros) -> None:
     """Of that camera alone."""
     bench = Bench(ros)
     wrist = ros.node.create_publisher(Image, "/wrist/depth/image_raw", QOS_SENSOR)
@@ -146,7 +150,8 @@ def test_a58_images_are_listened_to_only_while_somebody_wants_points(ros) -> Non
         (np.zeros((480, 640), np.uint16), "16UC1", "overhead_link", "expected the optical frame"),
     ],
 )
-def test_b28_b30_b34_what_does_not_fit_is_named_and_dropped(ros, pixels, encoding, frame, text) -> None:
+@pytest.mark.requirement("B-28", "B-30", "B-34")
+def test_what_does_not_fit_is_named_and_dropped(ros, pixels, encoding, frame, text) -> None:
     """On /diagnostics; no cloud comes of it."""
     bench = Bench(ros)
     bench.watch()

@@ -57,7 +57,8 @@ def becomes(bench: Bench, *expected: list[str]) -> None:
         ("anything", ["anything", "box"]),
     ],
 )
-def test_p17_every_detector_finds_the_box_behind_the_same_topic(ros, camera, model, detector, called) -> None:
+@pytest.mark.requirement("P-17")
+def test_every_detector_finds_the_box_behind_the_same_topic(ros, camera, model, detector, called) -> None:
     bench = Bench(ros, camera=camera, detector=detector, **{"network.model": model})
     (found,) = bench.detect().detections
     assert [r.hypothesis.class_id for r in found.results] == called
@@ -71,7 +72,8 @@ def test_p17_every_detector_finds_the_box_behind_the_same_topic(ros, camera, mod
     assert float(values["rate_hz"]) >= 0.0
 
 
-def test_b69_the_detector_is_switched_while_it_runs(ros, camera, model, tmp_path) -> None:
+@pytest.mark.requirement("B-69")
+def test_the_detector_is_switched_while_it_runs(ros, camera, model, tmp_path) -> None:
     """What is set holds from the next frame on; what cannot be is refused with a reason, and the one before goes on."""
     bench = Bench(ros, camera=camera, **{"network.model": model})
     becomes(bench, ["red", "box"])
@@ -125,7 +127,8 @@ def test_while_colours_stand_in_for_a_network_the_rest_may_change(ros, camera, t
     becomes(bench, ["red", "box"])
 
 
-def test_n15_a_network_that_cannot_be_used_leaves_the_work_to_the_colours(ros, camera, tmp_path) -> None:
+@pytest.mark.requirement("N-15")
+def test_a_network_that_cannot_be_used_leaves_the_work_to_the_colours(ros, camera, tmp_path) -> None:
     path = tmp_path / "damaged.onnx"
     path.write_bytes(b"no network")
     bench = Bench(ros, camera=camera, detector="network", **{"network.model": str(path)})
@@ -135,7 +138,8 @@ def test_n15_a_network_that_cannot_be_used_leaves_the_work_to_the_colours(ros, c
     assert status.level != status.OK
 
 
-def test_n16_what_only_colour_sees_is_told_but_not_given_to_be_grasped(ros, camera, tmp_path) -> None:
+@pytest.mark.requirement("N-16")
+def test_what_only_colour_sees_is_told_but_not_given_to_be_grasped(ros, camera, tmp_path) -> None:
     """In view with score 0, as everything that is in the way and not measured."""
     blind = write_network(tmp_path / "blind.onnx", boxes(), (1, 3, 480, 640))
     bench = Bench(ros, camera=camera, detector="both", **{"network.model": str(blind)})

@@ -34,7 +34,8 @@ def bench(ros) -> Bench:
     return Bench(ros, camera=FakeCamera(ros))
 
 
-def test_a63_b01_b29_a_box_is_found_where_it_stands(bench) -> None:
+@pytest.mark.requirement("A-63", "B-01", "B-29")
+def test_a_box_is_found_where_it_stands(bench) -> None:
     """Position, size and yaw in the base frame, at the stamp of the image, through the pinhole and the mount."""
     message = bench.detect()
     assert message.header.frame_id == BASE_FRAME
@@ -52,7 +53,8 @@ def test_a63_b01_b29_a_box_is_found_where_it_stands(bench) -> None:
     assert found.results[0].pose.covariance[0] > 0.0
 
 
-def test_b31_b62_without_a_depth_topic_an_object_of_known_height_is_found_by_its_silhouette(ros) -> None:
+@pytest.mark.requirement("B-31", "B-62")
+def test_without_a_depth_topic_an_object_of_known_height_is_found_by_its_silhouette(ros) -> None:
     camera = FakeCamera(ros)
     ros.node.destroy_publisher(camera.pubs.pop("depth"))
     bench = Bench(ros, camera=camera, depth_topic="", **{"localizer.heights": ["red=0.05"]})
@@ -62,7 +64,8 @@ def test_b31_b62_without_a_depth_topic_an_object_of_known_height_is_found_by_its
     np.testing.assert_allclose((size.x, size.y, size.z), (0.04, 0.06, 0.05), atol=0.0015)
 
 
-def test_b63_the_height_of_the_table_is_measured_from_its_surface_or_a_block_and_applied(ros, bench) -> None:
+@pytest.mark.requirement("B-63")
+def test_the_height_of_the_table_is_measured_from_its_surface_or_a_block_and_applied(ros, bench) -> None:
     """The detector was told 0.41 m; the camera sees 0.40 m."""
     camera = FakeCamera(ros)
     camera.publish_mount()
@@ -96,7 +99,8 @@ def test_b63_the_height_of_the_table_is_measured_from_its_surface_or_a_block_and
         assert text in ask(**fields).message
 
 
-def test_b04_a61_boxes_in_the_image_by_their_centre(ros, bench) -> None:
+@pytest.mark.requirement("B-04", "A-61")
+def test_boxes_in_the_image_by_their_centre(ros, bench) -> None:
     """Class, score, and the middle of the box in pixels, in the optical frame."""
     boxes = Watch(ros, Detection2DArray, "/detections_2d")
     bench.pump(lambda: boxes.got, "a detection in the image")
@@ -109,7 +113,8 @@ def test_b04_a61_boxes_in_the_image_by_their_centre(ros, bench) -> None:
     assert box.results[0].hypothesis.class_id == "red"
 
 
-def test_a61_an_empty_table_is_an_answer(bench) -> None:
+@pytest.mark.requirement("A-61")
+def test_an_empty_table_is_an_answer(bench) -> None:
     """An empty array with the stamp of the image."""
     bench.camera.rgb[:] = (180, 176, 170)
     assert bench.detect("an empty answer").detections == []
@@ -128,7 +133,8 @@ def test_pictures_and_markers_for_people(ros, bench) -> None:
     assert text.text.startswith("red")
 
 
-def test_b69_images_are_listened_to_only_while_somebody_listens(ros) -> None:
+@pytest.mark.requirement("B-69")
+def test_images_are_listened_to_only_while_somebody_listens(ros) -> None:
     """No subscription without demand; demand by any output starts it, its end ends it."""
     camera = FakeCamera(ros)
     ros.add(DetectNode())
@@ -140,7 +146,8 @@ def test_b69_images_are_listened_to_only_while_somebody_listens(ros) -> None:
     ros.spin_until(camera.unwatched, 10.0, "the camera is let go")
 
 
-def test_a04_old_frames_are_dropped_not_queued(ros, bench) -> None:
+@pytest.mark.requirement("A-04")
+def test_old_frames_are_dropped_not_queued(ros, bench) -> None:
     """Frames that come faster than `max_rate` by their stamps are passed over."""
     bench.detect()
     count = len(bench.watch.got)
@@ -173,7 +180,8 @@ def test_a04_old_frames_are_dropped_not_queued(ros, bench) -> None:
         ("depth is in frame", "depth", lambda cam, t: array_to_image(cam.depth, "32FC1", "other_optical_frame", t)),
     ],
 )
-def test_b28_b30_b34_a31_what_does_not_fit_is_named_and_dropped(bench, text, stream, make) -> None:
+@pytest.mark.requirement("B-28", "B-30", "B-34", "A-31")
+def test_what_does_not_fit_is_named_and_dropped(bench, text, stream, make) -> None:
     """Encodings, sizes, frames, a CameraInfo without calibration; the next good frame is answered."""
     bench.said(text, **{stream: lambda t: make(bench.camera, t)})
     assert bench.watch.got == []
@@ -193,7 +201,8 @@ def _info(camera: FakeCamera, t_ns: int, frame: str = "") -> CameraInfo:
     return info
 
 
-def test_a31_positions_follow_the_camera_info(bench) -> None:
+@pytest.mark.requirement("A-31")
+def test_positions_follow_the_camera_info(bench) -> None:
     """Twice the focal length in the CameraInfo, half the size: the node has no other source."""
     whole = bench.detect().detections[0].bbox.size.y
     K = bench.camera.K
@@ -201,7 +210,8 @@ def test_a31_positions_follow_the_camera_info(bench) -> None:
     assert bench.detect().detections[0].bbox.size.y == pytest.approx(whole / 2.0, rel=0.05)
 
 
-def test_b33_b60_without_a_mount_the_frame_is_skipped_with_a_warning(ros) -> None:
+@pytest.mark.requirement("B-33", "B-60")
+def test_without_a_mount_the_frame_is_skipped_with_a_warning(ros) -> None:
     """No transform, no detection: the frame is named on /diagnostics; with the mount there, detections come."""
     bench = Bench(ros, camera=FakeCamera(ros), mounted=False, transform_wait=0.1)
     bench.said("frame skipped: pose of the camera at its stamp: frame 'overhead_color_optical_frame'")
@@ -233,7 +243,8 @@ def frame_waits(bench: Bench) -> None:
     bench.pump(lambda: bench.node.waiting_ns and joints.get_subscription_count(), "a frame waits for joint states")
 
 
-def test_b14_b32_b61_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) -> None:
+@pytest.mark.requirement("B-14", "B-32", "B-61")
+def test_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) -> None:
     """The frame comes first, joint states 8 ms before and 12 ms after it later: the pose is interpolated.
 
     The newest joint state, with the arm elsewhere, is not used. The wait is long here, so that a busy machine passes.
@@ -249,7 +260,8 @@ def test_b14_b32_b61_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) 
     np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.0015)
 
 
-def test_b61_a_joint_state_just_before_the_image_is_not_enough_while_the_next_is_to_come(ros) -> None:
+@pytest.mark.requirement("B-61")
+def test_a_joint_state_just_before_the_image_is_not_enough_while_the_next_is_to_come(ros) -> None:
     """Which of the two came first must not decide: taking the nearer one, the arm moving, would be 15 mm off."""
     bench = on_arm(ros, transform_wait=5.0)
     frame_waits(bench)
@@ -264,7 +276,8 @@ def test_b61_a_joint_state_just_before_the_image_is_not_enough_while_the_next_is
     np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.0015)
 
 
-def test_b32_b60_a72_a_frame_20_ms_from_any_joint_state_is_skipped(ros) -> None:
+@pytest.mark.requirement("B-32", "B-60", "A-72")
+def test_a_frame_20_ms_from_any_joint_state_is_skipped(ros) -> None:
     """Nothing within 5 ms and nothing that brackets: skipped and named, no detection, and the node goes on."""
     bench = on_arm(ros, transform_wait=0.1)
     ros.spin_until(bench.camera.joints.get_subscription_count, 5.0, "joint states are listened to")

@@ -22,7 +22,8 @@ def client_of(bench) -> ActionClient:
 
 
 @pytest.mark.parametrize("position", [0.005, 0.035, 0.025])
-def test_p22_the_classic_action_reaches_the_real_joint(bridge, position: float) -> None:
+@pytest.mark.requirement("P-22")
+def test_the_classic_action_reaches_the_real_joint(bridge, position: float) -> None:
     bench = bridge(images=False, gripper_action="classic")
     goal = GripperCommand.Goal(command=Command(position=position, max_effort=10.0))
     handle, future = bench.ros.send_goal(client_of(bench), goal)

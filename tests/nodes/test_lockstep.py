@@ -117,7 +117,8 @@ def lead(ros: Any) -> Iterator[Lead]:
         leader.close()
 
 
-def test_n18_messages_are_handled_by_stamp_and_topic_and_not_before_their_tick(lead: Lead) -> None:
+@pytest.mark.requirement("N-18")
+def test_messages_are_handled_by_stamp_and_topic_and_not_before_their_tick(lead: Lead) -> None:
     lead.tick(0)
     lead.send("/b", 20_000_000, "b20")
     lead.send("/b", 10_000_000, "b10")
@@ -131,7 +132,8 @@ def test_n18_messages_are_handled_by_stamp_and_topic_and_not_before_their_tick(l
     assert lead.node.log[-1] == "/a early"
 
 
-def test_n18_a_tick_waits_for_what_was_sent_and_the_answer_says_what_was_sent(lead: Lead, ros: Any) -> None:
+@pytest.mark.requirement("N-18")
+def test_a_tick_waits_for_what_was_sent_and_the_answer_says_what_was_sent(lead: Lead, ros: Any) -> None:
     lead.tick(0)
     late = lead.begin_tick(10_000_000, {"/a": 1, "/b": 0})
     for _ in range(5):
@@ -142,13 +144,15 @@ def test_n18_a_tick_waits_for_what_was_sent_and_the_answer_says_what_was_sent(le
     assert lead.node.log == ["/a ask", "worked"]
 
 
-def test_n18_timers_follow_simulated_time(lead: Lead) -> None:
+@pytest.mark.requirement("N-18")
+def test_timers_follow_simulated_time(lead: Lead) -> None:
     for t_ms in (0, 20, 40, 60):
         lead.tick(t_ms * 1_000_000)
     assert lead.node.log == ["timer 0.04", "timer 0.06"]
 
 
-def test_n18_a_subscription_that_is_given_up_is_silent_and_comes_back_at_once(lead: Lead) -> None:
+@pytest.mark.requirement("N-18")
+def test_a_subscription_that_is_given_up_is_silent_and_comes_back_at_once(lead: Lead) -> None:
     lead.tick(0)
     (given_up,) = (s for s in lead.node.subscriptions if s.topic_name == "/a")
     lead.node.destroy_subscription(given_up)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from octomap_msgs.srv import GetOctomap
@@ -28,7 +29,8 @@ def at(bench: Bench, point: tuple[float, float, float]) -> str:
     return bench.state(point, bench.call(GetOctomap, "/octomap_binary").map)
 
 
-def test_p31_a_map_at_rest_listens_to_nothing_and_goes_on_where_it_was(ros, tmp_path: Path) -> None:
+@pytest.mark.requirement("P-31")
+def test_a_map_at_rest_listens_to_nothing_and_goes_on_where_it_was(ros, tmp_path: Path) -> None:
     bench = Bench(ros, tmp_path)
     assert state(bench) == "active", "whoever knows of no lifecycle has a map"
     bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
@@ -42,7 +44,8 @@ def test_p31_a_map_at_rest_listens_to_nothing_and_goes_on_where_it_was(ros, tmp_
     bench.show(sheet(0.51), lambda: bench.state(higher) == "occupied", "it looks again")
 
 
-def test_p31_a_manager_may_bring_it_up_and_clean_it(ros, tmp_path: Path) -> None:
+@pytest.mark.requirement("P-31")
+def test_a_manager_may_bring_it_up_and_clean_it(ros, tmp_path: Path) -> None:
     bench = Bench(ros, tmp_path, autostart=False)
     assert state(bench) == "unconfigured"
     assert not ros.node.count_subscribers(CAMERA)

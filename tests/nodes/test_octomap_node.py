@@ -43,7 +43,8 @@ ON_TABLE = (0.45, 0.25, 0.41)
 ABOVE = (0.45, 0.25, 0.51)
 
 
-def test_a53_a54_a57_images_become_a_latched_octree(bench) -> None:
+@pytest.mark.requirement("A-53", "A-54", "A-57")
+def test_images_become_a_latched_octree(bench) -> None:
     """In the base frame, with the stamp of the image, 2 cm, readable as OctoMap; a late subscriber gets it too."""
     bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
     assert bench.state(ABOVE) == "free"
@@ -60,19 +61,22 @@ def test_a53_a54_a57_images_become_a_latched_octree(bench) -> None:
         assert bench.state(ON_TABLE, answer) == "occupied"
 
 
-def test_a56_a55_what_moves_away_is_gone_and_what_arrives_is_there(bench) -> None:
+@pytest.mark.requirement("A-56", "A-55")
+def test_what_moves_away_is_gone_and_what_arrives_is_there(bench) -> None:
     bench.show(sheet(0.51), lambda: bench.state(ABOVE) == "occupied", "an obstacle")
     bench.show(sheet(0.41), lambda: bench.state(ABOVE) == "free", "it is gone")
     bench.show(sheet(0.51), lambda: bench.state(ABOVE) == "occupied", "it is back")
 
 
-def test_a47_metres_and_millimetres_are_the_same(bench) -> None:
+@pytest.mark.requirement("A-47")
+def test_metres_and_millimetres_are_the_same(bench) -> None:
     metres = (sheet(0.41) * 1e-3).astype(np.float32)
     metres[metres == 0] = np.nan
     bench.show(metres, lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map", "32FC1")
 
 
-def test_a75_coarse_maps_are_answered(bench) -> None:
+@pytest.mark.requirement("A-75")
+def test_coarse_maps_are_answered(bench) -> None:
     bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
     for depth, edge in ((15, 0.04), (14, 0.08), (13, 0.16)):
         answer = bench.call(GetOctomap, f"/octomap/depth_{depth}/octomap_binary").map
@@ -80,7 +84,8 @@ def test_a75_coarse_maps_are_answered(bench) -> None:
         assert bench.state(ON_TABLE, answer) == "occupied"
 
 
-def test_p06_reset_is_visible_at_once_and_boxes_are_cleared(bench) -> None:
+@pytest.mark.requirement("P-06")
+def test_reset_is_visible_at_once_and_boxes_are_cleared(bench) -> None:
     bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
     # an update under way would put back what it saw
     bench.ros.spin_until(lambda: bench.node.idle, 10.0, "all images are in the map")
@@ -106,7 +111,8 @@ def test_p06_reset_is_visible_at_once_and_boxes_are_cleared(bench) -> None:
         assert text in answer.message
 
 
-def test_a75_points_are_answered_by_cells_of_any_size_with_a_policy_for_unknown_ones(bench) -> None:
+@pytest.mark.requirement("A-75")
+def test_points_are_answered_by_cells_of_any_size_with_a_policy_for_unknown_ones(bench) -> None:
     bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
     points = [Point(x=x, y=y, z=z) for x, y, z in (ON_TABLE, (0.45, 0.25, 0.45), (0.45, 0.25, 0.2), (9.0, 0.0, 0.0))]
 
@@ -159,7 +165,8 @@ def test_maps_are_saved_and_loaded_and_damaged_files_leave_the_map_alone(bench, 
         bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "occupied", 5.0, "the map is back")
 
 
-def test_p05_the_robot_and_what_it_holds_are_not_in_the_map(bench) -> None:
+@pytest.mark.requirement("P-05")
+def test_the_robot_and_what_it_holds_are_not_in_the_map(bench) -> None:
     """A sheet of cells across the left tool, then a held box around it: its cells vanish with the next update."""
     tool = ROBOT.link_pose("openarm_left_hand_tcp", dict.fromkeys(JOINTS, 0.0))
     near = tuple(tool[:3, 3] + (0.06, 0.12, 0.0))
@@ -253,15 +260,15 @@ def test_pictures_of_the_map_while_somebody_looks(bench) -> None:
         (np.zeros((480, 640), np.uint16), "16UC1", "nowhere", K, "'nowhere' is not connected"),
     ],
 )
-def test_b28_b30_b34_b60_what_does_not_fit_is_named_and_the_map_unharmed(
-    bench, pixels, encoding, frame, k, text
-) -> None:
+@pytest.mark.requirement("B-28", "B-30", "B-34", "B-60")
+def test_what_does_not_fit_is_named_and_the_map_unharmed(bench, pixels, encoding, frame, k, text) -> None:
     bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
     bench.show(pixels, lambda: bench.heard(text), f"diagnostics with {text!r}", encoding, frame=frame)
     assert bench.state(ON_TABLE) == "occupied"
 
 
-def test_b59_b60_a_frame_without_a_joint_state_at_its_stamp_is_skipped(bench) -> None:
+@pytest.mark.requirement("B-59", "B-60")
+def test_a_frame_without_a_joint_state_at_its_stamp_is_skipped(bench) -> None:
     """Here 20 s ahead of the robot."""
     bench.show(sheet(0.41), lambda: bench.state(ON_TABLE) == "occupied", "the table is in the map")
     bench.t_ns += 20_000_000_000

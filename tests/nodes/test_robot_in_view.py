@@ -110,7 +110,8 @@ def detector(ros, **params) -> Bench:
     return Bench(ros, DetectNode, Detection3DArray, "/detections_3d", table_height=height, **params)
 
 
-def test_p04_p05_what_motion_holds_is_no_object_on_the_table(ros) -> None:
+@pytest.mark.requirement("P-04", "P-05")
+def test_what_motion_holds_is_no_object_on_the_table(ros) -> None:
     """Reported until motion says that it is held; then found in the image alone, counted, and out of the mask."""
     bench = detector(ros)
     bench.pump(lambda: bench.got and bench.got[-1].detections, "the box is taken for an object")
@@ -153,7 +154,8 @@ def test_the_self_filter_of_the_detector_can_be_switched_off(ros) -> None:
 
 
 @pytest.mark.parametrize("organised", [True, False])
-def test_p05_clouds_without_the_robot_where_asked(ros, organised: bool) -> None:
+@pytest.mark.requirement("P-05")
+def test_clouds_without_the_robot_where_asked(ros, organised: bool) -> None:
     """NaN where the hand holds something, the table as it is; without joint states no cloud, and the reason."""
     params = {"self_filter.enabled": True, "organised": organised, "transform_wait": 0.1, "cameras": ["overhead"]}
     bench = Bench(ros, CloudNode, PointCloud2, "/overhead/depth/points", **params)

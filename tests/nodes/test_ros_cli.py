@@ -166,7 +166,8 @@ def test_nodes_and_parameters(heard: list[str]) -> None:
     assert "--set probe.height=tall" in wrong.message
 
 
-def test_b35_the_tree_of_frames_is_shown_and_drawn(heard: list[str], tmp_path: Path) -> None:
+@pytest.mark.requirement("B-35")
+def test_the_tree_of_frames_is_shown_and_drawn(heard: list[str], tmp_path: Path) -> None:
     out = tmp_path / "tree.png"
     tree = tf.tree(out=out)
     assert tree.text.splitlines() == ["world", "  base", "    camera"]

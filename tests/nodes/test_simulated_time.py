@@ -26,7 +26,8 @@ NOW = 123_000_000_000
 
 
 @pytest.mark.parametrize("module", NODES)
-def test_p30_a_node_takes_simulated_time(ros, tmp_path, monkeypatch, module: str) -> None:
+@pytest.mark.requirement("P-30")
+def test_a_node_takes_simulated_time(ros, tmp_path, monkeypatch, module: str) -> None:
     monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path))
     kind = getattr(import_module(module), NODES[module])
     node = ros.add(kind(parameter_overrides=[Parameter("use_sim_time", value=True)]))
@@ -45,7 +46,8 @@ def test_p30_a_node_takes_simulated_time(ros, tmp_path, monkeypatch, module: str
     ros.spin_until(lambda: told.count(NOW) >= 2, 10.0, "diagnostics with simulated stamps")
 
 
-def test_p30_the_bridge_stamps_with_the_time_it_makes(bridge) -> None:
+@pytest.mark.requirement("P-30")
+def test_the_bridge_stamps_with_the_time_it_makes(bridge) -> None:
     bench = bridge(images=False, use_sim_time=True)
     told = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
     bench.ros.spin_until(lambda: len(told) > 1, 10.0, "diagnostics")

@@ -58,7 +58,8 @@ class Eye:
 
 
 @pytest.mark.parametrize(("frame", "joints"), [(HAND, False), ("openarm_body_link0", True)])
-def test_b61_a_posture_waits_for_the_joint_state_after_its_stamp(ros, frame: str, joints: bool) -> None:
+@pytest.mark.requirement("B-61")
+def test_a_posture_waits_for_the_joint_state_after_its_stamp(ros, frame: str, joints: bool) -> None:
     """However near the one before is; and is then between the two."""
     eye = Eye(ros)
     assert eye.posture(frame, 103, joints=joints) is None

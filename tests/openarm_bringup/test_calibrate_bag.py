@@ -118,7 +118,8 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
     return code, out, err
 
 
-def test_p28_a44_a_bag_is_solved_and_says_what_became_of_its_images(capsys, bag, known, tmp_path: Path) -> None:
+@pytest.mark.requirement("P-28", "A-44")
+def test_a_bag_is_solved_and_says_what_became_of_its_images(capsys, bag, known, tmp_path: Path) -> None:
     """One sample of each stand, to 0.05 mm of the true mount; what moved, showed nothing or had no joints is told."""
     store, session = tmp_path / "store", tmp_path / "session.npz"
     argv = ("--store", str(store), "--session", str(session))
@@ -147,7 +148,8 @@ def test_p28_a44_a_bag_is_solved_and_says_what_became_of_its_images(capsys, bag,
     assert "images not used, MOVING, such as: the robot moves: openarm_right_joint" in out
 
 
-def test_a41_a_bag_with_too_few_stands_says_so_and_shows_them(capsys, known, tmp_path: Path) -> None:
+@pytest.mark.requirement("A-41")
+def test_a_bag_with_too_few_stands_says_so_and_shows_them(capsys, known, tmp_path: Path) -> None:
     code, out, err = run(capsys, "solve", str(record(tmp_path / "bag", known, 2)))
     assert code == 1
     assert "DEGENERATE: too few poses: 2" in err

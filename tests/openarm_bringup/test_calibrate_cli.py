@@ -36,7 +36,8 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
     return code, out, err
 
 
-def test_p28_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_path: Path) -> None:
+@pytest.mark.requirement("P-28")
+def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_path: Path) -> None:
     """From a session file to a stored calibration and a page, and back."""
     code, out, _ = run(capsys, "solve", str(session_file))
     assert code == 0
@@ -70,7 +71,8 @@ def test_p28_solve_check_save_report_list_rollback(capsys, session_file: Path, t
 
 @pytest.mark.parametrize("name", ["board.png", "board.pdf", "board.xml"])
 @pytest.mark.parametrize("kind", ["circles", "charuco"])
-def test_a43_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) -> None:
+@pytest.mark.requirement("A-43")
+def test_boards_are_written(capsys, tmp_path: Path, name: str, kind: str) -> None:
     path = tmp_path / "new" / name
     code, out, _ = run(capsys, "board", str(path), "--kind", kind)
     assert code == 0
@@ -99,7 +101,8 @@ def test_wrong_intrinsics_are_found_with_the_mount(capsys, tmp_path: Path) -> No
     assert "fx " in run(capsys, "solve", str(path), "--free-intrinsics")[1]
 
 
-def test_a45_a_stored_file_that_would_run_something_is_told_and_not_run(capsys, tmp_path: Path) -> None:
+@pytest.mark.requirement("A-45")
+def test_a_stored_file_that_would_run_something_is_told_and_not_run(capsys, tmp_path: Path) -> None:
     """Also one that is cut short, and one whose name is a trick."""
     store = tmp_path / "store"
     store.mkdir(exist_ok=True)
@@ -163,14 +166,16 @@ def test_wrong_calls_say_what_is_wrong(
     assert list(tmp_path.glob("b.*")) == []
 
 
-def test_a41_a_degenerate_session_is_exit_code_1_with_advice(capsys, session_file: Path) -> None:
+@pytest.mark.requirement("A-41")
+def test_a_degenerate_session_is_exit_code_1_with_advice(capsys, session_file: Path) -> None:
     names = [f"s{k:03d}" for k in range(3, 13)]
     code, _, err = run(capsys, "solve", str(session_file), *[word for n in names for word in ("--exclude", n)])
     assert code == 1
     assert "DEGENERATE: too few poses: 2" in err
 
 
-def test_b14_sessions_of_both_cameras_are_solved_together(capsys, session_file: Path, tmp_path: Path) -> None:
+@pytest.mark.requirement("B-14")
+def test_sessions_of_both_cameras_are_solved_together(capsys, session_file: Path, tmp_path: Path) -> None:
     other = tmp_path / "overhead.npz"
     make_session("to_hand", 12).samples.save(other)
     code, out, err = run(capsys, "together", str(session_file), str(other), "--save", "--json")
@@ -202,7 +207,8 @@ def result(camera: str, **more) -> AutoResult:
         ({"overhead": result("overhead")}, OpenArmError(Code.CANCELLED, "stopped"), 1, "CANCELLED: stopped"),
     ],
 )  # fmt: skip
-def test_b15_auto_takes_the_fixed_camera_first_and_tells_what_came_out(
+@pytest.mark.requirement("B-15")
+def test_auto_takes_the_fixed_camera_first_and_tells_what_came_out(
     capsys, tmp_path: Path, monkeypatch, results, error, code: int, words: str
 ) -> None:
     """Exit code and sentence follow the worst camera; pages are written of the sessions that there are."""

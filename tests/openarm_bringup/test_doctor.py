@@ -30,7 +30,8 @@ WHEEL = f"{PREFIX}/lib/python3.11/site-packages/rclpy/__init__.py"
 NATIVE = "/opt/ros/jazzy/lib/python3.12/site-packages/rclpy/__init__.py"
 
 
-def test_a08_the_simulators_version_is_the_first_check() -> None:
+@pytest.mark.requirement("A-08")
+def test_the_simulators_version_is_the_first_check() -> None:
     first = checks.check_versions(GOOD)[0]
     assert (first.name, first.level) == ("mujoco", "ok")
     assert "4.0.0" in first.seen
@@ -39,7 +40,8 @@ def test_a08_the_simulators_version_is_the_first_check() -> None:
 @pytest.mark.parametrize(
     ("name", "version"), [("mujoco", "3.9.1"), ("opencv-python-headless", "5.0.1"), ("ompl", "1.7.0")]
 )
-def test_b08_wrong_versions_are_errors_with_the_wanted_range(name: str, version: str) -> None:
+@pytest.mark.requirement("B-08")
+def test_wrong_versions_are_errors_with_the_wanted_range(name: str, version: str) -> None:
     findings = {f.name: f for f in checks.check_versions({**GOOD, name: version})}
     assert findings[name].level == "error"
     assert "needs >=" in findings[name].advice
@@ -63,7 +65,8 @@ def test_missing_package_is_an_error() -> None:
         ({"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": "/opt/ros/jazzy"}, WHEEL, "but rclpy comes from the wheels"),
     ],
 )
-def test_b09_more_than_one_ros_is_an_error(environ: dict[str, str], file: str, words: str) -> None:
+@pytest.mark.requirement("B-09")
+def test_more_than_one_ros_is_an_error(environ: dict[str, str], file: str, words: str) -> None:
     (finding,) = checks.check_ros(environ, file, "7.1.6", PREFIX)
     assert finding.level == "error"
     assert words in finding.seen
@@ -81,7 +84,8 @@ def test_rclpy_of_another_distribution_and_none_at_all_are_errors() -> None:
     assert "cannot be imported" in checks.check_ros({}, None, "", PREFIX)[0].seen
 
 
-def test_b11_opencv_with_a_window_system_is_an_error() -> None:
+@pytest.mark.requirement("B-11")
+def test_opencv_with_a_window_system_is_an_error() -> None:
     both = checks.check_opencv({**GOOD, "opencv-python": "4.14.0"}, links_gl=False)
     assert both.level == "error"
     assert "uninstall opencv-python," in both.advice
@@ -109,7 +113,8 @@ def test_too_little_shared_memory_is_an_error_with_what_to_do() -> None:
     assert "20 MiB are free" in caught.value.message
 
 
-def test_a10_no_display_is_fine_and_a_failing_renderer_names_one_that_works() -> None:
+@pytest.mark.requirement("A-10")
+def test_no_display_is_fine_and_a_failing_renderer_names_one_that_works() -> None:
     assert checks.check_machine(2, 8.0, 0.3, display=False, wsl=True).level == "ok"
     assert checks.check_gl({"egl": 12.0, "osmesa": "failed"}, "egl").level == "ok"
     other = checks.check_gl({"egl": "failed", "osmesa": 30.0}, "egl")
@@ -134,7 +139,8 @@ def test_domain(text: str, level: str) -> None:
         ((3, 12), "Darwin", "arm64", "error"),
     ],
 )
-def test_n17_python_and_machine(version: tuple[int, int], system: str, machine: str, level: str) -> None:
+@pytest.mark.requirement("N-17")
+def test_python_and_machine(version: tuple[int, int], system: str, machine: str, level: str) -> None:
     assert checks.check_python(version, system, machine).level == level
 
 
@@ -145,7 +151,8 @@ def test_environment_that_changes_discovery_is_noted() -> None:
 
 
 @pytest.mark.slow
-def test_b10_doctor_of_this_machine_checks_ros_simulator_and_planner(
+@pytest.mark.requirement("B-10")
+def test_doctor_of_this_machine_checks_ros_simulator_and_planner(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # graphs that others run here are no fault of the machine

@@ -153,7 +153,8 @@ def test_drawings_show_who_gives_what_to_whom(tmp_path: Path) -> None:
     assert "after bridge, arm" in text(graph)
 
 
-def test_n18_a_lockstep_gives_its_nodes_their_parameters_and_never_restarts_them(tmp_path: Path) -> None:
+@pytest.mark.requirement("N-18")
+def test_a_lockstep_gives_its_nodes_their_parameters_and_never_restarts_them(tmp_path: Path) -> None:
     section = "lockstep: {leader: bridge, participants: [arm]}\n"
     graph = load_graph(write(tmp_path, BASE + section))
     assert graph.nodes["bridge"].params["lockstep"] is True

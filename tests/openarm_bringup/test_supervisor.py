@@ -114,7 +114,8 @@ def wait_gone(pids: Sequence[int], seconds: float) -> None:
         time.sleep(0.05)
 
 
-def test_b12_nodes_start_when_their_needs_are_ready_and_stop_in_reverse(tmp_path: Path) -> None:
+@pytest.mark.requirement("B-12")
+def test_nodes_start_when_their_needs_are_ready_and_stop_in_reverse(tmp_path: Path) -> None:
     nodes = {
         "last": toy(tmp_path, "last", needs=("middle",)),
         "middle": toy(tmp_path, "middle", needs=("first",)),
@@ -250,7 +251,8 @@ def test_error_inside_the_probe_is_raised_and_not_waited_for_ever(tmp_path: Path
     asyncio.run(body())
 
 
-def test_p34_grandchildren_end_with_their_node(tmp_path: Path) -> None:
+@pytest.mark.requirement("P-34")
+def test_grandchildren_end_with_their_node(tmp_path: Path) -> None:
     body = (
         "import subprocess; c = subprocess.Popen([sys.executable, '-S', '-c', "
         "'import signal, time; signal.signal(2, signal.SIG_IGN); signal.signal(15, signal.SIG_IGN); time.sleep(60)']);"
@@ -308,7 +310,8 @@ def test_second_ctrl_c_cuts_the_patience_short(tmp_path: Path) -> None:
     assert asyncio.run(run_it()) < 10.0
 
 
-def test_p34_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
+@pytest.mark.requirement("P-34")
+def test_children_end_when_the_supervisor_is_killed(tmp_path: Path) -> None:
     """SIGKILL leaves the supervisor no time for anything: its guard ends the nodes, deaf ones and grandchildren too."""
     script = tmp_path / "supervise.py"
     script.write_text(

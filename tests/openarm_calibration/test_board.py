@@ -39,7 +39,8 @@ def photograph(board: Board, T: np.ndarray, rng: np.random.Generator, mirrored: 
 
 
 @pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
-def test_a42_boards_are_found_in_at_least_95_percent_of_views_and_never_in_a_wrong_order(board: Board) -> None:
+@pytest.mark.requirement("A-42")
+def test_boards_are_found_in_at_least_95_percent_of_views_and_never_in_a_wrong_order(board: Board) -> None:
     """Any turn in the image, tilts to 40°: every mark is within a pixel of its own place."""
     rng = np.random.default_rng(1)
     found = seen = 0
@@ -61,7 +62,8 @@ def test_a42_boards_are_found_in_at_least_95_percent_of_views_and_never_in_a_wro
     assert found >= 0.95 * seen
 
 
-def test_a42_a_mirrored_board_is_not_read_as_one() -> None:
+@pytest.mark.requirement("A-42")
+def test_a_mirrored_board_is_not_read_as_one() -> None:
     """The mirror image of a circle grid is the grid itself after half a turn: there only ChArUco can tell."""
     rng = np.random.default_rng(2)
     T = se3.make(se3.rot_x(0.2), (0.0, 0.0, 0.4))
@@ -79,7 +81,8 @@ def test_an_image_without_the_board_says_what_was_seen(board: Board) -> None:
         detect(board, np.zeros((4, 4, 3), np.uint8))
 
 
-def test_a43_the_board_in_mujoco_is_found_to_a_hundredth_of_a_pixel(tmp_path: Path) -> None:
+@pytest.mark.requirement("A-43")
+def test_the_board_in_mujoco_is_found_to_a_hundredth_of_a_pixel(tmp_path: Path) -> None:
     """Its MJCF, rendered as the suite's cameras are; no shift and no stretch, so pixels and texture are where we think.
 
     Errors that the marks of a view share do not average out: a stretch of 0.06 % puts a camera 0.4 mm off.
@@ -115,7 +118,8 @@ def test_a43_the_board_in_mujoco_is_found_to_a_hundredth_of_a_pixel(tmp_path: Pa
 
 
 @pytest.mark.parametrize("board", BOARDS, ids=lambda b: b.kind)
-def test_a43_a_picture_of_any_shape_is_exactly_the_plate(board: Board) -> None:
+@pytest.mark.requirement("A-43")
+def test_a_picture_of_any_shape_is_exactly_the_plate(board: Board) -> None:
     """Marks of the stretched picture, found as corners or centroids, are where the board says."""
     columns, rows = 1024, 1500
     image = board.picture(columns, rows)
@@ -152,7 +156,8 @@ def test_png_and_pdf_are_true_to_scale(board: Board, tmp_path: Path) -> None:
     assert float(box[2]) / 72 * 0.0254 >= board.size[0]
 
 
-def test_a43_the_board_of_the_scenes_is_the_one_that_the_suite_writes(tmp_path: Path) -> None:
+@pytest.mark.requirement("A-43")
+def test_the_board_of_the_scenes_is_the_one_that_the_suite_writes(tmp_path: Path) -> None:
     write_board(CircleGrid(), tmp_path / "circles_4x11.xml")
     kept = models_dir() / "boards"
     assert (kept / "circles_4x11.xml").read_text() == (tmp_path / "circles_4x11.xml").read_text()

@@ -50,7 +50,8 @@ def test_contact_is_told_by_separating_axes(x: float, turn: float, touches: bool
     assert bodies.touching(bodies.place(description.link_poses({"slide": x, "turn": turn}))) is touches
 
 
-def test_a74_the_home_posture_is_free_and_crossed_arms_are_not(openarm: RobotDescription) -> None:
+@pytest.mark.requirement("A-74")
+def test_the_home_posture_is_free_and_crossed_arms_are_not(openarm: RobotDescription) -> None:
     bodies = Bodies(openarm)
     q = dict.fromkeys(openarm.joints, 0.0)
     q |= openarm.group_state("right_arm", "home") | openarm.group_state("left_arm", "home")

@@ -64,7 +64,8 @@ class Arm:
 
 
 @pytest.mark.parametrize("name", ["wrist", "overhead"])
-def test_n07_eight_proposed_poses_calibrate(name: str) -> None:
+@pytest.mark.requirement("N-07")
+def test_eight_proposed_poses_calibrate(name: str) -> None:
     """Nominal mount and a ruler are enough to begin; all proposals but the first few show the board; 0.3 mm, 0.03°."""
     arm, rng = Arm(name), np.random.default_rng(0)
     search = arm.search()

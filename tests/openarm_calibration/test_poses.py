@@ -20,7 +20,8 @@ CONFIG = SolveConfig(most_translation=0.05, most_rotation=0.1)
 
 
 @pytest.mark.parametrize("setup", ["in_hand", "to_hand"])
-def test_n07_a40_chosen_poses_tell_more_than_random_ones(setup: str) -> None:
+@pytest.mark.requirement("N-07", "A-40")
+def test_chosen_poses_tell_more_than_random_ones(setup: str) -> None:
     """Four poses and then six chosen among 40 each: the true error bound is below that of six random ones."""
     rng = np.random.default_rng(1)
     noise = Noise(0.3, 2e-4, 4e-4)
@@ -53,7 +54,8 @@ def test_predicted_errors_shrink_and_what_does_not_show_the_board_is_left_out() 
         rank(synthetic.BOARD, solution, away)
 
 
-def test_n07_advice_names_the_axis_that_is_missing() -> None:
+@pytest.mark.requirement("N-07")
+def test_advice_names_the_axis_that_is_missing() -> None:
     """Turns about z only: x or y is asked for; with enough of everything it says so."""
     assert "first sample" in advice([])
     turned = [se3.make(se3.rot_z(0.2 * k), (0.01 * k, 0.0, 0.0)) for k in range(5)]

@@ -32,7 +32,8 @@ def buffer(until_ms: int = 1000, speed: float = 0.0) -> RobotStateBuffer:
     return out
 
 
-def test_a44_a72_an_image_6_ms_after_the_last_joint_state_is_rejected_and_4_ms_is_not() -> None:
+@pytest.mark.requirement("A-44", "A-72")
+def test_an_image_6_ms_after_the_last_joint_state_is_rejected_and_4_ms_is_not() -> None:
     """And 20 ms; an image between two joint states is interpolated."""
     for late, accepted in ((4, True), (6, False), (20, False)):
         if accepted:
@@ -45,7 +46,8 @@ def test_a44_a72_an_image_6_ms_after_the_last_joint_state_is_rejected_and_4_ms_i
     assert between.joints[NAMES[1]] == pytest.approx(0.2 + 0.001 * 0.503)
 
 
-def test_a44_a_moving_robot_is_rejected_with_the_joint_and_its_speed() -> None:
+@pytest.mark.requirement("A-44")
+def test_a_moving_robot_is_rejected_with_the_joint_and_its_speed() -> None:
     with pytest.raises(OpenArmError, match=r"openarm_right_joint2 at 0\.10\d rad/s, at most 0\.005") as caught:
         match(buffer(1000, 0.1), 900 * MS, NAMES, GateConfig())
     assert caught.value.code == Code.MOVING
@@ -58,7 +60,8 @@ def test_one_joint_state_does_not_say_whether_the_robot_stands() -> None:
 
 
 @pytest.mark.parametrize("setup", ["in_hand", "to_hand"])
-def test_a33_a34_a_session_solves_to_the_true_mount_and_again_from_its_file(session, setup, tmp_path: Path) -> None:
+@pytest.mark.requirement("A-33", "A-34")
+def test_a_session_solves_to_the_true_mount_and_again_from_its_file(session, setup, tmp_path: Path) -> None:
     """Wrist and overhead camera on the arm's own kinematics; bit-equal after saving and loading."""
     known = session(setup)
     solution = solve(known.samples.problem())
@@ -151,7 +154,8 @@ def test_a_changed_session_or_one_of_another_robot_is_refused_by_name(session, t
         load_session(rewritten(known, tmp_path / "s.npz", change), known.description)
 
 
-def test_n09_a_delay_of_20_ms_is_estimated_to_1_ms(session) -> None:
+@pytest.mark.requirement("N-09")
+def test_a_delay_of_20_ms_is_estimated_to_1_ms(session) -> None:
     """Images that are 20 ms old at their stamps, of a moving arm; a standing one says nothing of it."""
     moving = session(count=15, delay=0.020, speed=0.3)
     delay, sigma = estimate_delay(moving.samples)
@@ -160,7 +164,8 @@ def test_n09_a_delay_of_20_ms_is_estimated_to_1_ms(session) -> None:
     assert estimate_delay(session(count=5).samples) == (0.0, math.inf)
 
 
-def test_p28_the_verdict_has_held_out_errors_and_reasons(session) -> None:
+@pytest.mark.requirement("P-28")
+def test_the_verdict_has_held_out_errors_and_reasons(session) -> None:
     """A good set passes; few samples, a wrong board size and a drift are told."""
     known = session(px=0.05)
     problem = known.samples.problem()
@@ -182,7 +187,8 @@ def test_p28_the_verdict_has_held_out_errors_and_reasons(session) -> None:
 
 
 @pytest.mark.parametrize("setup", ["in_hand", "to_hand"])
-def test_a32_wrong_intrinsics_fail_by_name_and_right_ones_do_not(session, setup: str) -> None:
+@pytest.mark.requirement("A-32")
+def test_wrong_intrinsics_fail_by_name_and_right_ones_do_not(session, setup: str) -> None:
     """A focal length 4 % off, as of another resolution or field of view."""
     samples = session(setup, px=0.1).samples
     solution = solve(samples.problem())

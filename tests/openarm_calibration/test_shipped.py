@@ -23,7 +23,8 @@ SESSIONS = Path(__file__).parent / "data"
 
 
 @pytest.mark.parametrize("name", ["overhead", "wrist"])
-def test_a45_what_comes_with_the_suite_is_what_its_samples_give(name: str) -> None:
+@pytest.mark.requirement("A-45")
+def test_what_comes_with_the_suite_is_what_its_samples_give(name: str) -> None:
     """Samples that `openarm calibrate auto --mount-seed 1` took are solved again: same mount, right to 0.05 mm."""
     samples, digest = load_session(SESSIONS / f"mount_seed_1_{name}.npz", RobotDescription.load())
     result = calibrate(samples)

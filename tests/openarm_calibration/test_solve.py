@@ -23,7 +23,8 @@ LAX = SolveConfig(most_translation=1.0, most_rotation=3.0)
 
 @pytest.mark.parametrize("setup", SETUPS)
 @pytest.mark.parametrize("method", METHODS)
-def test_a36_a37_a38_a39_every_closed_form_within_2_mm_and_0_2_degrees_on_clean_data(setup: str, method: str) -> None:
+@pytest.mark.requirement("A-36", "A-37", "A-38", "A-39")
+def test_every_closed_form_within_2_mm_and_0_2_degrees_on_clean_data(setup: str, method: str) -> None:
     """Both set-ups, names instead of numbers, arguments by keyword: X and Z are the true ones."""
     truth = synthetic.trial(setup, 12, Noise(1e-3), np.random.default_rng(1))
     mounts = closed_form(method.lower(), setup, truth.problem.A, truth.problem.free)
@@ -33,7 +34,8 @@ def test_a36_a37_a38_a39_every_closed_form_within_2_mm_and_0_2_degrees_on_clean_
         assert angle < math.radians(0.2)
 
 
-def test_a38_an_unknown_method_lists_the_methods() -> None:
+@pytest.mark.requirement("A-38")
+def test_an_unknown_method_lists_the_methods() -> None:
     with pytest.raises(OpenArmError, match="no method 'tsay'; methods: TSAI, PARK, HORAUD, ANDREFF, DANIILIDIS, SHAH"):
         closed_form("tsay", "in_hand", np.zeros((3, 4, 4)), np.zeros((3, 4, 4)))
 
@@ -143,7 +145,8 @@ def test_marks_in_a_wrong_order_are_an_outlier_too() -> None:
         ("few", "too few poses: 2"),
     ],
 )
-def test_a41_n07_degenerate_sets_are_refused_by_name(setup: str, kind: str, name: str) -> None:
+@pytest.mark.requirement("A-41", "N-07")
+def test_degenerate_sets_are_refused_by_name(setup: str, kind: str, name: str) -> None:
     """With what to add."""
     truth = synthetic.degenerate(kind, setup, np.random.default_rng(8), count=2 if kind == "few" else 10)
     with pytest.raises(OpenArmError, match=name) as caught:
@@ -151,7 +154,8 @@ def test_a41_n07_degenerate_sets_are_refused_by_name(setup: str, kind: str, name
     assert caught.value.code == Code.DEGENERATE
 
 
-def test_a41_nearly_degenerate_sets_are_refused_or_right() -> None:
+@pytest.mark.requirement("A-41")
+def test_nearly_degenerate_sets_are_refused_or_right() -> None:
     """60 sets of every kind with small free rotations: no silent wrong result, no NaN (the benchmark runs 1000)."""
     rng = np.random.default_rng(9)
     refused = 0

@@ -20,7 +20,8 @@ def calibration(x: float = 0.1, **more) -> StoredCalibration:
     )
 
 
-def test_a45_a_saved_mount_comes_back_exactly(tmp_path: Path) -> None:
+@pytest.mark.requirement("A-45")
+def test_a_saved_mount_comes_back_exactly(tmp_path: Path) -> None:
     store = CalibrationStore(tmp_path / "store")
     assert store.find("wrist") is None
     saved = calibration()

@@ -15,7 +15,8 @@ from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics, load_camer
 from openarm_common.errors import OpenArmError
 
 
-def test_a27_a30_intrinsics_from_the_vertical_field_of_view() -> None:
+@pytest.mark.requirement("A-27", "A-30")
+def test_intrinsics_from_the_vertical_field_of_view() -> None:
     camera = load_cameras()["overhead"]
     assert camera.fovy_deg == 60.0
     k = camera.intrinsics
@@ -26,7 +27,8 @@ def test_a27_a30_intrinsics_from_the_vertical_field_of_view() -> None:
 
 
 @given(st.floats(0.0, 639.0), st.floats(0.0, 479.0), st.floats(0.05, 5.0))
-def test_b29_deprojection_is_the_pinhole_and_undoes_projection(u: float, v: float, z: float) -> None:
+@pytest.mark.requirement("B-29")
+def test_deprojection_is_the_pinhole_and_undoes_projection(u: float, v: float, z: float) -> None:
     k = Intrinsics.from_fovy(640, 480, 60.0)
     p = k.deproject((u, v), z)
     assert p == pytest.approx([(u - k.cx) * z / k.fx, (v - k.cy) * z / k.fy, z])
@@ -37,7 +39,8 @@ def test_points_behind_the_camera_have_no_pixel() -> None:
     assert np.isnan(Intrinsics.from_fovy(640, 480, 60.0).project((0.1, 0.1, -1.0))).all()
 
 
-def test_b34_optical_frame_looks_along_link_x_with_y_down() -> None:
+@pytest.mark.requirement("B-34")
+def test_optical_frame_looks_along_link_x_with_y_down() -> None:
     assert np.allclose(T_LINK_OPTICAL[:3, :3] @ (0, 0, 1), (1, 0, 0))
     assert np.allclose(T_LINK_OPTICAL[:3, :3] @ (1, 0, 0), (0, -1, 0))
     assert np.allclose(T_LINK_OPTICAL[:3, :3] @ (0, 1, 0), (0, 0, -1))

@@ -41,7 +41,8 @@ def test_big_endian_depth_is_read() -> None:
 
 
 @pytest.mark.parametrize(("encoding", "size"), [("yuv422", 12), ("mono8", 11), ("rgb8", 12)])
-def test_b28_a_bad_image_is_refused_by_name(encoding: str, size: int) -> None:
+@pytest.mark.requirement("B-28")
+def test_a_bad_image_is_refused_by_name(encoding: str, size: int) -> None:
     message = Image(height=3, width=4, encoding=encoding, step=4)
     message.data = bytes(size)
     with pytest.raises(OpenArmError) as caught:
@@ -50,7 +51,8 @@ def test_b28_a_bad_image_is_refused_by_name(encoding: str, size: int) -> None:
     assert encoding in caught.value.message
 
 
-def test_a47_depth_in_millimetres_and_metres_is_the_same() -> None:
+@pytest.mark.requirement("A-47")
+def test_depth_in_millimetres_and_metres_is_the_same() -> None:
     millimetres = np.array([[0, 1500], [65535, 250]], dtype=np.uint16)
     metres = np.array([[np.nan, 1.5], [np.inf, 0.25]], dtype=np.float32)
     a = convert.depth_to_metres(convert.array_to_image(millimetres, "16UC1", "c", 0))
@@ -64,7 +66,8 @@ def test_a47_depth_in_millimetres_and_metres_is_the_same() -> None:
         convert.depth_to_metres(convert.array_to_image(np.zeros((1, 1), np.uint8), "mono8", "c", 0))
 
 
-def test_a30_camera_info_carries_the_intrinsics() -> None:
+@pytest.mark.requirement("A-30")
+def test_camera_info_carries_the_intrinsics() -> None:
     k = Intrinsics.from_fovy(640, 480, 60.0)
     assert convert.intrinsics_from_info(convert.info_from_intrinsics(k, "c", 0)) == k
 

@@ -92,7 +92,8 @@ def expected(description: RobotDescription, q: dict[str, float]) -> dict[str, Ar
     return frames
 
 
-def test_a06_own_forward_kinematics_equals_the_table(
+@pytest.mark.requirement("A-06")
+def test_own_forward_kinematics_equals_the_table(
     description: RobotDescription, configurations: list[dict[str, float]]
 ) -> None:
     worst = 0.0
@@ -103,7 +104,8 @@ def test_a06_own_forward_kinematics_equals_the_table(
     assert worst < 1e-9, worst
 
 
-def test_a06_tcp_equals_the_closed_form_and_the_left_arm_is_its_mirror_image(
+@pytest.mark.requirement("A-06")
+def test_tcp_equals_the_closed_form_and_the_left_arm_is_its_mirror_image(
     description: RobotDescription, configurations: list[dict[str, float]]
 ) -> None:
     flip = np.diag([1.0, -1.0, 1.0])
@@ -116,7 +118,8 @@ def test_a06_tcp_equals_the_closed_form_and_the_left_arm_is_its_mirror_image(
         np.testing.assert_allclose(description.link_pose("openarm_left_hand_tcp", left), T_mirror, atol=1e-6)
 
 
-def test_a06_a12_mujoco_forward_kinematics_equals_the_table(
+@pytest.mark.requirement("A-06", "A-12")
+def test_mujoco_forward_kinematics_equals_the_table(
     description: RobotDescription, model: mujoco.MjModel, configurations: list[dict[str, float]]
 ) -> None:
     data = mujoco.MjData(model)
@@ -136,7 +139,8 @@ def test_a06_a12_mujoco_forward_kinematics_equals_the_table(
     assert worst < 1e-6, worst
 
 
-def test_a06_pinocchio_forward_kinematics_equals_the_table(
+@pytest.mark.requirement("A-06")
+def test_pinocchio_forward_kinematics_equals_the_table(
     description: RobotDescription, configurations: list[dict[str, float]]
 ) -> None:
     model = pin.buildModelFromXML(description.urdf)
@@ -162,7 +166,8 @@ def test_world_positions_at_zero(description: RobotDescription) -> None:
         np.testing.assert_allclose(poses[f"openarm_{side}_hand_tcp"][:3, :3], se3.rot_x(np.pi), atol=1e-9)
 
 
-def test_a06_link_names_are_those_users_know(description: RobotDescription) -> None:
+@pytest.mark.requirement("A-06")
+def test_link_names_are_those_users_know(description: RobotDescription) -> None:
     assert set(description.links) == LINK_NAMES
     assert description.root == "world"
     assert set(description.joints) == (
@@ -175,7 +180,8 @@ def test_a06_link_names_are_those_users_know(description: RobotDescription) -> N
     )
 
 
-def test_a06_names_and_limits_are_equal_in_table_urdf_mujoco_and_pinocchio(
+@pytest.mark.requirement("A-06")
+def test_names_and_limits_are_equal_in_table_urdf_mujoco_and_pinocchio(
     description: RobotDescription, model: mujoco.MjModel
 ) -> None:
     pin_model = pin.buildModelFromXML(description.urdf)
@@ -200,7 +206,8 @@ def test_a06_names_and_limits_are_equal_in_table_urdf_mujoco_and_pinocchio(
             assert (finger.lower, finger.upper, finger.effort, finger.velocity) == (0.0, 0.044, 333.0, 10.0)
 
 
-def test_a06_yourdfpy_reads_the_same_robot(description: RobotDescription) -> None:
+@pytest.mark.requirement("A-06")
+def test_yourdfpy_reads_the_same_robot(description: RobotDescription) -> None:
     robot = yourdfpy.URDF.load(io.StringIO(description.urdf), build_scene_graph=True, load_meshes=False)
     assert set(robot.link_map) == set(description.links)
     assert robot.validate()
@@ -210,7 +217,8 @@ def test_a06_yourdfpy_reads_the_same_robot(description: RobotDescription) -> Non
         np.testing.assert_allclose(robot.get_transform(name, "world"), T, atol=1e-9, err_msg=name)
 
 
-def test_a13_collision_is_primitives_and_looks_stay_inside_their_bounds(description: RobotDescription) -> None:
+@pytest.mark.requirement("A-13")
+def test_collision_is_primitives_and_looks_stay_inside_their_bounds(description: RobotDescription) -> None:
     def bounds(shapes: tuple[object, ...]) -> tuple[Array, Array]:
         corners = []
         for shape in shapes:
@@ -230,7 +238,8 @@ def test_a13_collision_is_primitives_and_looks_stay_inside_their_bounds(descript
             assert (seen_high <= high + 1.5e-4).all(), name
 
 
-def test_a11_all_names_are_unique(description: RobotDescription, model: mujoco.MjModel) -> None:
+@pytest.mark.requirement("A-11")
+def test_all_names_are_unique(description: RobotDescription, model: mujoco.MjModel) -> None:
     shapes = [s.name for link in description.links.values() for s in link.visual + link.collision]
     assert all(shapes)
     assert len(shapes) == len(set(shapes))

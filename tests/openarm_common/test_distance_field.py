@@ -81,7 +81,8 @@ def test_readers_wait_for_the_first_version_and_follow_a_new_writer(tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_p33_a_stale_field_or_camera_is_refused_by_name(tmp_path: Path) -> None:
+@pytest.mark.requirement("P-33")
+def test_a_stale_field_or_camera_is_refused_by_name(tmp_path: Path) -> None:
     w, reader = writer(tmp_path / "f"), DistanceFieldReader(tmp_path / "f")
     publish(w, 0.1, 10 * S, "overhead")
     field = reader.latest()

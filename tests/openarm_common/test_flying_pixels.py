@@ -87,7 +87,8 @@ def test_planes_up_to_the_slant_are_left_alone(slant: float) -> None:
 
 
 @pytest.mark.parametrize("gap", [0.15, 0.3, 1.0])
-def test_a51_a52_what_floats_between_two_surfaces_is_found(gap: float) -> None:
+@pytest.mark.requirement("A-51", "A-52")
+def test_what_floats_between_two_surfaces_is_found(gap: float) -> None:
     """A disc before a wall, as a D435 sees it: what is left lies at the disc or at the wall."""
     v, u = np.mgrid[:480, :640]
     clean = np.where(np.hypot(u - 320, v - 240) < 100, 1.4 - gap, 1.4)

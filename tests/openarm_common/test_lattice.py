@@ -10,7 +10,8 @@ from openarm_common.errors import OpenArmError
 from openarm_common.octree.lattice import KEY_ZERO, Lattice
 
 
-def test_a54_faces_on_the_lattice_stay_where_they_are() -> None:
+@pytest.mark.requirement("A-54")
+def test_faces_on_the_lattice_stay_where_they_are() -> None:
     """0.58 / 0.02 is 28.999… in floats; the box still has 29 cells."""
     lattice = Lattice.from_bounds(0.02, (0.0, -0.58, 0.0), (0.58, 0.0, 0.1))
     assert lattice.shape == (29, 29, 5)
@@ -35,7 +36,8 @@ def test_centres_and_indices_are_inverse() -> None:
 
 
 @pytest.mark.parametrize("levels", [1, 2, 3, 15])
-def test_a75_coarser_cells_contain_the_finer_ones(levels: int) -> None:
+@pytest.mark.requirement("A-75")
+def test_coarser_cells_contain_the_finer_ones(levels: int) -> None:
     """The centre of a coarse key is ``(key - 32768 + 0.5) * resolution`` again, as octomap readers compute it."""
     fine = Lattice.from_bounds(0.02, (-0.31, 0.07, -0.01), (0.2, 0.3, 0.2))
     coarse = fine.coarser(levels)

@@ -22,7 +22,8 @@ def names(inbox: Inbox, due: dict[str, int]) -> list[tuple[str, int]]:
 
 
 @given(st.randoms(use_true_random=False))
-def test_n18_the_order_of_a_tick_does_not_depend_on_arrival(shuffle: random.Random) -> None:
+@pytest.mark.requirement("N-18")
+def test_the_order_of_a_tick_does_not_depend_on_arrival(shuffle: random.Random) -> None:
     sent = [("/b", 1, 20), ("/b", 2, 30), ("/a", 1, 30), ("/c/request", 1, None), ("/a/request", 1, None)]
     shuffle.shuffle(sent)
     inbox = Inbox()
@@ -32,7 +33,8 @@ def test_n18_the_order_of_a_tick_does_not_depend_on_arrival(shuffle: random.Rand
     assert names(inbox, dict.fromkeys(("/a", "/b", "/a/request", "/c/request"), 9)) == order
 
 
-def test_n18_what_was_sent_after_the_tick_waits_for_the_next() -> None:
+@pytest.mark.requirement("N-18")
+def test_what_was_sent_after_the_tick_waits_for_the_next() -> None:
     inbox = Inbox()
     for number in (1, 2, 3):
         inbox.add("/a", nothing, number, number)

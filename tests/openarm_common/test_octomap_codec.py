@@ -28,7 +28,8 @@ def states_of(seed: int) -> np.ndarray:
     return states
 
 
-def test_a57_one_voxel_is_thirty_two_bytes() -> None:
+@pytest.mark.requirement("A-57")
+def test_one_voxel_is_thirty_two_bytes() -> None:
     """Sixteen inner nodes of two bytes; the voxel at (0, 0, 0) is child 7 of the root and child 0 from there on."""
     states = np.zeros(LATTICE.shape, np.uint8)
     states[8, 8, 8] = 2
@@ -51,7 +52,8 @@ def test_an_empty_map_has_no_bytes() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_a57_binary_round_trip(seed: int) -> None:
+@pytest.mark.requirement("A-57")
+def test_binary_round_trip(seed: int) -> None:
     states = states_of(seed)
     leaves = decode(ENCODER.binary(states).data, 0.02, binary=True)
     values, outside = leaves.on(LATTICE)
@@ -61,7 +63,8 @@ def test_a57_binary_round_trip(seed: int) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_a57_full_round_trip(seed: int) -> None:
+@pytest.mark.requirement("A-57")
+def test_full_round_trip(seed: int) -> None:
     rng = np.random.default_rng(seed)
     levels = np.array([np.nan, -2.0, -0.405, 0.442, 3.5], np.float32)
     log_odds = levels[(states_of(seed) + rng.integers(0, 3)) % 5]

@@ -28,7 +28,8 @@ def buffer() -> RobotStateBuffer:
 
 
 @given(st.integers(0, 10 * MS))
-def test_a44_interpolates_between_two_that_bracket(t_ns: int) -> None:
+@pytest.mark.requirement("A-44")
+def test_interpolates_between_two_that_bracket(t_ns: int) -> None:
     buffer = RobotStateBuffer(RobotDescription.from_urdf(URDF))
     buffer.add_joint_state(0, ["lift"], [0.0])
     buffer.add_joint_state(10 * MS, ["lift"], [0.1])
@@ -36,7 +37,8 @@ def test_a44_interpolates_between_two_that_bracket(t_ns: int) -> None:
 
 
 @pytest.mark.parametrize(("offset_ms", "accepted"), [(-5, True), (5, True), (6, False), (-6, False), (20, False)])
-def test_a72_beyond_the_ends_five_milliseconds_are_the_limit(
+@pytest.mark.requirement("A-72")
+def test_beyond_the_ends_five_milliseconds_are_the_limit(
     buffer: RobotStateBuffer, offset_ms: int, accepted: bool
 ) -> None:
     buffer.add_joint_state(100 * MS, ["lift"], [0.3])
@@ -56,7 +58,8 @@ def test_a_gap_in_the_joint_states_is_not_bridged(buffer: RobotStateBuffer) -> N
         buffer.joints_at(250 * MS)
 
 
-def test_b33_nothing_yet_is_an_answer(buffer: RobotStateBuffer) -> None:
+@pytest.mark.requirement("B-33")
+def test_nothing_yet_is_an_answer(buffer: RobotStateBuffer) -> None:
     with pytest.raises(OpenArmError, match="no /joint_states yet"):
         buffer.joints_at(0)
     with pytest.raises(OpenArmError, match="no /joint_states yet"):
@@ -76,7 +79,8 @@ def test_fixed_frames_need_no_joint_state(buffer: RobotStateBuffer) -> None:
     assert np.allclose(buffer.lookup("base", "table", 0)[:3, 3], (0.0, 0.0, 0.4))
 
 
-def test_b34_an_unknown_frame_is_refused_with_the_known_ones(buffer: RobotStateBuffer) -> None:
+@pytest.mark.requirement("B-34")
+def test_an_unknown_frame_is_refused_with_the_known_ones(buffer: RobotStateBuffer) -> None:
     with pytest.raises(OpenArmError) as caught:
         buffer.lookup("base", "camera_link", 0)
     assert caught.value.code is Code.NO_TRANSFORM

@@ -189,7 +189,8 @@ def test_scenes_are_frozen() -> None:
         load_scene("demo").name = "other"  # type: ignore[misc]
 
 
-def test_b17_random_scenes_are_graspable_and_repeatable() -> None:
+@pytest.mark.requirement("B-17")
+def test_random_scenes_are_graspable_and_repeatable() -> None:
     counts, shapes, sides = set(), set(), set()
     for seed in range(200):
         scene = random_scene(seed)

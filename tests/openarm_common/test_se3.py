@@ -43,7 +43,8 @@ def test_log_at_half_a_turn(axis: int) -> None:
 
 
 @given(rotation_vectors)
-def test_b64_quaternion_round_trip_is_xyzw_with_w_not_negative(w: np.ndarray) -> None:
+@pytest.mark.requirement("B-64")
+def test_quaternion_round_trip_is_xyzw_with_w_not_negative(w: np.ndarray) -> None:
     R = se3.exp_so3(w)
     q = se3.quat_xyzw_from_matrix(R)
     assert q[3] >= 0.0
@@ -58,7 +59,8 @@ def test_a_quaternion_that_is_no_rotation_is_refused(q: tuple[float, ...]) -> No
         se3.matrix_from_quat_xyzw(q)
 
 
-def test_b64_rotation_from_directions() -> None:
+@pytest.mark.requirement("B-64")
+def test_rotation_from_directions() -> None:
     R = se3.rotation_from_z_y((0.0, 0.0, -2.0), (0.0, 1.0, 0.3))
     assert np.allclose(R[:, 2], (0.0, 0.0, -1.0))
     assert np.allclose(R[:, 1], (0.0, 1.0, 0.0))

@@ -47,7 +47,8 @@ def truth(kind: str, points: np.ndarray, padding: float) -> np.ndarray:
 
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(list(GEOMETRY)), st.integers(0, 2**32 - 1))
-def test_p05_pixels_in_the_padded_shape_and_no_others_are_labelled(kind: str, seed: int) -> None:
+@pytest.mark.requirement("P-05")
+def test_pixels_in_the_padded_shape_and_no_others_are_labelled(kind: str, seed: int) -> None:
     """Any pose of the camera, also inside the shape or beside it."""
     rng = np.random.default_rng(seed)
     description = RobotDescription.from_urdf(ONE_LINK.format(geometry=GEOMETRY[kind]))
@@ -98,7 +99,8 @@ def test_each_link_has_a_padding_of_its_own() -> None:
             SelfFilterConfig(link_padding=(wrong,))
 
 
-def test_p04_p05_a_held_box_follows_its_link() -> None:
+@pytest.mark.requirement("P-04", "P-05")
+def test_a_held_box_follows_its_link() -> None:
     robot = SelfFilter(ROBOT, SelfFilterConfig(padding=0.0, held_padding=0.0))
     held = HeldBox("left/cube", "openarm_left_hand_tcp", se3.make(None, (0.0, 0.0, 0.03)), (0.05, 0.05, 0.05))
     for q in (0.0, 0.9):

@@ -57,7 +57,8 @@ def generator() -> ModuleType:
     return module
 
 
-def test_a74_collision_matrix_is_symmetric_and_keeps_what_must_be_checked(
+@pytest.mark.requirement("A-74")
+def test_collision_matrix_is_symmetric_and_keeps_what_must_be_checked(
     description: RobotDescription, generator: ModuleType
 ) -> None:
     allowed = description.allowed_collisions
@@ -68,7 +69,8 @@ def test_a74_collision_matrix_is_symmetric_and_keeps_what_must_be_checked(
     assert len(generator.adjacent_pairs(description)) == 22
 
 
-def test_a74_no_pair_that_is_said_never_to_touch_does(description: RobotDescription, generator: ModuleType) -> None:
+@pytest.mark.requirement("A-74")
+def test_no_pair_that_is_said_never_to_touch_does(description: RobotDescription, generator: ModuleType) -> None:
     touching = generator.touching_pairs(description, 3000)
     never = description.allowed_collisions - generator.adjacent_pairs(description) - generator.default_pairs()
     assert len(never) > 50

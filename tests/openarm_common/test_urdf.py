@@ -21,7 +21,8 @@ MINI = """<robot name="mini">
 </robot>"""
 
 
-def test_b07_any_robot_can_be_read() -> None:
+@pytest.mark.requirement("B-07")
+def test_any_robot_can_be_read() -> None:
     robot = RobotDescription.from_urdf(MINI)
     assert (robot.root, robot.name) == ("base", "mini")
     assert robot.links["base"].visual[0].size == (0.1,)
@@ -51,7 +52,8 @@ def test_b07_any_robot_can_be_read() -> None:
         ("sphere", "cone", "<cone> is none of box, cylinder, sphere, mesh"),
     ],
 )
-def test_a11_faulty_descriptions_are_refused_by_name(find: str, replace: str, words: str) -> None:
+@pytest.mark.requirement("A-11")
+def test_faulty_descriptions_are_refused_by_name(find: str, replace: str, words: str) -> None:
     assert MINI.count(find) >= 1
     with pytest.raises(OpenArmError, match=words) as caught:
         RobotDescription.from_urdf(MINI.replace(find, replace, 1))

@@ -39,7 +39,8 @@ def row(seed: int, *, placed: bool = True, attempts: int = 1, false: bool = Fals
     }  # fmt: skip
 
 
-def test_n01_n04_n19_rates_carry_wilson_intervals_and_attempts() -> None:
+@pytest.mark.requirement("N-01", "N-04", "N-19")
+def test_rates_carry_wilson_intervals_and_attempts() -> None:
     rows = [row(0), row(1, attempts=2), row(2, placed=False, code="GRASP_LOST"), row(3, false=True, placed=False)]
     s = report.summarise(rows)
     assert (s["success"], s["possible"], s["first_attempt"], s["false_success"]) == (2, 4, 1, 1)
@@ -59,7 +60,8 @@ def test_impossible_rows_count_apart() -> None:
     assert (s["refused_right"]["count"], s["refused_right"]["n"]) == (1, 2)
 
 
-def test_p13_p14_reports_are_written_in_three_forms(tmp_path) -> None:
+@pytest.mark.requirement("P-13", "P-14")
+def test_reports_are_written_in_three_forms(tmp_path) -> None:
     rows = [row(0), row(1, placed=False, code="GRASP_LOST")]
     done = campaign.Campaign(tmp_path, CampaignOptions(seeds=(0, 1)), rows, wall_s=7.2)
     data = campaign.write_reports(done)
@@ -117,7 +119,8 @@ def test_tasks_come_from_set_and_seed_alone() -> None:
         make_task("nothing", 0)
 
 
-def test_n03_every_kind_of_fault_can_be_made_and_says_how_it_may_end() -> None:
+@pytest.mark.requirement("N-03")
+def test_every_kind_of_fault_can_be_made_and_says_how_it_may_end() -> None:
     for i, kind in enumerate(KINDS):
         task = make_task("faults", len(KINDS) + i)
         assert task.kind == kind
@@ -128,7 +131,8 @@ def trials(task, tmp_path, **kwargs) -> trial.Trials:
     return trial.Trials(task, SimulatedSenses(depth_noise=False), GraspConfig(), folder=tmp_path, **kwargs)
 
 
-def test_b01_b70_two_objects_are_placed_one_after_the_other_without_a_reset(tmp_path) -> None:
+@pytest.mark.requirement("B-01", "B-70")
+def test_two_objects_are_placed_one_after_the_other_without_a_reset(tmp_path) -> None:
     run = trials(make_task("nominal", 10001), tmp_path / "f")
     found = run.run()
     assert found["placed"], found["message"]
@@ -140,7 +144,8 @@ def test_b01_b70_two_objects_are_placed_one_after_the_other_without_a_reset(tmp_
     assert names[-1] == "IDLE"
 
 
-def test_n03_n05_a_nudged_object_is_looked_for_again_and_placed(tmp_path) -> None:
+@pytest.mark.requirement("N-03", "N-05")
+def test_a_nudged_object_is_looked_for_again_and_placed(tmp_path) -> None:
     task = replace(make_task("nominal", 10000), labels=("yellow",))
     name = task.scene.objects[0].name
     nudge = FaultPlan("object_nudged", {"object": name, "mm": 45.0}, when="MOVE_TO_PREGRASP")
@@ -149,14 +154,16 @@ def test_n03_n05_a_nudged_object_is_looked_for_again_and_placed(tmp_path) -> Non
     assert found["attempts"] == 2
 
 
-def test_n03_a_gap_of_joint_states_while_the_hand_is_read_is_waited_out(tmp_path) -> None:
+@pytest.mark.requirement("N-03")
+def test_a_gap_of_joint_states_while_the_hand_is_read_is_waited_out(tmp_path) -> None:
     tasks = (make_task("faults", seed) for seed in range(10000, 10100))
     task = next(task for task in tasks if task.kind == "joint_states_gap")
     found = trials(task, tmp_path).run()
     assert found["placed"], found["message"]
 
 
-def test_n02_n24_what_cannot_be_held_is_refused_and_everything_of_it_kept(tmp_path) -> None:
+@pytest.mark.requirement("N-02", "N-24")
+def test_what_cannot_be_held_is_refused_and_everything_of_it_kept(tmp_path) -> None:
     task = replace(make_task("nominal", 10000), labels=("yellow",), codes=(Code.GRASP_MISSED, Code.GRASP_LOST))
     task = replace(task, fault=FaultPlan("friction_lowered", {"scale": 0.02}))
     run = trials(replace(task, codes=(Code.OK,)), tmp_path, again="openarm campaign --seeds 10000")
@@ -181,7 +188,8 @@ def test_n02_n24_what_cannot_be_held_is_refused_and_everything_of_it_kept(tmp_pa
     assert "openarm campaign --seeds 10000" in (tmp_path / "reason.txt").read_text()
 
 
-def test_p16_nothing_that_decides_reads_ground_truth() -> None:
+@pytest.mark.requirement("P-16")
+def test_nothing_that_decides_reads_ground_truth() -> None:
 
     for module in (performer, link):
         text = Path(module.__file__ or "").read_text()

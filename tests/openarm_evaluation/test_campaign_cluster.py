@@ -49,7 +49,8 @@ def test_without_a_cluster_the_refusal_says_how_to_start_one(tmp_path) -> None:
     assert error.value.code is Code.ENVIRONMENT
 
 
-def test_n24_what_a_worker_keeps_of_a_failure_comes_back_whole(tmp_path) -> None:
+@pytest.mark.requirement("N-24")
+def test_what_a_worker_keeps_of_a_failure_comes_back_whole(tmp_path) -> None:
     (tmp_path / "there" / "deep").mkdir(parents=True)
     (tmp_path / "there" / "deep" / "end.png").write_bytes(b"\x89PNG")
     unpack(pack(tmp_path / "there"), tmp_path / "here")

@@ -24,7 +24,8 @@ def run(set_name: str, seed: int):
     return trials, trials.run()
 
 
-def test_p12_an_object_changes_hands_in_the_middle_and_stands_where_one_arm_alone_cannot_put_it() -> None:
+@pytest.mark.requirement("P-12")
+def test_an_object_changes_hands_in_the_middle_and_stands_where_one_arm_alone_cannot_put_it() -> None:
     trials, row = run("handover", 5000)
     assert row["as_expected"], row["message"]
     assert row["grasps"][0]["route"] == "hand_over"
@@ -33,7 +34,8 @@ def test_p12_an_object_changes_hands_in_the_middle_and_stands_where_one_arm_alon
     assert row["place_error_mm"] < 20.0
 
 
-def test_n13_a65_an_object_that_no_arm_can_grasp_is_pushed_and_then_grasped() -> None:
+@pytest.mark.requirement("N-13", "A-65")
+def test_an_object_that_no_arm_can_grasp_is_pushed_and_then_grasped() -> None:
     trials, row = run("push", 5000)
     assert row["as_expected"], row["message"]
     assert row["grasps"][0]["route"] == "push"
@@ -43,7 +45,8 @@ def test_n13_a65_an_object_that_no_arm_can_grasp_is_pushed_and_then_grasped() ->
     assert float(told[0].split(" mm from where")[0].split()[-1]) < 20.0
 
 
-def test_a65_two_objects_are_grasped_at_once_and_the_arms_keep_apart() -> None:
+@pytest.mark.requirement("A-65")
+def test_two_objects_are_grasped_at_once_and_the_arms_keep_apart() -> None:
     trials, row = run("pairs", 5001)
     assert row["as_expected"], row["message"]
     assert row["arm_gap_mm"] >= 1e3 * LEAST_GAP

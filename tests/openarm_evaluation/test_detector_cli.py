@@ -28,7 +28,8 @@ def data(tmp_path) -> Path:
     return tmp_path
 
 
-def test_b65_the_report_tells_figures_and_shows_failures(data, capsys) -> None:
+@pytest.mark.requirement("B-65")
+def test_the_report_tells_figures_and_shows_failures(data, capsys) -> None:
     """Wrong in the first picture, right in the second: half of what is shown is right, the first picture is shown."""
     model = write_network(data / "net.onnx", boxes((100, 100, 141, 141, 0, 0.9)))
     out, figures = data / "page.html", data / "out.json"

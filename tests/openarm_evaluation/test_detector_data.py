@@ -21,7 +21,8 @@ def files(folder) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.suffix in kinds}
 
 
-def test_p18_b68_sets_are_the_same_for_a_seed_share_nothing_and_go_on_after_a_stop(tmp_path) -> None:
+@pytest.mark.requirement("P-18", "B-68")
+def test_sets_are_the_same_for_a_seed_share_nothing_and_go_on_after_a_stop(tmp_path) -> None:
     made = make_data(tmp_path / "a", SIZE)
     assert made == {"train": 3, "select": 2, "report": 2}
     first = files(tmp_path / "a")
@@ -43,7 +44,8 @@ def test_p18_b68_sets_are_the_same_for_a_seed_share_nothing_and_go_on_after_a_st
     assert sheet.shape == (480, 640, 3)
 
 
-def test_p18_all_classes_are_drawn_and_some_pictures_are_empty() -> None:
+@pytest.mark.requirement("P-18")
+def test_all_classes_are_drawn_and_some_pictures_are_empty() -> None:
     """Boxes lie in the picture, large enough to be seen; the same seed draws the same picture."""
     views = RandomViews()
     empty, kinds = 0, set()

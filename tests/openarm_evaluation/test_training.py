@@ -54,7 +54,8 @@ def data(tmp_path_factory) -> Path:
     return folder
 
 
-def test_b68_samples_are_read_and_varied_with_their_boxes(data) -> None:
+@pytest.mark.requirement("B-68")
+def test_samples_are_read_and_varied_with_their_boxes(data) -> None:
     """The box of a varied picture is still around what is bright: within a pixel or two of its outline."""
     samples = Samples(data, "train")
     rng = np.random.default_rng(1)
@@ -110,7 +111,8 @@ def test_folding_the_batch_norms_changes_nothing() -> None:
         assert Deployed(network, 64, 96)(image).shape == (1, 7, 64 * 96 // 64 + 64 * 96 // 256 + 64 * 96 // 1024)
 
 
-def test_n14_training_learns_goes_on_after_a_stop_and_exports_what_it_learnt(data, tmp_path) -> None:
+@pytest.mark.requirement("N-14")
+def test_training_learns_goes_on_after_a_stop_and_exports_what_it_learnt(data, tmp_path) -> None:
     """A run that is stopped half way and goes on ends like one that is not; the ONNX file gives what torch gives."""
     whole = Fit(data, tmp_path / "whole", CONFIG)
     whole.run(lambda row: None)
@@ -151,7 +153,8 @@ def test_n14_training_learns_goes_on_after_a_stop_and_exports_what_it_learnt(dat
     assert dataclasses.is_dataclass(by_onnx)
 
 
-def test_b65_a_data_set_without_pictures_is_refused_with_what_to_do(tmp_path) -> None:
+@pytest.mark.requirement("B-65")
+def test_a_data_set_without_pictures_is_refused_with_what_to_do(tmp_path) -> None:
     write_classes(tmp_path, ("a",), ("train",))
     with pytest.raises(OpenArmError, match=r"no pictures .*; make some: openarm detector data"):
         Samples(tmp_path, "train")

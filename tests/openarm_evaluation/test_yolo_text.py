@@ -18,7 +18,8 @@ boxes = st.lists(
 
 
 @given(boxes)
-def test_b68_labels_come_back_as_they_were_written(items) -> None:
+@pytest.mark.requirement("B-68")
+def test_labels_come_back_as_they_were_written(items) -> None:
     kinds = np.array([item[0] for item in items], np.int64)
     there = np.array([[u, v, u + w, v + h] for _, u, v, w, h in items], np.float64).reshape(-1, 4)
     text = write_labels(kinds, there, 640, 480)
@@ -32,7 +33,8 @@ def test_b68_labels_come_back_as_they_were_written(items) -> None:
     assert back == pytest.approx(there, abs=1e-3)
 
 
-def test_b68_a_line_as_cvat_and_labelimg_write_it() -> None:
+@pytest.mark.requirement("B-68")
+def test_a_line_as_cvat_and_labelimg_write_it() -> None:
     kinds, there = read_labels("2 0.500000 0.250000 0.100000 0.200000\n\n", 640, 480, 3, "here.txt")
     assert kinds.tolist() == [2]
     assert there[0] == pytest.approx([288.0, 72.0, 352.0, 168.0])
@@ -49,7 +51,8 @@ def test_b68_a_line_as_cvat_and_labelimg_write_it() -> None:
         ("1 0.97 0.5 0.1 0.1", "leaves the picture"),
     ],
 )
-def test_b65_label_errors_are_refused_with_file_and_line(line: str, words: str) -> None:
+@pytest.mark.requirement("B-65")
+def test_label_errors_are_refused_with_file_and_line(line: str, words: str) -> None:
     with pytest.raises(OpenArmError, match=r"here\.txt:2") as caught:
         read_labels(f"0 0.5 0.5 0.1 0.1\n{line}\n", 640, 480, 3, "here.txt")
     assert words in caught.value.message

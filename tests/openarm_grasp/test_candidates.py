@@ -43,20 +43,23 @@ boxes = st.builds(
 
 
 @given(boxes)
-def test_b42_the_best_grasp_comes_from_straight_above(target):
+@pytest.mark.requirement("B-42")
+def test_the_best_grasp_comes_from_straight_above(target):
     best = propose(target, CONFIG)[0]
     assert best.tilt == 0.0
     assert best.T_base_tcp[:3, 2] @ DOWN >= 0.99
 
 
 @given(boxes)
-def test_b42_each_tilt_leans_by_its_angle(target):
+@pytest.mark.requirement("B-42")
+def test_each_tilt_leans_by_its_angle(target):
     for c in propose(target, CONFIG):
         assert c.T_base_tcp[:3, 2] @ DOWN == pytest.approx(np.cos(c.tilt))
 
 
 @given(boxes)
-def test_b43_opening_axis_is_horizontal_and_parallel_to_an_edge(target):
+@pytest.mark.requirement("B-43")
+def test_opening_axis_is_horizontal_and_parallel_to_an_edge(target):
     edges = target.T_base_object[:2, :2]
     for c in propose(target, CONFIG):
         y_tool = c.T_base_tcp[:3, 1]
@@ -65,7 +68,8 @@ def test_b43_opening_axis_is_horizontal_and_parallel_to_an_edge(target):
 
 
 @given(boxes)
-def test_b44_tool_z_is_the_approach_and_tool_y_spans_the_width(target):
+@pytest.mark.requirement("B-44")
+def test_tool_z_is_the_approach_and_tool_y_spans_the_width(target):
     for c in propose(target, CONFIG):
         R = c.T_base_tcp[:3, :3]
         assert pytest.approx(np.eye(3), abs=1e-9) == R @ R.T
@@ -77,7 +81,8 @@ def test_b44_tool_z_is_the_approach_and_tool_y_spans_the_width(target):
 
 
 @given(boxes)
-def test_b45_b46_pregrasp_is_straight_behind_the_grasp(target):
+@pytest.mark.requirement("B-45", "B-46")
+def test_pregrasp_is_straight_behind_the_grasp(target):
     for c in propose(target, CONFIG):
         assert 0.05 <= np.linalg.norm(c.approach_offset) <= 0.08
         pregrasp = c.T_base_tcp[:3, 3] + c.approach_offset
@@ -87,19 +92,22 @@ def test_b45_b46_pregrasp_is_straight_behind_the_grasp(target):
         assert c.retreat_offset == pytest.approx((0.0, 0.0, CONFIG.approach.lift_height))
 
 
-def test_b46_pregrasp_distance_of_6_cm_is_a_parameter():
+@pytest.mark.requirement("B-46")
+def test_pregrasp_distance_of_6_cm_is_a_parameter():
     config = GraspConfig.model_validate({"approach": {"pregrasp_distance": 0.06}})
     top_down = propose(box(), config)[0]
     assert top_down.approach_offset[2] == pytest.approx(0.06)
 
 
 @pytest.mark.parametrize("value", [0.04, 0.09])
-def test_b45_pregrasp_distance_is_5_to_8_cm(value):
+@pytest.mark.requirement("B-45")
+def test_pregrasp_distance_is_5_to_8_cm(value):
     with pytest.raises(ValueError, match="pregrasp_distance"):
         GraspConfig.model_validate({"approach": {"pregrasp_distance": value}})
 
 
-def test_b48_pregrasp_distance_must_exceed_the_path_tolerance():
+@pytest.mark.requirement("B-48")
+def test_pregrasp_distance_must_exceed_the_path_tolerance():
     with pytest.raises(ValueError, match="at least twice path_tolerance"):
         GraspConfig.model_validate({"approach": {"pregrasp_distance": 0.06, "path_tolerance": 0.035}})
 
@@ -138,7 +146,8 @@ def can(x=0.26, y=-0.2, yaw=0.0, width=0.06) -> Detection:
 
 
 @given(st.floats(-np.pi, np.pi))
-def test_b43_what_is_round_is_taken_from_any_side(yaw):
+@pytest.mark.requirement("B-43")
+def test_what_is_round_is_taken_from_any_side(yaw):
     """Whatever yaw the camera gave it: a hand stands across every 30 degrees."""
     found = propose(can(yaw=yaw), CONFIG)
     assert len({c.id for c in found}) == len(found) == 6 * 2 * (1 + 3 * 2)
@@ -147,7 +156,8 @@ def test_b43_what_is_round_is_taken_from_any_side(yaw):
     assert {c.width for c in found} == {0.06}
 
 
-def test_b43_the_steps_around_what_is_round_are_a_parameter():
+@pytest.mark.requirement("B-43")
+def test_the_steps_around_what_is_round_are_a_parameter():
     config = GraspConfig.model_validate({"approach": {"round_step_deg": 45.0, "tilts_deg": [0.0]}})
     assert [c.id for c in propose(can(), config)] == [f"red/{a}{f}/tilt0" for a in (0, 45, 90, 135) for f in "+-"]
 
@@ -175,7 +185,8 @@ def test_score_is_the_sum_of_its_parts():
         assert set(c.parts) == {"tilt", "width", "side", "room", "used"}
 
 
-def test_n21_hands_whose_fingers_have_room_come_first():
+@pytest.mark.requirement("N-21")
+def test_hands_whose_fingers_have_room_come_first():
     """A block stands close to the narrow side, across which the hand would close by itself: it turns by a quarter."""
     alone = box(yaw=0.0, size=(0.045, 0.05, 0.05))
     beside = box(x=alone.p_base[0] + 0.075, yaw=0.0, size=(0.05, 0.05, 0.05), label="blue")
@@ -200,7 +211,8 @@ def test_only_the_narrow_edge_of_a_wide_box_is_grasped():
     assert {c.width for c in found} == {0.05}
 
 
-def test_b17_too_wide_states_widths_and_limit():
+@pytest.mark.requirement("B-17")
+def test_too_wide_states_widths_and_limit():
     with pytest.raises(OpenArmError) as error:
         propose(box(size=(0.08, 0.09, 0.05)), CONFIG)
     assert error.value.code is Code.TOO_WIDE

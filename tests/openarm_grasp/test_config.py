@@ -23,7 +23,8 @@ def fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Fiel
 
 
 @pytest.mark.parametrize(("name", "field"), list(fields(GraspConfig)), ids=lambda v: v if isinstance(v, str) else "")
-def test_b62_every_parameter_is_described_and_numbers_have_a_range(name, field):
+@pytest.mark.requirement("B-62")
+def test_every_parameter_is_described_and_numbers_have_a_range(name, field):
     assert field.description
     if field.annotation in (int, float):
         assert field.metadata, f"{name} has no range"
@@ -52,7 +53,8 @@ def test_impossible_tilts_are_refused(tilts):
         GraspConfig.model_validate({"approach": {"tilts_deg": tilts}})
 
 
-def test_a69_p16_no_source_reads_ground_truth_or_contacts_or_the_simulator():
+@pytest.mark.requirement("A-69", "P-16")
+def test_no_source_reads_ground_truth_or_contacts_or_the_simulator():
     folder = Path(openarm_grasp.__file__).parent
     for path in folder.rglob("*.py"):
         text = path.read_text(encoding="utf-8")

@@ -67,7 +67,8 @@ def test_both_machines_watch_the_same_camera(crew: Crew) -> None:
         ("done", "cancelled", "CANCELLED"),
     ],
 )
-def test_p02_the_outcome_of_two_is_told_in_one_word(first: str, second: str, kind: str) -> None:
+@pytest.mark.requirement("P-02")
+def test_the_outcome_of_two_is_told_in_one_word(first: str, second: str, kind: str) -> None:
     ends = {
         "done": GraspOutcome(Code.OK, "placed", "a", attempts=1),
         "refused": GraspOutcome(Code.UNREACHABLE, "too far", "a"),

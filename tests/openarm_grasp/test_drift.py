@@ -28,7 +28,8 @@ def watched(bias: tuple[float, float], noise: float, n: int = 10, seed: int = 0)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_n06_a_bias_of_8_mm_is_found_and_named_within_10_grasps(seed):
+@pytest.mark.requirement("N-06")
+def test_a_bias_of_8_mm_is_found_and_named_within_10_grasps(seed):
     drift = watched((0.008, 0.0), 0.002, seed=seed).of("overhead")
     assert drift.alarm
     assert drift.bias == pytest.approx((0.008, 0.0), abs=0.003)
@@ -37,24 +38,28 @@ def test_n06_a_bias_of_8_mm_is_found_and_named_within_10_grasps(seed):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_n06_noise_alone_raises_no_alarm(seed):
+@pytest.mark.requirement("N-06")
+def test_noise_alone_raises_no_alarm(seed):
     assert not watched((0.0, 0.0), 0.003, seed=seed).of("overhead").alarm
 
 
-def test_n06_few_grasps_and_other_cameras_say_nothing():
+@pytest.mark.requirement("N-06")
+def test_few_grasps_and_other_cameras_say_nothing():
     watch = watched((0.008, 0.0), 0.001, n=4)
     assert not watch.of("overhead").alarm
     assert watch.of("wrist").grasps == 0
 
 
-def test_n06_old_grasps_are_forgotten():
+@pytest.mark.requirement("N-06")
+def test_old_grasps_are_forgotten():
     watch = watched((0.008, 0.0), 0.001)
     for k in range(10):
         watch.add("overhead", np.array([1.0, 0.0]) if k % 2 else np.array([0.0, 1.0]), 0.0)
     assert not watch.of("overhead").alarm
 
 
-def test_n06_grasps_with_a_mount_8_mm_off_raise_the_alarm() -> None:
+@pytest.mark.requirement("N-06")
+def test_grasps_with_a_mount_8_mm_off_raise_the_alarm() -> None:
     camera = load_cameras()["overhead"]
     believed = se3.make(p=(0.006, 0.0053, 0.0)) @ camera.T_parent_link
     task = replace(make_task("nominal", 10001), labels=("red", "green") * 3)

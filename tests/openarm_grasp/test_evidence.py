@@ -56,7 +56,8 @@ def larger(**kwargs) -> Detection:
         ({"tcp_error": 0.008}, Grip.HELD),
     ],
 )
-def test_a71_grip_truth_table(changes, expected):
+@pytest.mark.requirement("A-71")
+def test_grip_truth_table(changes, expected):
     evidence = Evidence(**{**vars(GOOD), **changes})
     grip, reason = judge_grip(evidence, HELD)
     assert grip is expected
@@ -64,7 +65,8 @@ def test_a71_grip_truth_table(changes, expected):
 
 
 @pytest.mark.parametrize(("pads", "held"), [((12.0, 14.0), True), ((12.0, 0.4), False), ((), False)])
-def test_a69_where_there_are_sensors_both_pads_must_feel_the_object(pads, held):
+@pytest.mark.requirement("A-69")
+def test_where_there_are_sensors_both_pads_must_feel_the_object(pads, held):
     evidence = Evidence(**{**vars(GOOD), "pads": pads})
     grip, reason = judge_grip(evidence, HeldConfig(use_finger_force=True))
     assert (grip is Grip.HELD) == held, reason
@@ -100,7 +102,8 @@ def test_what_was_held_and_is_not_is_lost(gap, effort):
         ([Frame(1, (seen(),)), Frame(2, ())], Sight.STILL_THERE),
     ],
 )
-def test_p08_sight_truth_table(after, expected):
+@pytest.mark.requirement("P-08")
+def test_sight_truth_table(after, expected):
     sight, reason = judge_sight(seen(), after, HELD, match_radius=0.03)
     assert sight is expected
     assert reason
@@ -108,7 +111,8 @@ def test_p08_sight_truth_table(after, expected):
 
 @pytest.mark.parametrize("sight", list(Sight))
 @pytest.mark.parametrize("grip", list(Grip))
-def test_a71_p08_a_lift_needs_hand_and_camera(grip, sight):
+@pytest.mark.requirement("A-71", "P-08")
+def test_a_lift_needs_hand_and_camera(grip, sight):
     verdict = judge_lift((grip, "hand"), (sight, "camera"))
     assert verdict.ok == (grip is Grip.HELD and sight in (Sight.RISEN, Sight.GONE))
     if grip is not Grip.HELD:
@@ -117,7 +121,8 @@ def test_a71_p08_a_lift_needs_hand_and_camera(grip, sight):
         assert verdict.code is Code.STALE_DATA
 
 
-def test_a71_without_an_object_nothing_is_held():
+@pytest.mark.requirement("A-71")
+def test_without_an_object_nothing_is_held():
     """The hand closes on nothing and the camera sees nothing: no evidence, no success."""
     grip = judge_grip(Evidence(gap=0.0, expected=0.05, effort=0.0, speed=0.0), HELD)
     sight = judge_sight(seen(), [Frame(1, ())], HELD, match_radius=0.03)
@@ -137,12 +142,14 @@ def test_a71_without_an_object_nothing_is_held():
         ([Frame(1, (seen(),)), Frame(2, (seen(x=0.29),))], Code.PLACE_FAILED),
     ],
 )
-def test_p09_a_place_counts_when_the_camera_sees_it_within_2_cm(frames, code):
+@pytest.mark.requirement("P-09")
+def test_a_place_counts_when_the_camera_sees_it_within_2_cm(frames, code):
     verdict = judge_place("red", np.array([0.26, -0.2, 0.4]), frames, 0.02)
     assert verdict.code is code
 
 
-def test_p08_a_twin_elsewhere_is_not_taken_for_the_lifted_object() -> None:
+@pytest.mark.requirement("P-08")
+def test_a_twin_elsewhere_is_not_taken_for_the_lifted_object() -> None:
     """A taller object of the same label stands beside: it proves nothing, and the one that is gone is gone."""
     twin = seen(x=0.40, top=0.50, height=0.10)
     assert judge_sight(seen(), [Frame(1, (twin,))], HELD, match_radius=0.03)[0] is Sight.ASKEW
@@ -160,14 +167,16 @@ def test_p08_a_twin_elsewhere_is_not_taken_for_the_lifted_object() -> None:
         ((larger(x=0.29),), True),  # pixels of the hand are in it
     ],
 )
-def test_n03_an_object_that_has_moved_is_noticed_before_the_hand_goes_down(found, still) -> None:
+@pytest.mark.requirement("N-03")
+def test_an_object_that_has_moved_is_noticed_before_the_hand_goes_down(found, still) -> None:
     assert judge_still(seen(), [Frame(1, found)], HELD)[0] is still
 
 
 @pytest.mark.parametrize(
     ("height", "code"), [(0.05, Code.OK), (0.054, Code.OK), (0.06, Code.PLACE_FAILED), (0.04, Code.PLACE_FAILED)]
 )
-def test_p09_what_has_fallen_over_is_not_placed_and_no_other_try_would_help(height, code) -> None:
+@pytest.mark.requirement("P-09")
+def test_what_has_fallen_over_is_not_placed_and_no_other_try_would_help(height, code) -> None:
     verdict = judge_place("red", np.array([0.26, -0.2, 0.4]), [Frame(1, (seen(),))], 0.02, height=height)
     assert verdict.code is code
     assert verdict.final == (code is not Code.OK)

@@ -11,13 +11,15 @@ from openarm_grasp.strategy import effects as fx
 from tests.openarm_grasp.two_arms import OVER, TwoArms
 
 
-def test_p11_a_direct_request_goes_one_way_and_says_so(robot) -> None:
+@pytest.mark.requirement("P-11")
+def test_a_direct_request_goes_one_way_and_says_so(robot) -> None:
     two = robot(0.25, 0.25)
     outcome = two.ask(place=(0.25, 0.35))
     assert (outcome.code, outcome.route, outcome.arm, outcome.attempts) == (Code.OK, "direct", "left", 1)
 
 
-def test_p11_the_other_arm_is_asked_before_a_hand_over(robot) -> None:
+@pytest.mark.requirement("P-11")
+def test_the_other_arm_is_asked_before_a_hand_over(robot) -> None:
     """At y = 0.14 the left arm is nearer, but the right one reaches both ends."""
     two = robot(0.25, 0.14)
     two._reaches = lambda arm, p: (p[1] >= 0.1) if arm == "left" else (p[1] <= 0.2)
@@ -26,7 +28,8 @@ def test_p11_the_other_arm_is_asked_before_a_hand_over(robot) -> None:
     assert any("from the other side" in note for note in two.notes)
 
 
-def test_p12_an_object_goes_from_hand_to_hand_by_way_of_the_middle(robot) -> None:
+@pytest.mark.requirement("P-12")
+def test_an_object_goes_from_hand_to_hand_by_way_of_the_middle(robot) -> None:
     two = robot(0.25, -0.30, ("blue", 0.25, 0.15))
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.code, outcome.route, outcome.kind) == (Code.OK, "hand_over", "SUCCESS")
@@ -45,7 +48,8 @@ def test_p12_an_object_goes_from_hand_to_hand_by_way_of_the_middle(robot) -> Non
     assert abs(y) <= middle.abs_y
 
 
-def test_p12_what_the_taker_cannot_use_is_not_chosen(robot) -> None:
+@pytest.mark.requirement("P-12")
+def test_what_the_taker_cannot_use_is_not_chosen(robot) -> None:
     """The taker reaches one end of the strip only; nothing moves before a spot there is found."""
     two = robot(0.25, -0.30, hand_over={"tries": 50})
     two._reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= 0.02
@@ -54,7 +58,8 @@ def test_p12_what_the_taker_cannot_use_is_not_chosen(robot) -> None:
     assert len([e for e in two.world.done(fx.Execute) if e.trajectory == "lift"]) == 2
 
 
-def test_p12_a_taker_that_fails_leaves_a_partial_result_that_says_where_the_object_is(robot) -> None:
+@pytest.mark.requirement("P-12")
+def test_a_taker_that_fails_leaves_a_partial_result_that_says_where_the_object_is(robot) -> None:
     two = robot(0.25, -0.30)
     two.world.fail(lambda e: isinstance(e, fx.Execute) and e.arm == "left" and e.trajectory == "approach",
                    Code.EXECUTION_FAILED)  # fmt: skip
@@ -66,7 +71,8 @@ def test_p12_a_taker_that_fails_leaves_a_partial_result_that_says_where_the_obje
 
 
 @pytest.mark.parametrize(("margin", "spot_y"), [(0.0, -0.03), (0.005, 0.0)])
-def test_p12_the_taker_must_cope_with_an_object_that_stands_a_little_off(robot, margin, spot_y) -> None:
+@pytest.mark.requirement("P-12")
+def test_the_taker_must_cope_with_an_object_that_stands_a_little_off(robot, margin, spot_y) -> None:
     """The nearest spot is within the taker's reach by 2 mm: too little, once a margin is asked for."""
     two = robot(0.25, -0.30, hand_over={"margin": margin, "margin_deg": 0.0, "tries": 50})
     two._reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= -0.032
@@ -75,7 +81,8 @@ def test_p12_the_taker_must_cope_with_an_object_that_stands_a_little_off(robot, 
     assert f"{spot_y:.3f}) m, and the left arm from there" in outcome.message.replace("-0.000", "0.000")
 
 
-def test_p12_a_spot_without_margin_is_better_than_none(robot) -> None:
+@pytest.mark.requirement("P-12")
+def test_a_spot_without_margin_is_better_than_none(robot) -> None:
     two = robot(0.25, -0.30, hand_over={"abs_y": 0.001, "tries": 50})
     two._reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= 0.0
     outcome = two.ask(place=(0.25, 0.30), dry_run=True)
@@ -100,7 +107,8 @@ def shy_taker(two: TwoArms, times: int) -> None:
     two._reaches = reaches
 
 
-def test_p12_a_taker_that_is_refused_after_all_gets_the_object_elsewhere(robot) -> None:
+@pytest.mark.requirement("P-12")
+def test_a_taker_that_is_refused_after_all_gets_the_object_elsewhere(robot) -> None:
     two = robot(0.25, -0.30)
     shy_taker(two, 1)
     outcome = two.ask(place=(0.25, 0.30))
@@ -110,7 +118,8 @@ def test_p12_a_taker_that_is_refused_after_all_gets_the_object_elsewhere(robot) 
     assert any("looking for another way from where it stands now" in note for note in two.notes)
 
 
-def test_p12_it_is_brought_to_the_middle_as_often_as_the_parameter_says(robot) -> None:
+@pytest.mark.requirement("P-12")
+def test_it_is_brought_to_the_middle_as_often_as_the_parameter_says(robot) -> None:
     two = robot(0.25, -0.30, hand_over={"rounds": 2})
     shy_taker(two, 9)
     outcome = two.ask(place=(0.25, 0.30))
@@ -120,7 +129,8 @@ def test_p12_it_is_brought_to_the_middle_as_often_as_the_parameter_says(robot) -
     assert f"at try number 2 'red' was seen at ({x:.3f}, {y:.3f}) m" in outcome.message
 
 
-def test_p12_without_another_way_the_answer_says_both(robot) -> None:
+@pytest.mark.requirement("P-12")
+def test_without_another_way_the_answer_says_both(robot) -> None:
     """From the middle the right arm cannot lift it again."""
     two = robot(0.25, -0.30)
     shy_taker(two, 9)
@@ -137,7 +147,8 @@ def test_p12_without_another_way_the_answer_says_both(robot) -> None:
     assert "'red' was seen at" in outcome.message
 
 
-def test_p12_a_giver_that_fails_never_calls_the_taker(robot) -> None:
+@pytest.mark.requirement("P-12")
+def test_a_giver_that_fails_never_calls_the_taker(robot) -> None:
     two = robot(0.25, -0.30)
     two.world.fail(lambda e: isinstance(e, fx.Execute) and e.trajectory == "approach", Code.EXECUTION_FAILED)
     outcome = two.ask(place=(0.25, 0.30))
@@ -146,7 +157,8 @@ def test_p12_a_giver_that_fails_never_calls_the_taker(robot) -> None:
     assert {e.arm for e in two.world.done(fx.Execute)} == {"right"}
 
 
-def test_p11_a_full_middle_is_a_reason_to_refuse(robot) -> None:
+@pytest.mark.requirement("P-11")
+def test_a_full_middle_is_a_reason_to_refuse(robot) -> None:
     two = robot(0.25, -0.30, ("blue", 0.20, 0.0), ("green", 0.26, 0.0), ("orange", 0.32, 0.0))
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.kind, outcome.code) == ("REFUSED", Code.UNREACHABLE)
@@ -154,12 +166,14 @@ def test_p11_a_full_middle_is_a_reason_to_refuse(robot) -> None:
     assert not two.world.done(fx.Execute)
 
 
-def test_p11_an_arm_that_was_asked_for_is_not_replaced(robot) -> None:
+@pytest.mark.requirement("P-11")
+def test_an_arm_that_was_asked_for_is_not_replaced(robot) -> None:
     outcome = robot(0.25, -0.30).ask(place=(0.25, 0.30), arm="right")
     assert (outcome.kind, outcome.code) == ("REFUSED", Code.UNREACHABLE)
 
 
-def test_p12_a_dry_run_tells_the_way_and_moves_nothing(robot) -> None:
+@pytest.mark.requirement("P-12")
+def test_a_dry_run_tells_the_way_and_moves_nothing(robot) -> None:
     two = robot(0.25, -0.30)
     outcome = two.ask(place=(0.25, 0.30), dry_run=True)
     assert (outcome.code, outcome.route) == (Code.OK, "hand_over")

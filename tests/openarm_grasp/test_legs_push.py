@@ -10,7 +10,8 @@ from openarm_common.errors import Code
 from openarm_grasp.strategy import effects as fx
 
 
-def test_n13_a65_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(robot) -> None:
+@pytest.mark.requirement("N-13", "A-65")
+def test_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(robot) -> None:
     two = robot(0.46, 0.02)
     two.far = 0.44
     outcome = two.ask()
@@ -23,7 +24,8 @@ def test_n13_a65_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(ro
     assert closed.position == 0.0
 
 
-def test_n13_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_object_now(robot) -> None:
+@pytest.mark.requirement("N-13")
+def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_object_now(robot) -> None:
     two = robot(0.46, 0.02)
     two.far = 0.44
     plan, ahead = two.plan, list[fx.PlanGrasp]()
@@ -42,7 +44,8 @@ def test_n13_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the
         assert gone.T_frame_box[:2, 3] == pytest.approx((0.46, 0.02), abs=1e-6)
 
 
-def test_n13_a_push_that_the_object_does_not_follow_is_repeated_three_times_and_told(robot) -> None:
+@pytest.mark.requirement("N-13")
+def test_a_push_that_the_object_does_not_follow_is_repeated_three_times_and_told(robot) -> None:
     two = robot(0.46, 0.02)
     two.far, two.follows = 0.44, 0.1
     outcome = two.ask()
@@ -52,7 +55,8 @@ def test_n13_a_push_that_the_object_does_not_follow_is_repeated_three_times_and_
     assert f"after the pushes 'red' was seen at ({x:.3f}, {y:.3f}) m" in outcome.message
 
 
-def test_n13_the_camera_verifies_a_push(robot) -> None:
+@pytest.mark.requirement("N-13")
+def test_the_camera_verifies_a_push(robot) -> None:
     """Half of the way is seen as half of the way, and the rest is pushed again."""
     two = robot(0.46, 0.02)
     two.far, two.follows = 0.44, 0.5
@@ -62,7 +66,8 @@ def test_n13_the_camera_verifies_a_push(robot) -> None:
     assert "push 2" in outcome.message
 
 
-def test_n13_an_object_that_is_lost_in_a_push_is_told(robot) -> None:
+@pytest.mark.requirement("N-13")
+def test_an_object_that_is_lost_in_a_push_is_told(robot) -> None:
     two = robot(0.46, 0.02)
     two.far = 0.44
     push = two._push
@@ -90,7 +95,8 @@ def test_what_can_neither_be_grasped_nor_pushed_is_refused_with_both_reasons(rob
     assert not two.world.done(fx.Execute)
 
 
-def test_n13_a_dry_run_of_a_push_moves_nothing(robot) -> None:
+@pytest.mark.requirement("N-13")
+def test_a_dry_run_of_a_push_moves_nothing(robot) -> None:
     two = robot(0.46, 0.02)
     two.far = 0.44
     outcome = two.ask(dry_run=True)

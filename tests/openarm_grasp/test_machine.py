@@ -14,7 +14,8 @@ from openarm_grasp.strategy.states import State
 
 
 # --- success
-def test_b06_b57_a_grasp_goes_through_all_states_in_order(world):
+@pytest.mark.requirement("B-06", "B-57")
+def test_a_grasp_goes_through_all_states_in_order(world):
     outcome = world.grasp()
     assert outcome.success, outcome.message
     assert (outcome.arm, outcome.attempts, outcome.label) == ("right", 1, "red")
@@ -24,7 +25,8 @@ def test_b06_b57_a_grasp_goes_through_all_states_in_order(world):
     assert outcome.duration == pytest.approx((world.t_ns - 1_000_000_000) * 1e-9)
 
 
-def test_b51_the_hand_opens_on_the_way_to_the_pregrasp(world):
+@pytest.mark.requirement("B-51")
+def test_the_hand_opens_on_the_way_to_the_pregrasp(world):
     machine_step, seen = world.machine.step, []
     world.machine.step = lambda event, t: seen.append(machine_step(event, t)) or seen[-1]
     world.grasp()
@@ -34,7 +36,8 @@ def test_b51_the_hand_opens_on_the_way_to_the_pregrasp(world):
     assert together.effects[1].trajectory == "transfer"
 
 
-def test_b52_b53_b54_pause_close_wait_lift(world):
+@pytest.mark.requirement("B-52", "B-53", "B-54")
+def test_pause_close_wait_lift(world):
     world.grasp()
     (close,) = world.times(world.grips(opening=False))
     (arrive,) = world.times(world.executes("approach"))
@@ -43,19 +46,22 @@ def test_b52_b53_b54_pause_close_wait_lift(world):
     assert lift - (close + 0.6) == pytest.approx(0.2)  # the fingers take 0.6 s
 
 
-def test_b54_timing_is_a_parameter(worlds, box):
+@pytest.mark.requirement("B-54")
+def test_timing_is_a_parameter(worlds, box):
     world = worlds(box("red", 0.26, -0.2), timing={"pause_at_grasp": 1.5, "after_close": 0.7})
     world.grasp()
     assert [e.duration for e in world.done(fx.Wait)][:2] == [1.5, 0.7]
 
 
-def test_b71_the_hand_opens_only_before_the_grasp_and_at_the_place(world):
+@pytest.mark.requirement("B-71")
+def test_the_hand_opens_only_before_the_grasp_and_at_the_place(world):
     world.grasp()
     gripper = [(e.what, e.position) for e in world.done(fx.MoveGripper)]
     assert gripper == [("open", 0.044), ("close", 0.0), ("release", 0.044)]
 
 
-def test_b01_a_moved_object_is_grasped_where_it_is(worlds, box):
+@pytest.mark.requirement("B-01")
+def test_a_moved_object_is_grasped_where_it_is(worlds, box):
     for x, y in ((0.2, -0.1), (0.3, -0.35), (0.22, 0.31)):
         world = worlds(box("red", x, y))
         assert world.grasp().success
@@ -63,7 +69,8 @@ def test_b01_a_moved_object_is_grasped_where_it_is(worlds, box):
         assert plan.candidates[0].T_base_tcp[:2, 3] == pytest.approx((x, y))
 
 
-def test_b70_twenty_cycles_unattended(world):
+@pytest.mark.requirement("B-70")
+def test_twenty_cycles_unattended(world):
     for _ in range(20):
         assert world.grasp().success
         assert world.machine.state is State.IDLE
@@ -103,7 +110,8 @@ def test_dry_run_plans_both_and_moves_nothing(world):
 
 
 # --- seeing
-def test_b58_an_unknown_object_is_refused_with_what_is_in_view(world):
+@pytest.mark.requirement("B-58")
+def test_an_unknown_object_is_refused_with_what_is_in_view(world):
     outcome = world.grasp("mug")
     assert outcome.code is Code.UNKNOWN_OBJECT
     assert outcome.message == "no 'mug' in view; in view: blue, red"
@@ -115,7 +123,8 @@ def test_an_empty_table_is_named(worlds):
     assert worlds().grasp().code is Code.NOTHING_DETECTED
 
 
-def test_b58_an_object_that_comes_into_view_is_waited_for(worlds, box):
+@pytest.mark.requirement("B-58")
+def test_an_object_that_comes_into_view_is_waited_for(worlds, box):
     world = worlds(box("blue", 0.26, 0.2))
 
     def arrive(effect):
@@ -126,7 +135,8 @@ def test_b58_an_object_that_comes_into_view_is_waited_for(worlds, box):
     assert world.grasp().success
 
 
-def test_p33_a_stale_detection_is_not_acted_on(world):
+@pytest.mark.requirement("P-33")
+def test_a_stale_detection_is_not_acted_on(world):
     world.frame_age = 0.6
     outcome = world.grasp()
     assert outcome.code is Code.STALE_DATA
@@ -141,7 +151,8 @@ def test_no_frames_end_the_grasp_at_once(world):
     assert len(world.done(fx.Observe)) == 1
 
 
-def test_b33_no_transform_means_no_motion(world):
+@pytest.mark.requirement("B-33")
+def test_no_transform_means_no_motion(world):
     world.fail(lambda e: isinstance(e, fx.ToBase), Code.NO_TRANSFORM)
     outcome = world.grasp()
     assert outcome.code is Code.NO_TRANSFORM
@@ -156,7 +167,8 @@ def test_too_wide_is_refused_with_width_and_limit(worlds, box):
 
 
 # --- planning
-def test_b58_a_failed_plan_looks_again(world):
+@pytest.mark.requirement("B-58")
+def test_a_failed_plan_looks_again(world):
     world.fail(lambda e: isinstance(e, fx.PlanGrasp), Code.NO_PLAN, times=1)
     outcome = world.grasp()
     assert outcome.success

@@ -14,7 +14,8 @@ from openarm_grasp.strategy.states import State
 
 
 # --- grasping
-def test_a70_a_miss_opens_backs_off_and_tries_another_way(world):
+@pytest.mark.requirement("A-70")
+def test_a_miss_opens_backs_off_and_tries_another_way(world):
     world.slips = 1
     outcome = world.grasp()
     assert outcome.success
@@ -26,7 +27,8 @@ def test_a70_a_miss_opens_backs_off_and_tries_another_way(world):
     assert first.candidates[0].id == second.candidates[-1].id
 
 
-def test_a71_without_an_object_the_grasp_fails(worlds, box):
+@pytest.mark.requirement("A-71")
+def test_without_an_object_the_grasp_fails(worlds, box):
     """The object disappears after its detection: three attempts at most, never a success."""
     world = worlds(box("red", 0.26, -0.2))
     world.faults.append(lambda e: world.objects.clear() if isinstance(e, fx.PlanGrasp) else None)
@@ -54,7 +56,8 @@ def test_a_hand_that_stops_short_has_met_the_object(world):
     assert not world.times(world.grips(opening=False))
 
 
-def test_n03_a70_an_object_that_moves_before_the_hand_goes_down_is_not_touched(world, box):
+@pytest.mark.requirement("N-03", "A-70")
+def test_an_object_that_moves_before_the_hand_goes_down_is_not_touched(world, box):
     moved = []
 
     def nudge(effect):
@@ -69,7 +72,8 @@ def test_n03_a70_an_object_that_moves_before_the_hand_goes_down_is_not_touched(w
     assert world.done(fx.PlanGrasp)[1].candidates[0].T_base_tcp[0, 3] == pytest.approx(0.30)
 
 
-def test_n03_a_placed_object_that_the_detector_misses_is_looked_for_again(world):
+@pytest.mark.requirement("N-03")
+def test_a_placed_object_that_the_detector_misses_is_looked_for_again(world):
     real, missed = world.frames, []
 
     def frames(count):
@@ -102,7 +106,8 @@ def test_an_alarm_that_the_look_from_home_does_not_confirm_is_raised_once(world,
     assert outcome.attempts == 2
 
 
-def test_p09_an_object_that_has_fallen_over_is_told(world, box):
+@pytest.mark.requirement("P-09")
+def test_an_object_that_has_fallen_over_is_told(world, box):
     """It stands at its target, lower than it was: nothing that the hand could try again would right it."""
     world.objects["red"] = box("red", 0.26, -0.2, size=0.06)
     outcome = world.grasp()  # the scripted hand puts down cubes of 50 mm
@@ -111,7 +116,8 @@ def test_p09_an_object_that_has_fallen_over_is_told(world, box):
     assert outcome.attempts == 1
 
 
-def test_p08_held_but_still_seen_in_its_place_is_put_back(world):
+@pytest.mark.requirement("P-08")
+def test_held_but_still_seen_in_its_place_is_put_back(world):
     """The hand has something, but the camera says it is not the object: no success, and nothing is dropped."""
     real = world.carry_out
 
@@ -144,7 +150,8 @@ def test_lost_on_the_way_is_found_again(world, box):
 
 
 # --- placing
-def test_p09_a_place_that_is_not_seen_within_2_cm_is_tried_again(world):
+@pytest.mark.requirement("P-09")
+def test_a_place_that_is_not_seen_within_2_cm_is_tried_again(world):
     world.place_error = 0.03
     outcome = world.grasp()
     assert outcome.code is Code.PLACE_FAILED
@@ -214,7 +221,8 @@ def test_a_stop_in_any_state_ends_the_request_and_the_next_works(world, state, c
     assert world.grasp().success
 
 
-def test_p21_a_cancel_while_carrying_keeps_the_object(world):
+@pytest.mark.requirement("P-21")
+def test_a_cancel_while_carrying_keeps_the_object(world):
     world.fail(world.executes("carry"), Code.CANCELLED)
     outcome = world.grasp()
     assert outcome.code is Code.CANCELLED
@@ -237,7 +245,8 @@ def test_a_request_for_an_unknown_arm_is_refused_and_leaves_the_machine_idle(wor
     assert world.grasp().success
 
 
-def test_b72_every_transition_has_a_reason(world):
+@pytest.mark.requirement("B-72")
+def test_every_transition_has_a_reason(world):
     world.slips = 1
     machine_step, reasons = world.machine.step, []
 

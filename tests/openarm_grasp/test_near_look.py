@@ -47,7 +47,8 @@ def grasp(*, enabled: bool, off: tuple[float, float]) -> tuple[Trials, dict, flo
     return trials, trials.run(), errors[0]
 
 
-def test_a35_the_second_look_removes_the_error_of_the_first() -> None:
+@pytest.mark.requirement("A-35")
+def test_the_second_look_removes_the_error_of_the_first() -> None:
     _, _, coarse = grasp(enabled=False, off=(0.009, 0.008))
     trials, row, fine = grasp(enabled=True, off=(0.009, 0.008))
     assert coarse == pytest.approx(0.012, abs=0.002)
@@ -59,7 +60,8 @@ def test_a35_the_second_look_removes_the_error_of_the_first() -> None:
 
 
 @pytest.mark.parametrize("what", ["nothing", "another", "failed"])
-def test_a35_a_second_look_that_does_not_help_changes_nothing(what: str) -> None:
+@pytest.mark.requirement("A-35")
+def test_a_second_look_that_does_not_help_changes_nothing(what: str) -> None:
     task = Task("nominal", 1, Scene(name="near", objects=(CUBE,)), ("red",))
     trials = Trials(task, SimulatedSenses(depth_noise=False), GraspConfig())
     machine, tell, verdicts = trials.machine, trials._tell, []

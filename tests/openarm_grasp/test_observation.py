@@ -78,7 +78,8 @@ def test_one_missed_frame_of_three_is_forgiven_and_two_are_not():
         look(frames((), (), (seen(),)))
 
 
-def test_b27_without_a_label_the_highest_score_is_taken():
+@pytest.mark.requirement("B-27")
+def test_without_a_label_the_highest_score_is_taken():
     pair = (seen("red", score=0.5), seen("blue", y=0.2, score=0.8))
     assert look(frames(pair, pair), "").target.label == "blue"
 
@@ -129,7 +130,8 @@ def test_of_several_alike_the_one_at_a_position_is_meant() -> None:
     assert error.value.code is Code.UNKNOWN_OBJECT
 
 
-def test_p03_what_shall_stay_is_not_picked_again() -> None:
+@pytest.mark.requirement("P-03")
+def test_what_shall_stay_is_not_picked_again() -> None:
     both = (seen(x=0.2), seen(x=0.3, score=0.8))
     assert look(frames(both), leave=((0.21, -0.2),)).target.p_base[0] == pytest.approx(0.3)
     with pytest.raises(OpenArmError, match="besides 2 that shall stay") as error:

@@ -29,7 +29,8 @@ def carry_out(order: Order, codes: dict[Ask, Code] | None = None, table: dict[st
     return asked
 
 
-def test_p03_one_bin_per_class():
+@pytest.mark.requirement("P-03")
+def test_one_bin_per_class():
     order = Order(("red", "blue"), BINS)
     red, blue = carry_out(order)
     assert red.place is not None
@@ -38,21 +39,24 @@ def test_p03_one_bin_per_class():
     assert order.outcome == "SUCCESS"
 
 
-def test_p03_a_single_bin_takes_all_in_slots_of_their_own():
+@pytest.mark.requirement("P-03")
+def test_a_single_bin_takes_all_in_slots_of_their_own():
     order = Order(("red", "blue"), Bins(bins={"tray": Bin(x=(0.15, 0.39), y=(0.10, 0.34))}, rest="tray"), each=2)
     places = [ask.place for ask in carry_out(order)]
     assert len(set(places)) == 4
     assert min(np.hypot(a[0] - b[0], a[1] - b[1]) for i, a in enumerate(places) for b in places[:i]) >= 0.1199
 
 
-def test_p03_all_of_a_label_until_none_is_left():
+@pytest.mark.requirement("P-03")
+def test_all_of_a_label_until_none_is_left():
     order = Order(("red",), each=20)
     assert [ask.label for ask in carry_out(order, table={"red": 3})] == ["red"] * 4
     assert order.placed == ["red"] * 3
     assert order.outcome == "SUCCESS"
 
 
-def test_p02_an_order_done_in_part_says_so():
+@pytest.mark.requirement("P-02")
+def test_an_order_done_in_part_says_so():
     order = Order(("red", "blue"))
     carry_out(order, {Ask("red"): Code.TOO_WIDE})
     assert order.outcome == "PARTIAL"
@@ -67,7 +71,8 @@ def test_a_label_that_was_never_there_failed():
     assert "UNKNOWN_OBJECT" in order.faults()["red"]
 
 
-def test_p19_a_taken_slot_is_passed_over_and_a_full_bin_named():
+@pytest.mark.requirement("P-19")
+def test_a_taken_slot_is_passed_over_and_a_full_bin_named():
     first, second = BINS.bins["left"].slots(BINS.spacing)
     order = Order(("red",), BINS, each=3)
     asked = carry_out(order, {Ask("red", first): Code.IN_COLLISION})
@@ -110,7 +115,8 @@ def test_what_stays_blocked_failed_with_its_reason():
     assert order.outcome == "FAILED"
 
 
-def test_p03_what_an_order_has_placed_it_does_not_pick_again():
+@pytest.mark.requirement("P-03")
+def test_what_an_order_has_placed_it_does_not_pick_again():
     order = Order(("red",), each={"red": 2})
     order.done(order.next(), Code.OK, "", (0.3, -0.2, 0.4))
     assert order.next() == Ask("red", None, ((0.3, -0.2),))

@@ -56,7 +56,8 @@ def picked() -> Bench:
     return bench
 
 
-def test_p01_a_pick_ends_with_the_object_in_the_hand(picked: Bench) -> None:
+@pytest.mark.requirement("P-01")
+def test_a_pick_ends_with_the_object_in_the_hand(picked: Bench) -> None:
     assert picked.position("blue_box")[2] > 0.40 + 0.03 + 0.08
     assert picked.trials.machine.carrying == "right"
     states = [step.state for step in picked.trials.steps]
@@ -65,18 +66,21 @@ def test_p01_a_pick_ends_with_the_object_in_the_hand(picked: Bench) -> None:
     assert picked.position("blue_box")[2] > 0.50  # and it stays there
 
 
-def test_p01_a_full_hand_is_not_opened_by_another_request(picked: Bench) -> None:
+@pytest.mark.requirement("P-01")
+def test_a_full_hand_is_not_opened_by_another_request(picked: Bench) -> None:
     with pytest.raises(OpenArmError, match="still holds 'blue'") as error:
         picked.ask("red")
     assert error.value.code is Code.NOT_READY
 
 
-def test_p01_a_place_that_contradicts_the_hand_is_refused(picked: Bench) -> None:
+@pytest.mark.requirement("P-01")
+def test_a_place_that_contradicts_the_hand_is_refused(picked: Bench) -> None:
     with pytest.raises(OpenArmError, match="right hand that holds 'blue'"):
         picked.ask("red", phase="place")
 
 
-def test_p01_p09_a_place_puts_it_down_at_position_and_yaw(picked: Bench) -> None:
+@pytest.mark.requirement("P-01", "P-09")
+def test_a_place_puts_it_down_at_position_and_yaw(picked: Bench) -> None:
     outcome = picked.ask("", phase="place", place=(0.30, -0.30), place_yaw=0.6)
     assert outcome.success, outcome.message
     assert outcome.kind == "SUCCESS"
@@ -97,7 +101,8 @@ def test_a_yaw_that_one_hold_cannot_give_is_given_by_another() -> None:
     assert abs(off) < math.radians(15.0)
 
 
-def test_p02_a_time_limit_ends_a_carry_with_the_object_held_and_a_place_frees_it() -> None:
+@pytest.mark.requirement("P-02")
+def test_a_time_limit_ends_a_carry_with_the_object_held_and_a_place_frees_it() -> None:
     bench = Bench(BOX)
     whole = Bench(BOX).ask("blue").duration
     outcome = bench.ask("blue", timeout=0.6 * whole)
@@ -109,7 +114,8 @@ def test_p02_a_time_limit_ends_a_carry_with_the_object_held_and_a_place_frees_it
 
 
 @pytest.mark.parametrize("state", ["MOVE_TO_PREGRASP", "MOVE_TO_GRASP", "CLOSE_GRIPPER", "LIFT", "PLACE", "RESET"])
-def test_p21_a_cancel_in_each_state_drops_nothing_and_the_next_request_works(state: str) -> None:
+@pytest.mark.requirement("P-21")
+def test_a_cancel_in_each_state_drops_nothing_and_the_next_request_works(state: str) -> None:
     bench = Bench(BOX)
     trials, robot = bench.trials, bench.trials.robot
     entered: list[int] = []
@@ -137,7 +143,8 @@ def test_p21_a_cancel_in_each_state_drops_nothing_and_the_next_request_works(sta
 
 
 @pytest.mark.parametrize("use", [False, True])
-def test_a69_a_grasp_is_held_with_and_without_the_force_of_the_pads(use: bool) -> None:
+@pytest.mark.requirement("A-69")
+def test_a_grasp_is_held_with_and_without_the_force_of_the_pads(use: bool) -> None:
     """The simulated pads feel half the closing force each; a hand that is closed on nothing feels none."""
     bench = Bench(CUBE, config=GraspConfig(held=HeldConfig(use_finger_force=use)))
     assert max(bench.trials.link.pads("left")) < 0.1
@@ -146,7 +153,8 @@ def test_a69_a_grasp_is_held_with_and_without_the_force_of_the_pads(use: bool) -
     assert min(bench.trials.link.pads("left")) > 5.0
 
 
-def test_n20_the_closing_force_can_be_limited() -> None:
+@pytest.mark.requirement("N-20")
+def test_the_closing_force_can_be_limited() -> None:
     bench = Bench(CUBE, config=GraspConfig(hand=HandConfig(close_effort=12.0)))
     outcome = bench.ask("red", phase="pick")
     assert outcome.success, outcome.message
@@ -155,7 +163,8 @@ def test_n20_the_closing_force_can_be_limited() -> None:
     assert 10.0 < max(pressed) <= 12.001
 
 
-def test_p02_the_five_outcomes() -> None:
+@pytest.mark.requirement("P-02")
+def test_the_five_outcomes() -> None:
     with pytest.raises(OpenArmError, match="valid: all, pick, place"):
         Bench(BOX).ask("", phase="throw")
 

@@ -65,7 +65,8 @@ def watched() -> Watched:
     return seen
 
 
-def test_p07_the_object_rises_with_the_hand_and_slips_less_than_a_centimetre(watched: Watched) -> None:
+@pytest.mark.requirement("P-07")
+def test_the_object_rises_with_the_hand_and_slips_less_than_a_centimetre(watched: Watched) -> None:
     lift = watched.during("LIFT")
     obj, tcp = (np.array([track[i] for i in (lift[0], lift[-1])]) for track in (watched.p_object, watched.p_tcp))
     risen, hand = (obj[1] - obj[0])[2], (tcp[1] - tcp[0])[2]
@@ -74,7 +75,8 @@ def test_p07_the_object_rises_with_the_hand_and_slips_less_than_a_centimetre(wat
     assert np.linalg.norm((obj[1] - obj[0]) - (tcp[1] - tcp[0])) <= 0.01
 
 
-def test_p10_the_hand_leaves_without_dragging_what_it_has_put_down(watched: Watched) -> None:
+@pytest.mark.requirement("P-10")
+def test_the_hand_leaves_without_dragging_what_it_has_put_down(watched: Watched) -> None:
     place = watched.during("PLACE")
     gaps = np.array([watched.gap[i] for i in place])
     released = place[np.flatnonzero(gaps > gaps[0] + 0.004)[0]]
@@ -84,14 +86,16 @@ def test_p10_the_hand_leaves_without_dragging_what_it_has_put_down(watched: Watc
     assert np.hypot(*(watched.p_object[-1][:2] - (x, y))) <= 0.02
 
 
-def test_b19_what_is_out_of_reach_is_refused_before_anything_moves_and_says_how_far() -> None:
+@pytest.mark.requirement("B-19")
+def test_what_is_out_of_reach_is_refused_before_anything_moves_and_says_how_far() -> None:
     outcome = ask(trials(BOX.model_copy(update={"position": (0.52, -0.39)})), "blue")
     assert outcome.code is Code.UNREACHABLE
     assert (outcome.kind, outcome.attempts) == ("REFUSED", 0)
     assert "mm of it" in outcome.message
 
 
-def test_n20_a_gap_that_changes_on_the_way_is_a_slip_and_stops_the_carry() -> None:
+@pytest.mark.requirement("N-20")
+def test_a_gap_that_changes_on_the_way_is_a_slip_and_stops_the_carry() -> None:
     """The fingers creep together while the arm follows its path; 2 mm are let pass, 4 mm are not."""
     run = trials(BOX)
     assert ask(run, "blue", phase="pick").success
@@ -112,7 +116,8 @@ def test_n20_a_gap_that_changes_on_the_way_is_a_slip_and_stops_the_carry() -> No
     assert error.value.code is Code.GRASP_LOST
 
 
-def test_a78_the_endurance_task_asks_for_its_objects_again_and_again_in_one_world() -> None:
+@pytest.mark.requirement("A-78")
+def test_the_endurance_task_asks_for_its_objects_again_and_again_in_one_world() -> None:
     """The command `openarm campaign --set endurance` carries it out; here, that it is what it says."""
     task = endurance(7)
     assert len(task.labels) == 20

@@ -122,7 +122,8 @@ def test_yaw_offsets_go_once_round(step, count):
 
 
 @pytest.mark.parametrize("arm", ["left", "right"])
-def test_p19_free_spots_keep_clear_of_neighbours_and_origin(arm):
+@pytest.mark.requirement("P-19")
+def test_free_spots_keep_clear_of_neighbours_and_origin(arm):
     side = 1.0 if arm == "left" else -1.0
     target, others = (
         box(y=side * 0.2),
@@ -137,7 +138,8 @@ def test_p19_free_spots_keep_clear_of_neighbours_and_origin(arm):
         assert min(np.linalg.norm(spot - d.p_base[:2]) for d in others) >= 0.10
 
 
-def test_p19_a_spot_that_leaves_room_for_a_hand_comes_before_a_nearer_one() -> None:
+@pytest.mark.requirement("P-19")
+def test_a_spot_that_leaves_room_for_a_hand_comes_before_a_nearer_one() -> None:
     """What is put down too near to another object blocks the way to it later."""
     target = box(x=0.17, y=-0.10)
     others = [box(x=x, y=y, label="blue") for x, y in ((0.33, -0.12), (0.20, -0.26), (0.34, -0.36))]

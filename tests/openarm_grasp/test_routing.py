@@ -21,7 +21,8 @@ from openarm_grasp.planning.routing import arm_order, out_of_reach
         ("right", 0.30, ("right",)),
     ],
 )
-def test_p11_arms_by_side_and_overlap(arm, y, expected):
+@pytest.mark.requirement("P-11")
+def test_arms_by_side_and_overlap(arm, y, expected):
     assert arm_order(arm, y, 0.12) == expected
 
 

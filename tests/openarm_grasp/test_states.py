@@ -14,18 +14,21 @@ from openarm_grasp.strategy.states import TRANSITIONS, Event, State, as_text, lo
 S, E = State, Event
 
 
-def test_b56_the_ten_states():
+@pytest.mark.requirement("B-56")
+def test_the_ten_states():
     names = "IDLE DETECT TRANSFORM PLAN MOVE_TO_PREGRASP MOVE_TO_GRASP CLOSE_GRIPPER LIFT PLACE RESET"
     assert " ".join(state.value for state in State) == names
 
 
 @pytest.mark.parametrize("state", list(State))
-def test_b56_every_event_is_defined_in_every_state(state):
+@pytest.mark.requirement("B-56")
+def test_every_event_is_defined_in_every_state(state):
     assert set(TRANSITIONS[state]) == set(Event)
     assert all(isinstance(follower, State) for follower in TRANSITIONS[state].values())
 
 
-def test_b56_done_leads_once_round():
+@pytest.mark.requirement("B-56")
+def test_done_leads_once_round():
     state, path = S.IDLE, []
     for _ in range(10):
         state = TRANSITIONS[state][E.DONE]
@@ -33,13 +36,15 @@ def test_b56_done_leads_once_round():
     assert path == [*list(State)[1:], S.IDLE]
 
 
-def test_b58_detection_fails_to_idle_and_planning_to_detect():
+@pytest.mark.requirement("B-58")
+def test_detection_fails_to_idle_and_planning_to_detect():
     assert TRANSITIONS[S.DETECT][E.AGAIN] is S.IDLE
     assert TRANSITIONS[S.TRANSFORM][E.AGAIN] is S.DETECT
     assert TRANSITIONS[S.PLAN][E.AGAIN] is S.DETECT
 
 
-def test_a70_what_fails_with_the_arm_goes_home_and_looks_again():
+@pytest.mark.requirement("A-70")
+def test_what_fails_with_the_arm_goes_home_and_looks_again():
     for state in (S.MOVE_TO_PREGRASP, S.MOVE_TO_GRASP, S.CLOSE_GRIPPER, S.LIFT, S.PLACE):
         assert TRANSITIONS[state][E.AGAIN] is S.RESET
     assert TRANSITIONS[S.RESET][E.AGAIN] is S.DETECT
@@ -72,7 +77,8 @@ def edited(tmp_path, **changes: str):
     return path
 
 
-def test_p29_a_table_may_be_edited_within_limits(tmp_path):
+@pytest.mark.requirement("P-29")
+def test_a_table_may_be_edited_within_limits(tmp_path):
     table = load_transitions(edited(tmp_path, DETECT_again="DETECT", RESET_again="IDLE"))
     assert table[S.DETECT][E.AGAIN] is S.DETECT
     assert table[S.RESET][E.AGAIN] is S.IDLE
@@ -89,13 +95,15 @@ def test_p29_a_table_may_be_edited_within_limits(tmp_path):
         ({"LIFT_done": "FLY"}, "LIFT.done is 'FLY', expected one of IDLE"),
     ],
 )
-def test_p29_what_would_skip_evidence_or_the_way_home_is_refused(tmp_path, change, why):
+@pytest.mark.requirement("P-29")
+def test_what_would_skip_evidence_or_the_way_home_is_refused(tmp_path, change, why):
     with pytest.raises(OpenArmError, match=why) as error:
         load_transitions(edited(tmp_path, **change))
     assert error.value.code is Code.CONFIG_INVALID
 
 
-def test_p29_missing_and_unknown_names_are_all_told(tmp_path):
+@pytest.mark.requirement("P-29")
+def test_missing_and_unknown_names_are_all_told(tmp_path):
     path = edited(tmp_path)
     table = yaml.safe_load(path.read_text())
     del table["LIFT"]["done"]
@@ -107,7 +115,8 @@ def test_p29_missing_and_unknown_names_are_all_told(tmp_path):
     assert "no state 'FLY'" in error.value.message
 
 
-def test_p29_the_drawings_hold_every_state_and_the_skips():
+@pytest.mark.requirement("P-29")
+def test_the_drawings_hold_every_state_and_the_skips():
     drawing = mermaid(TRANSITIONS)
     assert all(state.value in drawing for state in State)
     assert "TRANSFORM --> PLACE: skip" in drawing

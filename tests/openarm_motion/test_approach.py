@@ -59,7 +59,8 @@ def assert_tool_straight(arm: Arm, q: np.ndarray, T_a: np.ndarray, T_b: np.ndarr
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_b47_a_grasp_is_approached_and_lifted_on_straight_lines(
+@pytest.mark.requirement("B-47")
+def test_a_grasp_is_approached_and_lifted_on_straight_lines(
     arms: dict[str, Arm], home: dict[str, float], side: str
 ) -> None:
     arm = arms[side]
@@ -106,7 +107,8 @@ def test_every_moment_of_a_plan_is_free_of_what_it_must_not_touch(right: Arm, ho
         assert not held.collides(q)
 
 
-def test_n11_both_lines_carry_a_certificate_and_one_that_fails_it_is_not_handed_out(
+@pytest.mark.requirement("N-11")
+def test_both_lines_carry_a_certificate_and_one_that_fails_it_is_not_handed_out(
     right: Arm, home: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     request = ApproachRequest(

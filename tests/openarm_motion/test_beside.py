@@ -51,7 +51,8 @@ def meeting(arms: dict[str, Arm], home: dict[str, float]) -> tuple[dict[str, flo
     return standing(home, left, there.q[-1]), back(there), Motion.of(to_the_middle(right, home))
 
 
-def test_n12_an_arm_rests_until_the_other_one_leaves_room(arms, meeting) -> None:
+@pytest.mark.requirement("N-12")
+def test_an_arm_rests_until_the_other_one_leaves_room(arms, meeting) -> None:
     state, left, right = meeting
     wait = least_wait(Course(arms["right"], right), [Course(arms["left"], left)], state)
     assert 0.2 < wait < left.t[-1]
@@ -60,7 +61,8 @@ def test_n12_an_arm_rests_until_the_other_one_leaves_room(arms, meeting) -> None
     assert nearest(arms, state, left, right) < 0.020
 
 
-def test_n12_what_has_passed_of_a_motion_under_way_counts(arms, meeting) -> None:
+@pytest.mark.requirement("N-12")
+def test_what_has_passed_of_a_motion_under_way_counts(arms, meeting) -> None:
     state, left, right = meeting
     mine = Course(arms["right"], right)
     whole = least_wait(mine, [Course(arms["left"], left)], state)
@@ -69,14 +71,16 @@ def test_n12_what_has_passed_of_a_motion_under_way_counts(arms, meeting) -> None
     assert least_wait(mine, [Course(arms["left"], begun)], now) == pytest.approx(whole - 0.6, abs=0.11)
 
 
-def test_n12_arms_that_do_not_meet_set_out_at_once(arms, home) -> None:
+@pytest.mark.requirement("N-12")
+def test_arms_that_do_not_meet_set_out_at_once(arms, home) -> None:
     left = Motion.of(to_the_middle(arms["left"], home, 0.25))
     right = Motion.of(to_the_middle(arms["right"], home, -0.25))
     assert least_wait(Course(arms["right"], right), [Course(arms["left"], left)], home) == 0.0
     assert nearest(arms, home, left, right) >= 0.020
 
 
-def test_a74_an_arm_that_ends_in_the_way_is_no_matter_of_time(arms, home) -> None:
+@pytest.mark.requirement("A-74")
+def test_an_arm_that_ends_in_the_way_is_no_matter_of_time(arms, home) -> None:
     left, right = (Motion.of(to_the_middle(arms[side], home)) for side in ("left", "right"))
     with pytest.raises(OpenArmError, match=r"right arm after .*openarm_left_\w+.* no rest before it helps") as caught:
         least_wait(Course(arms["right"], right), [Course(arms["left"], left)], home)
@@ -105,7 +109,8 @@ def test_of_several_motions_the_one_that_arrives_first_is_taken(arms, home, meet
         first_to_arrive([], [], state)
 
 
-def test_n12_two_held_objects_keep_apart_too(arms, home) -> None:
+@pytest.mark.requirement("N-12")
+def test_two_held_objects_keep_apart_too(arms, home) -> None:
     """Hands that pass each other with room, but carry plates that would not."""
     plate = box_from("plate", (0.0, 0.0, 0.10), (0.05, 0.26, 0.02))
     left = Motion.of(to_the_middle(arms["left"], home, 0.20))

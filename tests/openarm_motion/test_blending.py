@@ -63,7 +63,8 @@ def test_a_way_back_stops() -> None:
 
 
 @pytest.mark.parametrize("size", [1e-4, 0.02, 0.5, 3.0])
-def test_a67_quintic_begins_and_ends_at_rest_and_touches_one_limit(size: float) -> None:
+@pytest.mark.requirement("A-67")
+def test_quintic_begins_and_ends_at_rest_and_touches_one_limit(size: float) -> None:
     waypoints = np.array([[0.0, 0.0, 0.0], [size, -0.4 * size, 0.1 * size]])
     trajectory = time_quintic(NAMES, waypoints, LIMITS, 0.004)
     ends = np.array([0, -1])

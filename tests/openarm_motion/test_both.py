@@ -35,7 +35,8 @@ def joined(both: BothArms, home: dict[str, float]) -> np.ndarray:
     return np.array([home[name] for name in both.names])
 
 
-def test_a74_one_arm_fine_but_two_collide(both: BothArms, home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-74")
+def test_one_arm_fine_but_two_collide(both: BothArms, home: dict[str, float]) -> None:
     left, right = over_the_middle(both, home, 0.0)
     scene = both.scene(home)
     start = joined(both, home)
@@ -49,7 +50,8 @@ def test_a74_one_arm_fine_but_two_collide(both: BothArms, home: dict[str, float]
     assert contact.required == pytest.approx(0.025)
 
 
-def test_a74_arms_that_swap_sides_of_a_box_keep_apart_all_the_way(both: BothArms, home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-74")
+def test_arms_that_swap_sides_of_a_box_keep_apart_all_the_way(both: BothArms, home: dict[str, float]) -> None:
     left_in, right_in = over_the_middle(both, home, 0.0)
     start = joined(both, home)
     # one arm leaves the middle while the other enters it: the straight line meets half-way

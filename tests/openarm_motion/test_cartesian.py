@@ -23,9 +23,8 @@ def down(x: float, y: float, z: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_b47_a_line_is_straight_to_a_tenth_of_a_millimetre_and_keeps_its_branch(
-    arms: dict[str, Arm], side: str
-) -> None:
+@pytest.mark.requirement("B-47")
+def test_a_line_is_straight_to_a_tenth_of_a_millimetre_and_keeps_its_branch(arms: dict[str, Arm], side: str) -> None:
     arm = arms[side]
     sign = 1.0 if side == "left" else -1.0
     T_a, T_b = down(0.25, sign * 0.25, 0.43), down(0.25, sign * 0.25, 0.55)
@@ -110,7 +109,8 @@ def test_poses_of_a_line_are_dense_enough() -> None:
     assert len(line_poses(T_a, T_a)[0]) >= 6
 
 
-def test_b07_a_line_of_an_arm_of_another_build(six: RobotDescription) -> None:
+@pytest.mark.requirement("B-07")
+def test_a_line_of_an_arm_of_another_build(six: RobotDescription) -> None:
     inverse = InverseKinematics(ArmKinematics(six, "tool"))
     start = inverse.classify(np.array([0.2, 0.5, 1.2, 0.1, 0.6, 0.3]))
     T = inverse.kinematics.fk(start.q)

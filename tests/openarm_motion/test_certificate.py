@@ -22,7 +22,8 @@ def across(right: Arm, home: dict[str, float]) -> PlannedPath:
     return PlannedPath(np.array(ends), 0, 1)
 
 
-def test_a68_a_planned_trajectory_is_certified_with_no_point_moving_far_between_two_looks(
+@pytest.mark.requirement("A-68")
+def test_a_planned_trajectory_is_certified_with_no_point_moving_far_between_two_looks(
     right: Arm, home: dict[str, float]
 ) -> None:
     scene = right.scene(home)
@@ -66,7 +67,8 @@ class Blind:
         return PlannedPath(np.stack([query.start, query.goals[0]]), 0, 0)
 
 
-def test_a68_what_a_search_stepped_over_is_searched_again_more_closely_and_never_handed_out(
+@pytest.mark.requirement("A-68")
+def test_what_a_search_stepped_over_is_searched_again_more_closely_and_never_handed_out(
     right: Arm, home: dict[str, float]
 ) -> None:
     planner = Blind()

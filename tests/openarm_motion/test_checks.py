@@ -71,7 +71,8 @@ def test_joints_numbers_and_limits_are_refused_by_name(right: Arm, home: dict[st
     assert "starts with openarm_right_joint2 at 2.200 rad, the arm is at 2.400" in message
 
 
-def test_a68_a_motion_into_the_other_arm_is_refused(arms: dict[str, Arm], home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-68")
+def test_a_motion_into_the_other_arm_is_refused(arms: dict[str, Arm], home: dict[str, float]) -> None:
     left, right = arms["left"], arms["right"]
     pose = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.26, 0.0, 0.60))
     plans = {a.name: moves.to_pose(a, a.situation(home), pose, Around()) for a in (left, right)}

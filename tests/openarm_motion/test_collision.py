@@ -44,7 +44,8 @@ def test_links_are_sorted_by_the_tree_alone(right: Arm, six: RobotDescription) -
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a74_known_postures_are_free(
+@pytest.mark.requirement("A-74")
+def test_known_postures_are_free(
     arms: dict[str, Arm], home: dict[str, float], description: RobotDescription, side: str
 ) -> None:
     arm = arms[side]
@@ -65,7 +66,8 @@ def test_the_wrist_camera_is_part_of_the_arm(arms: dict[str, Arm], home: dict[st
     assert arms["left"].scene(home).contacts(mirror(q)) == []
 
 
-def test_a74_crossed_arms_are_caught_and_the_pair_is_named(arms: dict[str, Arm], home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-74")
+def test_crossed_arms_are_caught_and_the_pair_is_named(arms: dict[str, Arm], home: dict[str, float]) -> None:
     # both hands on the centre line, reached from either side: fine alone, a collision together
     crossed = {}
     for side, arm in arms.items():
@@ -82,7 +84,8 @@ def test_a74_crossed_arms_are_caught_and_the_pair_is_named(arms: dict[str, Arm],
     assert all("right" in c.first and "left" in c.second for c in contacts)
 
 
-def test_a74_verdicts_mirror_from_arm_to_arm(arms: dict[str, Arm], home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-74")
+def test_verdicts_mirror_from_arm_to_arm(arms: dict[str, Arm], home: dict[str, float]) -> None:
     left, right = arms["left"].scene(home), arms["right"].scene(home)
     arm = arms["right"].kinematics
     rng = np.random.default_rng(11)
@@ -266,7 +269,8 @@ def test_bad_boxes_are_refused(right: Arm, home: dict[str, float]) -> None:
         right.scene(home, [box, box])
 
 
-def test_b07_another_robot_without_srdf_is_checked(six: RobotDescription) -> None:
+@pytest.mark.requirement("B-07")
+def test_another_robot_without_srdf_is_checked(six: RobotDescription) -> None:
     robot = CollisionRobot(six, ArmKinematics(six, "tool"))
     scene = CollisionScene(robot, Surroundings({}))
     assert scene.contacts(np.zeros(6)) == []

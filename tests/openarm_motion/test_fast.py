@@ -48,7 +48,8 @@ def disagreements(arm: Arm, home: dict[str, float], count: int, seed: int) -> tu
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a68_never_free_where_the_exact_layer_says_collision(
+@pytest.mark.requirement("A-68")
+def test_never_free_where_the_exact_layer_says_collision(
     arms: dict[str, Arm], home: dict[str, float], side: str
 ) -> None:
     wrong, needless, free = disagreements(arms[side], home, 4000, 68)
@@ -57,14 +58,16 @@ def test_a68_never_free_where_the_exact_layer_says_collision(
     assert needless < 0.05 * free  # it is of use, too
 
 
-def test_a68_never_free_where_the_exact_layer_says_collision_1e5(arms: dict[str, Arm], home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-68")
+def test_never_free_where_the_exact_layer_says_collision_1e5(arms: dict[str, Arm], home: dict[str, float]) -> None:
     for seed, arm in enumerate(arms.values()):
         wrong, needless, free = disagreements(arm, home, 50_000, 1000 + seed)
         assert wrong == 0
         assert needless < 0.05 * free
 
 
-def test_a74_both_arms_never_free_where_they_meet(arms: dict[str, Arm], home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-74")
+def test_both_arms_never_free_where_they_meet(arms: dict[str, Arm], home: dict[str, float]) -> None:
     both = BothArms(arms["left"], arms["right"])
     rng = np.random.default_rng(74)
     exact = both.scene(home, turned_boxes(rng, 3))
@@ -111,7 +114,8 @@ def map_boxes(cells: np.ndarray) -> Sequence[Box]:
     return [box_from(f"c{k}", corner + (i + 0.5) * 0.02, (0.02,) * 3) for k, i in enumerate(np.argwhere(cells))]
 
 
-def test_a59_cells_of_a_map_are_never_overlooked(right: Arm, home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-59")
+def test_cells_of_a_map_are_never_overlooked(right: Arm, home: dict[str, float]) -> None:
     rng = np.random.default_rng(9)
     cells = np.zeros((50, 80, 50), np.bool_)
     cells[tuple(rng.integers(0, cells.shape, (60, 3)).T)] = True
@@ -158,7 +162,8 @@ def test_spheres_cover_their_shape(kind: int) -> None:
         assert np.all(gaps <= 0.0)
 
 
-def test_b13_another_robot_goes_through_the_same_code(six: RobotDescription) -> None:
+@pytest.mark.requirement("B-13")
+def test_another_robot_goes_through_the_same_code(six: RobotDescription) -> None:
     robot = CollisionRobot(six, ArmKinematics(six, "tool"))
     rng = np.random.default_rng(13)
     exact = CollisionScene(robot, Surroundings({}, turned_boxes(rng, 4)))

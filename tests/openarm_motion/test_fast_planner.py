@@ -39,7 +39,8 @@ def free_states(arm: Arm, home: dict[str, float], count: int, seed: int, boxes: 
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a68_paths_between_any_states_are_free_for_the_exact_layer(
+@pytest.mark.requirement("A-68")
+def test_paths_between_any_states_are_free_for_the_exact_layer(
     arms: dict[str, Arm], home: dict[str, float], side: str
 ) -> None:
     arm = arms[side]
@@ -61,7 +62,8 @@ def test_the_same_query_gives_the_same_path(right: Arm, home: dict[str, float]) 
         np.testing.assert_array_equal(one, two)
 
 
-def test_p20_as_many_solved_as_by_ompl(right: Arm, home: dict[str, float]) -> None:
+@pytest.mark.requirement("P-20")
+def test_as_many_solved_as_by_ompl(right: Arm, home: dict[str, float]) -> None:
     states = free_states(right, home, 10, 5, CLUTTER)
     fast = ompl = 0.0
     limits = right.limits(0.5)
@@ -96,7 +98,8 @@ def test_a_goal_in_a_closed_box_is_no_plan_and_a_stop_is_heard(right: Arm, home:
     assert caught.value.code == Code.CANCELLED
 
 
-def test_n12_both_arms_keep_apart_on_the_whole_path(arms: dict[str, Arm], home: dict[str, float]) -> None:
+@pytest.mark.requirement("N-12")
+def test_both_arms_keep_apart_on_the_whole_path(arms: dict[str, Arm], home: dict[str, float]) -> None:
     both = BothArms(arms["left"], arms["right"])
     rng = np.random.default_rng(12)
     scene, judge = both.scene(home), both.scene(home, separation=0.020)

@@ -40,7 +40,8 @@ def test_jacobian_equals_finite_differences(arm: ArmKinematics) -> None:
         np.testing.assert_allclose(arm.jacobian(q), np.array(columns).T, atol=1e-7)
 
 
-def test_a66_thousand_reachable_poses_are_solved_to_a_tenth_of_a_millimetre(arm: ArmKinematics) -> None:
+@pytest.mark.requirement("A-66")
+def test_thousand_reachable_poses_are_solved_to_a_tenth_of_a_millimetre(arm: ArmKinematics) -> None:
     rng = np.random.default_rng(66)
     solved = 0
     for q in rng.uniform(arm.lower, arm.upper, (1000, 7)):
@@ -98,7 +99,8 @@ def test_same_seed_same_answer(arm: ArmKinematics) -> None:
     np.testing.assert_array_equal(arm.ik(target, restarts=5).q, arm.ik(target, restarts=5).q)
 
 
-def test_b07_b13_an_arm_of_another_build_is_solved(six: RobotDescription) -> None:
+@pytest.mark.requirement("B-07", "B-13")
+def test_an_arm_of_another_build_is_solved(six: RobotDescription) -> None:
     arm = ArmKinematics(six, "tool")
     assert arm.names == ("waist", "shoulder", "elbow", "forearm", "bend", "flange")
     rng = np.random.default_rng(13)

@@ -34,7 +34,8 @@ def assert_free(arm: Arm, state: dict[str, float], trajectory: Trajectory) -> No
         assert not scene.collides(q), scene.contacts(q)[0]
 
 
-def test_a66_the_sample_target_is_solved_with_free_orientation_and_refused_with_a_vertical_tool(
+@pytest.mark.requirement("A-66")
+def test_the_sample_target_is_solved_with_free_orientation_and_refused_with_a_vertical_tool(
     arms: dict[str, Arm], home: dict[str, float]
 ) -> None:
     arm = arms["left"]
@@ -88,7 +89,8 @@ def test_straight_down_from_home_and_back(right: Arm, home: dict[str, float]) ->
     assert "post" in message
 
 
-def test_b47_a_line_may_pass_by_an_object_nearer_than_a_free_path(right: Arm, home: dict[str, float]) -> None:
+@pytest.mark.requirement("B-47")
+def test_a_line_may_pass_by_an_object_nearer_than_a_free_path(right: Arm, home: dict[str, float]) -> None:
     state = right.with_gripper(home, 0.044)
     now = right.situation(state)
     T = right.kinematics.fk(now.start)
@@ -141,7 +143,8 @@ def test_velocity_scale_stretches_time(right: Arm, home: dict[str, float]) -> No
     assert slow > 1.5 * fast
 
 
-def test_b13_another_arm_is_a_matter_of_configuration(six: RobotDescription) -> None:
+@pytest.mark.requirement("B-13")
+def test_another_arm_is_a_matter_of_configuration(six: RobotDescription) -> None:
     limits = LimitsConfig(velocity=(1.0,) * 6, acceleration=(3.0,) * 6, jerk=(30.0,) * 6)
     config = MotionConfig(arms=("main",), tool_link="tool", group="{arm}", limits=limits, scene="")
     arm = Arm("main", six, config)

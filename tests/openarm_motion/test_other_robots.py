@@ -57,7 +57,8 @@ def robot(request: pytest.FixtureRequest) -> tuple[Arm, np.ndarray]:
     return Arm(request.param, description, config), np.array(start)
 
 
-def test_b13_every_reachable_pose_is_solved(robot: tuple[Arm, np.ndarray]) -> None:
+@pytest.mark.requirement("B-13")
+def test_every_reachable_pose_is_solved(robot: tuple[Arm, np.ndarray]) -> None:
     chain = robot[0].kinematics
     states = np.random.default_rng(13).uniform(chain.lower, chain.upper, (300, chain.n))
     for target in chain.fk_many(states):
@@ -67,7 +68,8 @@ def test_b13_every_reachable_pose_is_solved(robot: tuple[Arm, np.ndarray]) -> No
         np.testing.assert_allclose(chain.fk(found.q)[:3, 3], target[:3, 3], atol=1e-4)
 
 
-def test_b13_the_fast_layer_is_never_more_generous(robot: tuple[Arm, np.ndarray]) -> None:
+@pytest.mark.requirement("B-13")
+def test_the_fast_layer_is_never_more_generous(robot: tuple[Arm, np.ndarray]) -> None:
     arm, _ = robot
     exact = arm.scene({}, [box_from("post", (0.45, 0.1, 0.4), (0.1, 0.1, 0.8))])
     states = np.random.default_rng(14).uniform(arm.kinematics.lower, arm.kinematics.upper, (1000, arm.kinematics.n))
@@ -77,7 +79,8 @@ def test_b13_the_fast_layer_is_never_more_generous(robot: tuple[Arm, np.ndarray]
     assert int(np.sum(free)) > 0.9 * int(np.sum(truth)) > 300
 
 
-def test_b07_a_pose_is_planned_around_a_post_within_the_limits(robot: tuple[Arm, np.ndarray]) -> None:
+@pytest.mark.requirement("B-07")
+def test_a_pose_is_planned_around_a_post_within_the_limits(robot: tuple[Arm, np.ndarray]) -> None:
     arm, start = robot
     names = dict(zip(arm.names, start.tolist(), strict=True))
     here = arm.kinematics.fk(start)
@@ -94,7 +97,8 @@ def test_b07_a_pose_is_planned_around_a_post_within_the_limits(robot: tuple[Arm,
     assert np.all(np.abs(a) <= limits.acceleration * 1.001)
 
 
-def test_b07_a_straight_line_stays_on_it(robot: tuple[Arm, np.ndarray]) -> None:
+@pytest.mark.requirement("B-07")
+def test_a_straight_line_stays_on_it(robot: tuple[Arm, np.ndarray]) -> None:
     arm, start = robot
     now = Situation(dict(zip(arm.names, start.tolist(), strict=True)), start)
     here = arm.kinematics.fk(start)

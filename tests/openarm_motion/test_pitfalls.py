@@ -30,7 +30,8 @@ def overlaps(arm: Arm, state: dict[str, float], plan: Trajectory, boxes=()) -> l
         return [str(scene.contacts(q)[0]) for q in states if scene.collides(q)]
 
 
-def test_a68_no_path_leads_through_the_chest(arms: dict[str, Arm], home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-68")
+def test_no_path_leads_through_the_chest(arms: dict[str, Arm], home: dict[str, float]) -> None:
     """Starts and goals whose straight joint line goes through the body or the other arm."""
     rng = np.random.default_rng(68)
     for arm in arms.values():
@@ -84,7 +85,8 @@ def test_a_start_far_outside_a_limit_is_named(right: Arm, home: dict[str, float]
     assert caught.value.code == Code.LIMITS
 
 
-def test_b13_no_name_of_the_robot_is_in_the_code(right: Arm) -> None:
+@pytest.mark.requirement("B-13")
+def test_no_name_of_the_robot_is_in_the_code(right: Arm) -> None:
     """Joints, links, groups and arms are named by configuration and description alone."""
     description = right.description
     groups = {f"{side}_arm" for side in ("left", "right")} | {"openarm_left", "openarm_right"}

@@ -42,7 +42,8 @@ def q_of(arm: Arm, state: dict[str, float]) -> np.ndarray:
     return np.array([state[name] for name in arm.names])
 
 
-def test_a68_from_hanging_zero_to_home_and_back_around_table_and_chest(right: Arm, home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-68")
+def test_from_hanging_zero_to_home_and_back_around_table_and_chest(right: Arm, home: dict[str, float]) -> None:
     scene = right.scene(home)
     zero, there = np.zeros(7), q_of(right, home)
     assert not scene.edge_free(zero, there)
@@ -52,7 +53,8 @@ def test_a68_from_hanging_zero_to_home_and_back_around_table_and_chest(right: Ar
         np.testing.assert_array_equal(path.waypoints[[0, -1]], [start, goal])
 
 
-def test_a68_adversarial_pairs_never_go_through_the_robot(arms: dict[str, Arm], home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-68")
+def test_adversarial_pairs_never_go_through_the_robot(arms: dict[str, Arm], home: dict[str, float]) -> None:
     # from one side of the robot's column to the other, the other arm reaching into the way
     left, right = arms["left"], arms["right"]
     reach = left.inverse.solutions(_down(0.26, 0.06, 0.60), 0.05)
@@ -151,7 +153,8 @@ def test_what_has_no_way_is_given_up_in_time() -> None:
     assert time.monotonic() - begin < 1.5
 
 
-def test_n18_samples_limit_a_search_in_place_of_time() -> None:
+@pytest.mark.requirement("N-18")
+def test_samples_limit_a_search_in_place_of_time() -> None:
     seen = 0
 
     def collides(q: np.ndarray) -> bool:

@@ -53,7 +53,8 @@ def arm_with(planner: str, description: RobotDescription, table: Box) -> Arm:
     return Arm("right", description, MotionConfig(planning=PlanningConfig(planner=planner)), [table])
 
 
-def test_a76_b41_another_planner_gets_the_same_calls_and_its_path_is_timed(
+@pytest.mark.requirement("A-76", "B-41")
+def test_another_planner_gets_the_same_calls_and_its_path_is_timed(
     elsewhere: str, description: RobotDescription, table: Box, home: dict[str, float]
 ) -> None:
     arm = arm_with(f"{elsewhere}:Foreign", description, table)
@@ -66,7 +67,8 @@ def test_a76_b41_another_planner_gets_the_same_calls_and_its_path_is_timed(
     assert not query.collides(goal)
 
 
-def test_a76_a_path_of_another_planner_that_is_not_free_is_refused(
+@pytest.mark.requirement("A-76")
+def test_a_path_of_another_planner_that_is_not_free_is_refused(
     elsewhere: str, description: RobotDescription, table: Box, home: dict[str, float]
 ) -> None:
     arm = arm_with(f"{elsewhere}:Careless", description, table)

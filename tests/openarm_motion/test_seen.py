@@ -46,7 +46,8 @@ def test_cells_are_those_at_no_distance(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.centres[0], LATTICE.lower + np.array([3.5, 4.5, 5.5]) * 0.02)
 
 
-def test_a59_map_is_met_by_both_layers_alike(right: Arm, home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-59")
+def test_map_is_met_by_both_layers_alike(right: Arm, home: dict[str, float]) -> None:
     rng = np.random.default_rng(4)
     cells = seen(*rng.uniform([0.2, -0.8, 0.4], [0.7, 0.3, 1.0], (40, 3)))
     exact = right.scene(home, known=Known(map=cells))
@@ -61,7 +62,8 @@ def test_a59_map_is_met_by_both_layers_alike(right: Arm, home: dict[str, float])
     assert int(truth.sum()) > 100
 
 
-def test_a59_plans_go_around_the_map_at_its_own_resolution(right: Arm, home: dict[str, float]) -> None:
+@pytest.mark.requirement("A-59")
+def test_plans_go_around_the_map_at_its_own_resolution(right: Arm, home: dict[str, float]) -> None:
     wall_map = wall(-0.21)
     known = Known(map=wall_map)
     walled = right.scene(home, known=known)

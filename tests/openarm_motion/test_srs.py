@@ -109,7 +109,8 @@ def test_the_joint_that_binds_is_named(description: RobotDescription) -> None:
     assert "nearest reachable pose" in inverse.why_not(pose, 0.05)
 
 
-def test_b07_an_arm_of_another_build_falls_back_to_the_numeric_solver(six: RobotDescription) -> None:
+@pytest.mark.requirement("B-07")
+def test_an_arm_of_another_build_falls_back_to_the_numeric_solver(six: RobotDescription) -> None:
     arm = ArmKinematics(six, "tool")
     with pytest.raises(OpenArmError, match=r"not a spherical-revolute-spherical arm: it has 6 joints"):
         SrsArm(arm)

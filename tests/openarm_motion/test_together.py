@@ -63,7 +63,8 @@ def swapping(both: BothArms, home: dict[str, float]) -> tuple[dict[str, float], 
 
 
 @pytest.mark.parametrize("how", [plan_together, plan_staggered])
-def test_n12_arms_that_take_each_others_place_keep_20_mm_all_the_way(both, home, how) -> None:
+@pytest.mark.requirement("N-12")
+def test_arms_that_take_each_others_place_keep_20_mm_all_the_way(both, home, how) -> None:
     state, goals = swapping(both, home)
     plan: BothPlan = how(both, starting(both, state), goals, 10.0)
     seen = apart_all_the_way(both, state, plan)
@@ -75,7 +76,8 @@ def test_n12_arms_that_take_each_others_place_keep_20_mm_all_the_way(both, home,
         assert min(np.abs(part.q[-1] - q).max() for q in wanted) < 1e-9
 
 
-def test_n12_the_arm_in_the_way_goes_first_and_the_other_waits_no_longer_than_it_must(
+@pytest.mark.requirement("N-12")
+def test_the_arm_in_the_way_goes_first_and_the_other_waits_no_longer_than_it_must(
     both, home, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     state, goals = swapping(both, home)
@@ -141,7 +143,8 @@ def test_separation_is_the_least_of_all_pairs(both, home) -> None:
     assert near > 8
 
 
-def test_n12_corners_of_both_arms_are_rounded_and_keep_apart(both, home) -> None:
+@pytest.mark.requirement("N-12")
+def test_corners_of_both_arms_are_rounded_and_keep_apart(both, home) -> None:
     posts = [box_from(f"post{i}", (0.36, y, 0.65), (0.03, 0.03, 0.5)) for i, y in enumerate((-0.42, -0.2, 0.2))]
     scene = both.scene(home, posts)
     rng = np.random.default_rng(31)

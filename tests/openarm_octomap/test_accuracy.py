@@ -63,7 +63,8 @@ def test_compare_counts_what_it_says() -> None:
 
 
 @pytest.mark.parametrize("noisy", [False, True])
-def test_n10_a46_the_map_is_the_visible_geometry(scene: MapScene, truth: Visible, noisy: bool) -> None:
+@pytest.mark.requirement("N-10", "A-46")
+def test_the_map_is_the_visible_geometry(scene: MapScene, truth: Visible, noisy: bool) -> None:
     """Both cameras, clean and as noisy as a D435: no ghost, hardly anything missed, the robot itself not in it."""
     target, rng = mapper(scene), np.random.default_rng(1) if noisy else None
     for i in range(4):
@@ -75,9 +76,8 @@ def test_n10_a46_the_map_is_the_visible_geometry(scene: MapScene, truth: Visible
     assert result.iou >= 0.98
 
 
-def test_a51_a52_without_the_filter_flying_pixels_fill_the_map_and_nothing_else_does(
-    scene: MapScene, truth: Visible
-) -> None:
+@pytest.mark.requirement("A-51", "A-52")
+def test_without_the_filter_flying_pixels_fill_the_map_and_nothing_else_does(scene: MapScene, truth: Visible) -> None:
     """Hundreds of ghosts; so the tests with noise can fail. Noise along the rays alone makes none."""
     ghosts = []
     for config in (DepthNoiseConfig(), DepthNoiseConfig(flying=0.0)):
@@ -99,7 +99,8 @@ def test_flying_pixels_are_counted_by_camera(scene: MapScene) -> None:
     assert sum(counts[0].values()) < 300 < 1000 < sum(counts[1].values())
 
 
-def test_a46_the_clouds_of_both_cameras_meet_in_the_base_frame(scene: MapScene) -> None:
+@pytest.mark.requirement("A-46")
+def test_the_clouds_of_both_cameras_meet_in_the_base_frame(scene: MapScene) -> None:
     """Where both see a surface, they say the same of its depth: 5 mm at the 95th percentile."""
     home, looking = dict(scene.joints), scene.description.group_state("right_arm", "wrist_look")
     scene.joints |= {name: q for name, q in looking.items() if name in home}
@@ -119,7 +120,8 @@ def test_a46_the_clouds_of_both_cameras_meet_in_the_base_frame(scene: MapScene) 
     assert np.percentile(error[shared], 95) <= 0.005
 
 
-def test_a55_a56_an_object_is_gone_and_back_within_a_second_at_two_hertz(scene: MapScene, truth: Visible) -> None:
+@pytest.mark.requirement("A-55", "A-56")
+def test_an_object_is_gone_and_back_within_a_second_at_two_hertz(scene: MapScene, truth: Visible) -> None:
     """It moves right after an update, so that the next one is half a second away."""
     target, name = mapper(scene), DEMO.objects[0].name
     home = DEMO.objects[0].centre(DEMO.table)
@@ -140,9 +142,8 @@ def test_a55_a56_an_object_is_gone_and_back_within_a_second_at_two_hertz(scene: 
     assert (states[near] == OCCUPIED).any()
 
 
-def test_p05_no_cell_of_the_arm_or_of_what_it_holds_in_thirty_seconds_of_sweeping(
-    scene: MapScene, truth: Visible
-) -> None:
+@pytest.mark.requirement("P-05")
+def test_no_cell_of_the_arm_or_of_what_it_holds_in_thirty_seconds_of_sweeping(scene: MapScene, truth: Visible) -> None:
     """At 2 Hz; the second half with an object in the hand."""
     solid = binary_dilation(truth.solid, np.ones((3, 3, 3)))
     home, item = dict(scene.joints), DEMO.objects[0]

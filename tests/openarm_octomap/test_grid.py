@@ -62,7 +62,8 @@ def accumulated(reference) -> OccupancyGrid:
     return grid
 
 
-def test_a55_a56_cells_equal_liboctomap_after_ten_frames_with_clearing(accumulated, reference) -> None:
+@pytest.mark.requirement("A-55", "A-56")
+def test_cells_equal_liboctomap_after_ten_frames_with_clearing(accumulated, reference) -> None:
     """Voxel for voxel; cells that an early frame marked are free in the end."""
     theirs, outside = read_file(reference.data / "reference.bt").on(accumulated.lattice)
     assert outside == 0
@@ -71,12 +72,14 @@ def test_a55_a56_cells_equal_liboctomap_after_ten_frames_with_clearing(accumulat
     np.testing.assert_array_equal(accumulated.states, states)
 
 
-def test_a57_binary_file_equals_liboctomap_byte_for_byte(accumulated, reference, tmp_path) -> None:
+@pytest.mark.requirement("A-57")
+def test_binary_file_equals_liboctomap_byte_for_byte(accumulated, reference, tmp_path) -> None:
     write_file(tmp_path / "map.bt", accumulated.binary(), 0.02)
     assert (tmp_path / "map.bt").read_bytes() == (reference.data / "reference.bt").read_bytes()
 
 
-def test_a57_full_file_equals_liboctomap_byte_for_byte(accumulated, reference, tmp_path) -> None:
+@pytest.mark.requirement("A-57")
+def test_full_file_equals_liboctomap_byte_for_byte(accumulated, reference, tmp_path) -> None:
     """All log-odds are the same floats then."""
     write_file(tmp_path / "map.ot", accumulated.full(), 0.02)
     digest = hashlib.sha256((tmp_path / "map.ot").read_bytes()).hexdigest()
@@ -130,7 +133,8 @@ def test_every_ray_is_free_up_to_its_end(seed: int, limited: bool) -> None:
         assert (grid.states[tuple(at.T)] != UNKNOWN).all()
 
 
-def test_a55_a56_what_arrives_is_marked_and_what_leaves_is_cleared_in_one_frame_each() -> None:
+@pytest.mark.requirement("A-55", "A-56")
+def test_what_arrives_is_marked_and_what_leaves_is_cleared_in_one_frame_each() -> None:
     """Also after it stood there for a minute: clearing is as quick as marking."""
     grid = OccupancyGrid(GridConfig(**SMALL))
     empty, box = floor(), floor(box=(slice(20, 28), slice(28, 36), 890))
@@ -205,7 +209,8 @@ def test_robot_pixels_clear_up_to_the_robot_and_mark_nothing() -> None:
     np.testing.assert_array_equal(grid.log_odds, before)
 
 
-def test_p06_boxes_are_cleared_to_free_or_to_unknown_and_bad_ones_are_refused() -> None:
+@pytest.mark.requirement("P-06")
+def test_boxes_are_cleared_to_free_or_to_unknown_and_bad_ones_are_refused() -> None:
     grid = OccupancyGrid(GridConfig(**SMALL))
     grid.integrate([scan(floor(box=(slice(20, 28), slice(28, 36), 890)))], 0)
     point = [(0.0, 0.0, 0.11)]
@@ -220,7 +225,8 @@ def test_p06_boxes_are_cleared_to_free_or_to_unknown_and_bad_ones_are_refused() 
         grid.clear_box((0, 0, 0), (1, math.inf, 1))
 
 
-def test_a75_coarse_queries_keep_what_is_occupied() -> None:
+@pytest.mark.requirement("A-75")
+def test_coarse_queries_keep_what_is_occupied() -> None:
     """A cell of 4, 8, 16 cm is occupied when a part of it is; centres lie on OctoMap's lattice of that edge."""
     grid = OccupancyGrid(GridConfig(**SMALL))
     grid.integrate([scan(floor(box=(slice(20, 28), slice(28, 36), 890)))], 0)
@@ -282,7 +288,8 @@ def test_load_replaces_the_map_and_another_resolution_is_refused(accumulated, re
         (np.zeros((48, 64), np.uint16), K, DOWN * np.nan, Code.NO_TRANSFORM),
     ],
 )
-def test_b30_scans_that_do_not_fit_are_refused_by_name(depth, intrinsics, T, code) -> None:
+@pytest.mark.requirement("B-30")
+def test_scans_that_do_not_fit_are_refused_by_name(depth, intrinsics, T, code) -> None:
     with pytest.raises(OpenArmError) as error:
         DepthScan(depth, intrinsics, T, 0.2, 3.0)
     assert error.value.code == code
@@ -290,7 +297,8 @@ def test_b30_scans_that_do_not_fit_are_refused_by_name(depth, intrinsics, T, cod
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_b28_no_image_harms_the_map(data) -> None:
+@pytest.mark.requirement("B-28")
+def test_no_image_harms_the_map(data) -> None:
     """NaN, infinities, zeros, huge and negative depths, 1×1: states stay states, log-odds stay in their limits."""
     h, w = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 9))
     value = st.one_of(st.sampled_from([0.0, math.nan, math.inf, -math.inf, -1.0, 1e30, 1e-30]), st.floats(width=32))

@@ -20,7 +20,8 @@ SIZES = ((320, 256), (640, 480), (640, 640), (320, 320))
     size=st.sampled_from(SIZES),
     shares=st.tuples(*[st.floats(0.0, 1.0)] * 4),
 )
-def test_b38_boxes_come_back_within_a_pixel_at_every_aspect_ratio(width, height, size, shares) -> None:
+@pytest.mark.requirement("B-38")
+def test_boxes_come_back_within_a_pixel_at_every_aspect_ratio(width, height, size, shares) -> None:
     letterbox = Letterbox.fit((width, height), size)
     x, y = sorted((shares[0] * width, shares[1] * width)), sorted((shares[2] * height, shares[3] * height))
     boxes = np.array([[x[0], y[0], x[1], y[1]], [0.0, 0.0, width, height]])
@@ -37,7 +38,8 @@ def test_b38_boxes_come_back_within_a_pixel_at_every_aspect_ratio(width, height,
 
 @pytest.mark.parametrize("image", [(640, 480), (480, 640), (1920, 1080), (320, 240), (101, 640), (640, 37), (17, 23)])
 @pytest.mark.parametrize("size", SIZES)
-def test_b38_what_is_seen_in_the_input_is_where_the_image_has_it(image, size) -> None:
+@pytest.mark.requirement("B-38")
+def test_what_is_seen_in_the_input_is_where_the_image_has_it(image, size) -> None:
     """A bright rectangle is drawn, placed, found in the input and mapped back: within a pixel."""
     width, height = image
     rgb = np.zeros((height, width, 3), np.uint8)
@@ -64,7 +66,8 @@ def output(*rows: tuple[float, ...]) -> np.ndarray:
     return np.array(rows, np.float32).T
 
 
-def test_n15_the_best_box_of_a_thing_is_kept_and_neighbours_stay() -> None:
+@pytest.mark.requirement("N-15")
+def test_the_best_box_of_a_thing_is_kept_and_neighbours_stay() -> None:
     found = decode(
         output(
             (50, 50, 20, 20, 0.6, 0.1),  # weaker, same thing

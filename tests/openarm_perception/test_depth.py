@@ -31,7 +31,8 @@ def reference(depth, scale: float, intrinsics: Intrinsics, limits: DepthLimits):
 
 @settings(max_examples=30, deadline=None)
 @given(hnp.arrays(np.uint16, (12, 16), elements=st.integers(0, 2500).filter(lambda d: d not in (200, 2000))))
-def test_a47_b29_millimetres_equal_the_pinhole_written_out(depth) -> None:
+@pytest.mark.requirement("A-47", "B-29")
+def test_millimetres_equal_the_pinhole_written_out(depth) -> None:
     """16UC1 over 1000; x = (u - cx) z / fx, y = (v - cy) z / fy; the filtered points are the valid ones."""
     expected = reference(depth, 1e-3, K, LIMITS)
     deprojector = Deprojector(LIMITS)
@@ -44,7 +45,8 @@ def test_a47_b29_millimetres_equal_the_pinhole_written_out(depth) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(hnp.arrays(np.float32, (12, 16), elements=st.floats(0.0, 2.5, width=32) | st.just(float("nan"))))
-def test_a47_metres_equal_the_pinhole_written_out(depth) -> None:
+@pytest.mark.requirement("A-47")
+def test_metres_equal_the_pinhole_written_out(depth) -> None:
     """32FC1 is metres."""
     near, far = np.float32(LIMITS.near), np.float32(LIMITS.far)
     depth[np.isin(depth, [near, far])] = 1.0
@@ -52,7 +54,8 @@ def test_a47_metres_equal_the_pinhole_written_out(depth) -> None:
 
 
 @pytest.mark.parametrize("bad", [0.0, np.nan, np.inf, -1.0, 0.199, 2.001])
-def test_a48_invalid_and_too_near_depth_is_removed(bad: float) -> None:
+@pytest.mark.requirement("A-48")
+def test_invalid_and_too_near_depth_is_removed(bad: float) -> None:
     """Zero, NaN and what is outside the limits of the camera becomes NaN, and is left out of the filtered points."""
     depth = np.ones((12, 16), np.float32)
     depth[3, 5] = bad
@@ -63,7 +66,8 @@ def test_a48_invalid_and_too_near_depth_is_removed(bad: float) -> None:
     assert len(deprojector.valid_points(depth, K)) == 12 * 16 - 1
 
 
-def test_a31_rays_follow_the_intrinsics_of_each_frame() -> None:
+@pytest.mark.requirement("A-31")
+def test_rays_follow_the_intrinsics_of_each_frame() -> None:
     """A changed CameraInfo changes the points at once; nothing else says what the intrinsics are."""
     depth = np.full((12, 16), 1000, np.uint16)
     deprojector = Deprojector(LIMITS)
@@ -74,7 +78,8 @@ def test_a31_rays_follow_the_intrinsics_of_each_frame() -> None:
     np.testing.assert_allclose(deprojector.organised(depth, K), first)
 
 
-def test_a28_a30_planar_depth_of_a_tilted_camera_gives_a_flat_table(tabletop) -> None:
+@pytest.mark.requirement("A-28", "A-30")
+def test_planar_depth_of_a_tilted_camera_gives_a_flat_table(tabletop) -> None:
     """With fy = (h/2)/tan(fovy/2) and depth along the axis, a rendered table is flat and at its height to 1 mm."""
     view = tabletop.render([])
     assert view.intrinsics.fy == pytest.approx(240.0 / np.tan(np.radians(30.0)), rel=1e-6)
@@ -88,14 +93,16 @@ def test_a28_a30_planar_depth_of_a_tilted_camera_gives_a_flat_table(tabletop) ->
 
 
 @pytest.mark.parametrize("depth", [np.ones((12, 16)), np.ones((12, 16), np.uint8), np.ones((12, 16, 1), np.float32)])
-def test_b28_unknown_encodings_are_refused(depth) -> None:
+@pytest.mark.requirement("B-28")
+def test_unknown_encodings_are_refused(depth) -> None:
     """Neither 16UC1 nor 32FC1."""
     with pytest.raises(OpenArmError, match=r"expected \(h, w\) of uint16 millimetres") as caught:
         Deprojector(LIMITS).organised(depth, K)
     assert caught.value.code is Code.BAD_IMAGE
 
 
-def test_b30_an_image_of_another_size_than_its_info_is_refused() -> None:
+@pytest.mark.requirement("B-30")
+def test_an_image_of_another_size_than_its_info_is_refused() -> None:
     """The message names both sizes."""
     with pytest.raises(OpenArmError, match=r"8x6 pixels.*16x12"):
         Deprojector(LIMITS).valid_points(np.ones((6, 8), np.float32), K)
@@ -124,7 +131,8 @@ def test_limits_must_be_in_order() -> None:
         DepthLimits(near=1.0, far=0.5)
 
 
-def test_a46_clouds_of_two_cameras_agree_in_the_base_frame(tabletop) -> None:
+@pytest.mark.requirement("A-46")
+def test_clouds_of_two_cameras_agree_in_the_base_frame(tabletop) -> None:
     """The near camera's points of a box and the table lie on the overhead camera's within its pixels' spacing."""
     box = tabletop.Thing("red", "box", (0.07, 0.07, 0.06), 0.25, -0.25, 0.4)
     near = tabletop.look_at((0.38, -0.30, 0.72), (0.25, -0.25, 0.43), (0.3, -1.0, 0.0))

@@ -33,7 +33,8 @@ def picture(*boxes: tuple[int, int, int, int, tuple[int, int, int]]):
     return image
 
 
-def test_a60_a61_b04_class_score_and_box_centre(detector: Detector) -> None:
+@pytest.mark.requirement("A-60", "A-61", "B-04")
+def test_class_score_and_box_centre(detector: Detector) -> None:
     """The centre of the box is its middle, not its corner; class, score and box are all in pixels."""
     (found,) = detector.detect(picture((40, 30, 21, 31, RED)))
     assert found.label == "red"
@@ -45,12 +46,14 @@ def test_a60_a61_b04_class_score_and_box_centre(detector: Detector) -> None:
     assert not found.truncated
 
 
-def test_a61_nothing_found_is_an_answer(detector: Detector) -> None:
+@pytest.mark.requirement("A-61")
+def test_nothing_found_is_an_answer(detector: Detector) -> None:
     """An empty table gives an empty tuple."""
     assert detector.detect(picture()) == ()
 
 
-def test_a60_largest_first_and_objects_of_one_colour_stay_apart(detector: Detector) -> None:
+@pytest.mark.requirement("A-60")
+def test_largest_first_and_objects_of_one_colour_stay_apart(detector: Detector) -> None:
     """Two red boxes four pixels apart are two detections; a single row of pixels does not join them."""
     image = picture((20, 20, 20, 20, RED), (44, 20, 30, 30, RED), (100, 80, 40, 30, BLUE))
     image[30, 38:46] = RED
@@ -86,7 +89,8 @@ def test_red_wraps_around_zero(detector: Detector, hue_deg: float) -> None:
 
 
 @pytest.mark.parametrize("value", [0.25, 0.5, 0.95])
-def test_b18_every_palette_colour_has_one_name_at_any_brightness(detector: Detector, value: float) -> None:
+@pytest.mark.requirement("B-18")
+def test_every_palette_colour_has_one_name_at_any_brightness(detector: Detector, value: float) -> None:
     """The colours of the objects, among them the red of the cube and of the can, are told apart."""
     hues = {"red": 0, "orange": 27, "yellow": 51, "green": 130, "blue": 225, "purple": 285}
     for label, hue in hues.items():
@@ -102,7 +106,8 @@ def test_what_the_border_cuts_is_flagged(detector: Detector) -> None:
     assert cut.score == pytest.approx(0.5 * whole.score)
 
 
-def test_b26_the_score_falls_with_area_fraction_and_saturation(detector: Detector) -> None:
+@pytest.mark.requirement("B-26")
+def test_the_score_falls_with_area_fraction_and_saturation(detector: Detector) -> None:
     """A half-hidden shape and a washed-out colour are less certain; below the threshold they are dropped."""
     whole = detector.detect(picture((40, 30, 30, 30, RED)))[0].score
     notched = detector.detect(picture((40, 30, 30, 30, RED), (50, 30, 20, 20, GREY)))[0].score
@@ -114,14 +119,16 @@ def test_b26_the_score_falls_with_area_fraction_and_saturation(detector: Detecto
 
 
 @pytest.mark.parametrize("image", [np.zeros((10, 10), np.uint8), np.zeros((10, 10, 3), np.float32)])
-def test_b28_another_image_is_refused(detector: Detector, image) -> None:
+@pytest.mark.requirement("B-28")
+def test_another_image_is_refused(detector: Detector, image) -> None:
     """The shape and type are named."""
     with pytest.raises(OpenArmError, match=r"expected \(h, w, 3\) of uint8") as caught:
         detector.detect(image)
     assert caught.value.code is Code.BAD_IMAGE
 
 
-def test_b27_policies_rank_by_score_or_by_distance_from_the_centre() -> None:
+@pytest.mark.requirement("B-27")
+def test_policies_rank_by_score_or_by_distance_from_the_centre() -> None:
     """The most certain, the one nearest to the image centre, or only those of a name."""
     mask = np.ones((9, 9), np.bool_)
     far = Detection2D("red", 0.9, (20.0, 20.0), (9, 9), mask, False)
@@ -134,7 +141,8 @@ def test_b27_policies_rank_by_score_or_by_distance_from_the_centre() -> None:
     assert rank(everything, "score", (160, 120), label="green") == ()
 
 
-def test_b03_a_detection_in_the_image_holds_no_position_in_space() -> None:
+@pytest.mark.requirement("B-03")
+def test_a_detection_in_the_image_holds_no_position_in_space() -> None:
     """Pixels and metres are different types: a 2-D detection has no depth, no frame, nothing to take for a position."""
     names = {f.name for f in dataclasses.fields(Detection2D)}
     assert names == {"label", "score", "centre", "size", "mask", "truncated", "kind"}

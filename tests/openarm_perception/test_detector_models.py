@@ -22,7 +22,8 @@ MODELS = ("shapes_320x256", "shapes_640x480")
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_b22_b67_the_shipped_files_are_small_and_need_no_gpu(name: str) -> None:
+@pytest.mark.requirement("B-22", "B-67")
+def test_the_shipped_files_are_small_and_need_no_gpu(name: str) -> None:
     """At most 3.2 million parameters of 4 bytes; run by the CPU provider alone; the card tells their hash."""
     path = FOLDER / f"{name}.onnx"
     assert path.stat().st_size < 4 * 3.2e6 / 4  # a quarter of it
@@ -33,7 +34,8 @@ def test_b22_b67_the_shipped_files_are_small_and_need_no_gpu(name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["network", "both"])
-def test_n14_n16_the_shipped_network_finds_random_scenes(kind) -> None:
+@pytest.mark.requirement("N-14", "N-16")
+def test_the_shipped_network_finds_random_scenes(kind) -> None:
     """Every object of six scenes under the overhead camera, in place, by colour and shape."""
     studio = Studio()
     camera = studio.cameras["overhead"]

@@ -27,7 +27,8 @@ def run(pipeline: Pipeline, view):
     return pipeline.run(view.rgb, view.depth, view.intrinsics, view.T_base_camera)
 
 
-def test_b20_located_and_refused_objects_look_different_and_the_input_stays(tabletop, pipeline) -> None:
+@pytest.mark.requirement("B-20")
+def test_located_and_refused_objects_look_different_and_the_input_stays(tabletop, pipeline) -> None:
     whole = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.25, -0.2, 0.3)
     cut = tabletop.Thing("blue", "box", (0.06, 0.06, 0.06), 0.25, 0.51)
     view = tabletop.render([whole, cut])

@@ -36,7 +36,8 @@ def step(flying: bool = True) -> np.ndarray:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 0.02, 0.05]))
-def test_a50_one_point_a_cell_on_an_absolute_lattice(seed: int, edge: float) -> None:
+@pytest.mark.requirement("A-50")
+def test_one_point_a_cell_on_an_absolute_lattice(seed: int, edge: float) -> None:
     """Every occupied cell has one point, in the cell, at the mean of what was there."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.3, 0.3, (rng.integers(1, 2000), 3)).astype(np.float32)
@@ -64,7 +65,8 @@ def test_what_is_not_finite_or_far_too_far_is_dropped() -> None:
 
 
 @pytest.mark.parametrize("metres", [False, True])
-def test_a51_a52_flying_pixels_go_and_surfaces_stay(metres: bool) -> None:
+@pytest.mark.requirement("A-51", "A-52")
+def test_flying_pixels_go_and_surfaces_stay(metres: bool) -> None:
     """Edges included: the box keeps its outline, the mixed pixels and lonely ones are gone."""
     depth = step()
     depth[10, 10] = 300
@@ -80,7 +82,8 @@ def test_a51_a52_flying_pixels_go_and_surfaces_stay(metres: bool) -> None:
     np.testing.assert_array_equal(out[kept], depth[kept])
 
 
-def test_a51_the_median_takes_noise_and_keeps_holes_and_edges() -> None:
+@pytest.mark.requirement("A-51")
+def test_the_median_takes_noise_and_keeps_holes_and_edges() -> None:
     rng = np.random.default_rng(0)
     clean = step(flying=False)
     noisy = (clean + rng.normal(0, 5, clean.shape)).astype(np.uint16)
@@ -100,7 +103,8 @@ def test_a51_the_median_takes_noise_and_keeps_holes_and_edges() -> None:
         median_depth(np.zeros((4, 4), np.uint8), 3)  # type: ignore[arg-type]
 
 
-def test_a51_outliers_are_those_far_from_their_twenty_nearest() -> None:
+@pytest.mark.requirement("A-51")
+def test_outliers_are_those_far_from_their_twenty_nearest() -> None:
     """A plane with points above it, which go; hardly any of the plane goes with them."""
     rng = np.random.default_rng(1)
     plane = np.column_stack([rng.uniform(0, 0.3, (3000, 2)), rng.normal(0, 0.001, 3000)])

@@ -42,7 +42,8 @@ def circle(diameter: float, centre=(0.0, 0.0), noise: float = 0.0005):
     st.floats(-0.5, 0.5),
     st.floats(-0.5, 0.5),
 )
-def test_a64_rectangles_are_found_at_any_yaw(edges: tuple[float, float], yaw: float, x: float, y: float) -> None:
+@pytest.mark.requirement("A-64")
+def test_rectangles_are_found_at_any_yaw(edges: tuple[float, float], yaw: float, x: float, y: float) -> None:
     """Centre, size, and yaw of the smaller extent; far below the 5 degrees and the 5 mm of the requirement."""
     width, height = edges
     shape = footprint.fit(rectangle(width, height, yaw, (x, y)), SPACING)
@@ -59,7 +60,8 @@ def test_a64_rectangles_are_found_at_any_yaw(edges: tuple[float, float], yaw: fl
 
 @settings(max_examples=30, deadline=None)
 @given(st.floats(0.04, 0.08), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
-def test_b43_circles_are_found_and_have_any_yaw(diameter: float, x: float, y: float) -> None:
+@pytest.mark.requirement("B-43")
+def test_circles_are_found_and_have_any_yaw(diameter: float, x: float, y: float) -> None:
     """The diameter is both extents; the yaw is said to be unknown."""
     shape = footprint.fit(circle(diameter, (x, y)), SPACING)
     assert shape.kind == "circle"

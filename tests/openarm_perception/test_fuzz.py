@@ -35,7 +35,8 @@ MILLIMETRES = SHAPES.flatmap(lambda shape: hnp.arrays(np.uint16, shape))
 
 @settings(max_examples=150, deadline=None)
 @given(METRES | MILLIMETRES, st.integers(0, 1), st.integers(0, 1), st.sampled_from([0, 3, 5]))
-def test_b28_b30_any_depth_image_gives_points_in_range_or_a_named_refusal(depth, dw: int, dh: int, median: int) -> None:
+@pytest.mark.requirement("B-28", "B-30")
+def test_any_depth_image_gives_points_in_range_or_a_named_refusal(depth, dw: int, dh: int, median: int) -> None:
     """NaN, infinite, negative, all zero, 1 x 1, another size than its CameraInfo; with and without filters."""
     height, width = depth.shape
     k = Intrinsics.from_fovy(width + dw, height + dh, 60.0)
@@ -53,7 +54,8 @@ def test_b28_b30_any_depth_image_gives_points_in_range_or_a_named_refusal(depth,
 
 @settings(max_examples=40, deadline=None)
 @given(st.data())
-def test_b28_any_pair_of_images_gives_finite_objects_or_named_refusals(data) -> None:
+@pytest.mark.requirement("B-28")
+def test_any_pair_of_images_gives_finite_objects_or_named_refusals(data) -> None:
     """A red patch anywhere on noise, any depth below it, any pose of the camera."""
     seed = data.draw(st.integers(0, 2**32 - 1))
     rng = np.random.default_rng(seed)
@@ -84,7 +86,8 @@ def test_b28_any_pair_of_images_gives_finite_objects_or_named_refusals(data) -> 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(-0.06, 0.06), st.floats(0.0, 0.05))
-def test_b63_the_table_is_measured_to_two_millimetres_with_things_on_it_or_refused(
+@pytest.mark.requirement("B-63")
+def test_the_table_is_measured_to_two_millimetres_with_things_on_it_or_refused(
     seed: int, off: float, tilt: float
 ) -> None:
     """Expected up to 6 cm wrong, tilted up to 3 degrees, a third of the picture hidden, 2 mm of noise."""

@@ -67,9 +67,8 @@ def errors(thing, found) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(("encoding", "sigma"), [("16UC1", 0.0), ("32FC1", 0.0), ("16UC1", 0.001), ("16UC1", 0.002)])
-def test_a63_a64_p15_b01_objects_anywhere_on_the_table(
-    tabletop, detector, localizer, encoding: str, sigma: float, capsys
-) -> None:
+@pytest.mark.requirement("A-63", "A-64", "P-15", "B-01")
+def test_objects_anywhere_on_the_table(tabletop, detector, localizer, encoding: str, sigma: float, capsys) -> None:
     """48 objects at random places and yaws, overhead camera; p95 within 3 mm and 3 degrees, none beyond 5.
 
     `sigma` is white noise of the depth, m.
@@ -101,7 +100,8 @@ def test_a63_a64_p15_b01_objects_anywhere_on_the_table(
     assert all(p95 <= 3.0 and most <= 5.0 for p95, most in worst.values()), worst
 
 
-def test_a33_a49_a63_the_near_camera_agrees(tabletop, detector, localizer) -> None:
+@pytest.mark.requirement("A-33", "A-49", "A-63")
+def test_the_near_camera_agrees(tabletop, detector, localizer) -> None:
     """Through cam → base of a tilted camera on the hand, one known point: the object's middle."""
     for yaw in np.linspace(-1.4, 1.5, 6):
         thing = tabletop.Thing("red", "box", (0.04, 0.06, 0.05), 0.25, -0.25, float(yaw))
@@ -147,7 +147,8 @@ def test_what_is_no_prism_is_bounded_and_says_so(tabletop, detector, localizer) 
     assert math.sqrt(found.covariance[0, 0]) > 0.003
 
 
-def test_a62_the_median_is_at_least_five_times_steadier_than_a_pixel(tabletop, detector, localizer) -> None:
+@pytest.mark.requirement("A-62")
+def test_the_median_is_at_least_five_times_steadier_than_a_pixel(tabletop, detector, localizer) -> None:
     """White noise of 3 mm on the depth, 60 frames: the coarse position against the depth at the centre of the box."""
     rng = np.random.default_rng(11)
     view = tabletop.render([tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.25, -0.2, 0.2)])
@@ -162,7 +163,8 @@ def test_a62_the_median_is_at_least_five_times_steadier_than_a_pixel(tabletop, d
     assert np.std(single) > 5.0 * np.std(median)
 
 
-def test_a62_holes_in_the_depth_do_not_count(tabletop, detector, localizer) -> None:
+@pytest.mark.requirement("A-62")
+def test_holes_in_the_depth_do_not_count(tabletop, detector, localizer) -> None:
     """A third of the pixels without depth, the centre among them."""
     thing = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.25, -0.2, 0.2)
     view = tabletop.render([thing])
@@ -176,7 +178,8 @@ def test_a62_holes_in_the_depth_do_not_count(tabletop, detector, localizer) -> N
     assert 0.40 < point[2] < 0.451
 
 
-def test_a31_the_given_intrinsics_decide(tabletop, detector, localizer) -> None:
+@pytest.mark.requirement("A-31")
+def test_the_given_intrinsics_decide(tabletop, detector, localizer) -> None:
     """A focal length 10 % off moves the answer by centimetres: nothing else says what the camera is."""
     thing = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.25, -0.3)
     view = tabletop.render([thing])
@@ -186,7 +189,8 @@ def test_a31_the_given_intrinsics_decide(tabletop, detector, localizer) -> None:
     assert np.linalg.norm(point[:2] - thing.position[:2]) > 0.02
 
 
-def test_b43_the_covariance_says_what_is_not_known(tabletop, detector, localizer) -> None:
+@pytest.mark.requirement("B-43")
+def test_the_covariance_says_what_is_not_known(tabletop, detector, localizer) -> None:
     """A cylinder has any yaw; a box has one to a degree; positions are known to about a millimetre."""
     box = tabletop.Thing("red", "box", (0.05, 0.06, 0.05), 0.25, -0.2, 0.2)
     can = tabletop.Thing("blue", "cylinder", (0.066, 0.066, 0.115), 0.3, 0.1)
@@ -215,7 +219,8 @@ def test_a_cut_object_is_refused_by_name(tabletop, detector, localizer) -> None:
     assert "cut by the border" in error.message
 
 
-def test_b30_a_depth_image_of_another_size_is_refused(tabletop, detector, localizer) -> None:
+@pytest.mark.requirement("B-30")
+def test_a_depth_image_of_another_size_is_refused(tabletop, detector, localizer) -> None:
     """Depth must be aligned with colour."""
     view = tabletop.render([tabletop.Thing("red", "box", (0.06, 0.06, 0.06), 0.25, 0.2)])
     (found,) = detector.detect(view.rgb)
@@ -237,7 +242,8 @@ def test_missing_depth_and_flat_things_are_refused_by_name(tabletop, detector, l
     assert "table height wrong" in error.message
 
 
-def test_b05_the_way_from_pixel_to_robot_needs_no_ros() -> None:
+@pytest.mark.requirement("B-05")
+def test_the_way_from_pixel_to_robot_needs_no_ros() -> None:
     """The cores import neither rclpy nor messages."""
     code = (
         "import sys; from openarm_perception.detection import detector, localize;"

@@ -60,7 +60,8 @@ def three(tabletop):
 
 
 @pytest.mark.parametrize("shift", [-3.0, 0.0, 3.0])
-def test_n15_boxes_of_a_network_become_objects_in_place(tabletop, perceive, shift: float) -> None:
+@pytest.mark.requirement("N-15")
+def test_boxes_of_a_network_become_objects_in_place(tabletop, perceive, shift: float) -> None:
     """Also with boxes a few pixels off: depth and colour say where an object ends. Labels are colours if possible."""
     things = three(tabletop)
     seen = perceive("network", things, {0: (0, 0.9, shift), 1: (1, 0.8, shift), 2: (0, 0.7, shift)})
@@ -82,14 +83,16 @@ def test_a_round_outline_in_depth_is_no_box_whatever_the_network_says(tabletop, 
     assert found["red"] == ("red", "cylinder")  # it may lie
 
 
-def test_n16_what_both_see_is_found_and_named_by_both(tabletop, perceive) -> None:
+@pytest.mark.requirement("N-16")
+def test_what_both_see_is_found_and_named_by_both(tabletop, perceive) -> None:
     seen = perceive("both", three(tabletop))
     assert {(d.label, d.kind) for d in seen.found} == {("red", "box"), ("blue", "cylinder"), ("box", "box")}
     assert len(seen.located) == 3
     assert not seen.refused
 
 
-def test_n16_what_the_network_does_not_see_is_looked_at_again(tabletop, perceive) -> None:
+@pytest.mark.requirement("N-16")
+def test_what_the_network_does_not_see_is_looked_at_again(tabletop, perceive) -> None:
     """A network that has gone blind: nothing coloured is grasped, all of it stands in the way, and each is told of."""
     seen = perceive("both", three(tabletop), {2: (0, 0.9, 0.0)})
     assert [place.label for place in seen.located] == ["box"]
@@ -100,7 +103,8 @@ def test_n16_what_the_network_does_not_see_is_looked_at_again(tabletop, perceive
     )
 
 
-def test_n16_a_colour_that_only_paint_has_is_no_object(tabletop, perceive) -> None:
+@pytest.mark.requirement("N-16")
+def test_a_colour_that_only_paint_has_is_no_object(tabletop, perceive) -> None:
     """A red sheet on the table: by colour it is found in the image; the network knows better."""
 
     def sheet(rgb):
@@ -114,7 +118,8 @@ def test_n16_a_colour_that_only_paint_has_is_no_object(tabletop, perceive) -> No
     assert any("red at pixel (330, 120): the network sees nothing there" in why for why in seen.refused)
 
 
-def test_n16_what_has_lost_its_colour_to_one_of_them_is_looked_at_again(tabletop, perceive) -> None:
+@pytest.mark.requirement("N-16")
+def test_what_has_lost_its_colour_to_one_of_them_is_looked_at_again(tabletop, perceive) -> None:
     """Specks hide the red of a box from the colour detector, whose kernel takes it out; most of it is still red."""
 
     def specks(rgb):

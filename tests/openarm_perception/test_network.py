@@ -22,7 +22,8 @@ def make(path, output, **kwargs) -> NetworkDetector:
 IMAGE = np.zeros((480, 640, 3), np.uint8)
 
 
-def test_b36_b38_boxes_of_the_input_are_boxes_of_the_image(tmp_path) -> None:
+@pytest.mark.requirement("B-36", "B-38")
+def test_boxes_of_the_input_are_boxes_of_the_image(tmp_path) -> None:
     """320x256 takes a 640x480 image at half its size, 8 rows lower."""
     network = make(tmp_path, boxes((100, 58, 130, 88, 0, 0.9), (200, 108, 240, 168, 1, 0.6)))
     found = {d.label: d for d in network.detect(IMAGE)}
@@ -34,13 +35,15 @@ def test_b36_b38_boxes_of_the_input_are_boxes_of_the_image(tmp_path) -> None:
     assert found["ball"].mask.all()
 
 
-def test_b26_the_threshold_is_one_half_by_default(tmp_path) -> None:
+@pytest.mark.requirement("B-26")
+def test_the_threshold_is_one_half_by_default(tmp_path) -> None:
     output = boxes((10, 20, 40, 60, 0, 0.49), (100, 58, 130, 88, 0, 0.51))
     assert [d.score for d in make(tmp_path, output).detect(IMAGE)] == pytest.approx([0.51])
     assert len(make(tmp_path, output, config={"threshold": 0.4}).detect(IMAGE)) == 2
 
 
-def test_b27_policies_choose_among_several(tmp_path) -> None:
+@pytest.mark.requirement("B-27")
+def test_policies_choose_among_several(tmp_path) -> None:
     found = make(tmp_path, boxes((10, 20, 40, 60, 0, 0.95), (150, 110, 180, 140, 0, 0.7))).detect(IMAGE)
     assert rank(found, "score", (640, 480))[0].score == pytest.approx(0.95)
     assert rank(found, "centre", (640, 480))[0].score == pytest.approx(0.7)
@@ -63,7 +66,8 @@ def test_set_classes_looks_for_some_only_and_lists_what_it_knows(tmp_path) -> No
 
 @pytest.mark.parametrize("classes", [1, 2, 3, 17, 80])
 @pytest.mark.parametrize("size", [(256, 320), (480, 640), (640, 640)])
-def test_n15_any_layout_of_yolov8_is_read(tmp_path, classes: int, size: tuple[int, int]) -> None:
+@pytest.mark.requirement("N-15")
+def test_any_layout_of_yolov8_is_read(tmp_path, classes: int, size: tuple[int, int]) -> None:
     """The number of classes is that of the shape, the size of the input that of the file."""
     cells = sum(size[0] // s * (size[1] // s) for s in (8, 16, 32))
     names = [f"thing{i}" for i in range(classes)]
@@ -74,7 +78,8 @@ def test_n15_any_layout_of_yolov8_is_read(tmp_path, classes: int, size: tuple[in
     assert [d.label for d in network.detect(np.zeros((*size, 3), np.uint8))] == [names[-1]]
 
 
-def test_n15_sizes_that_the_file_leaves_free_are_those_of_the_configuration(tmp_path) -> None:
+@pytest.mark.requirement("N-15")
+def test_sizes_that_the_file_leaves_free_are_those_of_the_configuration(tmp_path) -> None:
     network = make(tmp_path, boxes(), shape=("n", 3, "h", "w"), config={"width": 416, "height": 320})
     assert network.size == (416, 320)
 
@@ -109,7 +114,8 @@ def test_names_come_from_the_configuration_the_file_or_a_yaml(tmp_path) -> None:
         (boxes(), {"kind": 2}, r"tensor\(uint8\), of tensor\(float\)"),
     ],
 )
-def test_n15_files_of_another_layout_are_refused_by_name(tmp_path, output, kwargs, words: str) -> None:
+@pytest.mark.requirement("N-15")
+def test_files_of_another_layout_are_refused_by_name(tmp_path, output, kwargs, words: str) -> None:
     with pytest.raises(OpenArmError, match=words) as caught:
         make(tmp_path, output, **kwargs)
     assert caught.value.code is Code.CONFIG_INVALID
@@ -134,7 +140,8 @@ def test_without_onnxruntime_networks_are_refused_and_say_what_to_install(tmp_pa
     assert caught.value.code is Code.ENVIRONMENT
 
 
-def test_b28_images_of_another_kind_are_refused(tmp_path) -> None:
+@pytest.mark.requirement("B-28")
+def test_images_of_another_kind_are_refused(tmp_path) -> None:
     network = make(tmp_path, boxes())
     for image in (
         np.zeros((480, 640), np.uint8),

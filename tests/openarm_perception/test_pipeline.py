@@ -26,13 +26,15 @@ def run(pipeline: Pipeline, view):
     return pipeline.run(view.rgb, view.depth, view.intrinsics, view.T_base_camera)
 
 
-def test_b30_colour_of_another_size_is_refused(tabletop, pipeline) -> None:
+@pytest.mark.requirement("B-30")
+def test_colour_of_another_size_is_refused(tabletop, pipeline) -> None:
     view = tabletop.render([])
     with pytest.raises(OpenArmError, match="colour image is 320x240"):
         pipeline.run(view.rgb[::2, ::2], view.depth, view.intrinsics, view.T_base_camera)
 
 
-def test_b27_the_pipeline_ranks_and_filters(tabletop, pipeline) -> None:
+@pytest.mark.requirement("B-27")
+def test_the_pipeline_ranks_and_filters(tabletop, pipeline) -> None:
     """By policy, and by label."""
     near = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.27, 0.0)
     far = tabletop.Thing("blue", "cylinder", (0.05, 0.05, 0.06), 0.2, 0.3)

@@ -24,7 +24,8 @@ FLAT = (0.0, 0.0, 1.0)
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_b31_a_point_of_any_plane_comes_back_for_any_attitude_of_the_camera(seed: int) -> None:
+@pytest.mark.requirement("B-31")
+def test_a_point_of_any_plane_comes_back_for_any_attitude_of_the_camera(seed: int) -> None:
     """Tilted, rolled, upside down; the plane need not be level."""
     rng = np.random.default_rng(seed)
     T = se3.make(se3.exp_so3(rng.normal(size=3) * 2.0), rng.normal(size=3))
@@ -40,7 +41,8 @@ def test_b31_a_point_of_any_plane_comes_back_for_any_attitude_of_the_camera(seed
 
 
 @pytest.mark.parametrize(("tilt", "v"), [(np.pi / 2, 100), (np.pi / 2, 239.5), (2.5, 240)])
-def test_b31_pixels_above_the_horizon_are_refused(tilt: float, v: float) -> None:
+@pytest.mark.requirement("B-31")
+def test_pixels_above_the_horizon_are_refused(tilt: float, v: float) -> None:
     """A camera that looks level or up at 1 m over the plane."""
     forward = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
     T = se3.make(se3.rotation_from_z_y(forward, np.cross(forward, (0.0, -1.0, 0.0))), (0.0, 0.0, 1.0))
@@ -73,9 +75,8 @@ VIEWS = {  # position, target, right: from straight above to 30 degrees over the
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_b21_b31_b63_objects_of_known_height_are_within_five_millimetres_without_depth(
-    tabletop, detector, view: str
-) -> None:
+@pytest.mark.requirement("B-21", "B-31", "B-63")
+def test_objects_of_known_height_are_within_five_millimetres_without_depth(tabletop, detector, view: str) -> None:
     """Boxes and cylinders by their silhouette, from any tilt: position, yaw and size."""
     T = tabletop.look_at(*VIEWS[view])
     rng = np.random.default_rng(11)
@@ -95,7 +96,8 @@ def test_b21_b31_b63_objects_of_known_height_are_within_five_millimetres_without
                 assert abs(np.degrees(turn)) <= 5.0
 
 
-def test_b63_a_wrong_height_stays_within_the_stated_uncertainty(tabletop, detector) -> None:
+@pytest.mark.requirement("B-63")
+def test_a_wrong_height_stays_within_the_stated_uncertainty(tabletop, detector) -> None:
     """5 mm too tall, with a standard deviation of 5 mm: the error along the view is about half of what that leans."""
     thing = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.3, 0.1, 0.3)
     seen = tabletop.render([thing], tabletop.look_at(*VIEWS["tilted"]))

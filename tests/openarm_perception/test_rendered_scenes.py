@@ -26,7 +26,8 @@ def studio() -> Iterator[Studio]:
     studio.close()
 
 
-def test_a26_a34_a60_a63_a64_b01_every_object_of_random_scenes(studio, capsys) -> None:
+@pytest.mark.requirement("A-26", "A-34", "A-60", "A-63", "A-64", "B-01")
+def test_every_object_of_random_scenes(studio, capsys) -> None:
     """Overhead camera, robot at home, 16 scenes: every object and nothing else, right in place, size and yaw."""
     found, times = [], []
     for seed in range(100, 116):
@@ -51,7 +52,8 @@ def test_a26_a34_a60_a63_a64_b01_every_object_of_random_scenes(studio, capsys) -
     assert (worst <= 5.0).all()
 
 
-def test_a33_the_wrist_camera_locates_or_refuses_by_name(studio) -> None:
+@pytest.mark.requirement("A-33")
+def test_the_wrist_camera_locates_or_refuses_by_name(studio) -> None:
     """Objects that fingers hide or the border cuts are refused; what is located is right."""
     joints = studio.looking()
     located = 0
@@ -68,7 +70,8 @@ def test_a33_the_wrist_camera_locates_or_refuses_by_name(studio) -> None:
 
 
 @pytest.mark.parametrize("camera", ["overhead", "wrist"])
-def test_p15_a52_a63_a64_depth_as_noisy_as_a_d435s_moves_nothing_by_a_millimetre(studio, camera: str) -> None:
+@pytest.mark.requirement("P-15", "A-52", "A-63", "A-64")
+def test_depth_as_noisy_as_a_d435s_moves_nothing_by_a_millimetre(studio, camera: str) -> None:
     """Errors that grow with the square of the depth, flying pixels at every edge, holes."""
     found, seed = [], 120
     while len(found) < 12:
@@ -99,7 +102,8 @@ def test_nothing_is_seen_on_robot_and_table(studio) -> None:
             assert studio.detector.detect(rgb) == ()
 
 
-def test_b18_cube_and_can_of_the_demo(studio) -> None:
+@pytest.mark.requirement("B-18")
+def test_cube_and_can_of_the_demo(studio) -> None:
     """The red cube and the can stand where the scene file says."""
     scene = load_scene("demo")
     perceived = studio.perceive(scene, studio.home(), "overhead")

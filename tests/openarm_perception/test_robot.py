@@ -60,7 +60,8 @@ def in_the_hand(studio: Studio, joints):
     return scene.model_copy(update={"objects": (cube,)}), held
 
 
-def test_p04_p05_what_a_hand_holds_is_not_reported_as_standing_on_the_table(studio) -> None:
+@pytest.mark.requirement("P-04", "P-05")
+def test_what_a_hand_holds_is_not_reported_as_standing_on_the_table(studio) -> None:
     """Without the self-filter it is: as a tower below the hand. In the image it is found in either case."""
     scene, held = in_the_hand(studio, studio.looking())
     look = Look(studio, scene, studio.looking(), held=[held])

@@ -180,7 +180,8 @@ def test_goal_tolerance_and_goal_time_of_the_goal_replace_the_defaults() -> None
     assert arm.run().result is TrajectoryResult.SUCCESSFUL
 
 
-def test_p21_cancel_slows_down_along_the_path_and_holds() -> None:
+@pytest.mark.requirement("P-21")
+def test_cancel_slows_down_along_the_path_and_holds() -> None:
     arm = Arm()
     arm.start(**CUBIC)
     arm.tick(50)
@@ -224,7 +225,8 @@ def test_a_refused_trajectory_leaves_the_running_one_alone() -> None:
     assert arm.run().end is End.SUCCEEDED
 
 
-def test_p21_a_busy_arm_refuses_new_goals_where_that_is_configured() -> None:
+@pytest.mark.requirement("P-21")
+def test_a_busy_arm_refuses_new_goals_where_that_is_configured() -> None:
     arm = Arm(config=TrajectoryConfig(new_goal="refuse"))
     arm.start(**CUBIC)
     arm.tick(30)

@@ -68,7 +68,8 @@ def draw(renderer: SnapshotRenderer, state: Snapshot) -> tuple[np.ndarray, np.nd
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.5])
-def test_a28_a29_depth_is_planar_within_a_millimetre(renderer: SnapshotRenderer, tilt: float) -> None:
+@pytest.mark.requirement("A-28", "A-29")
+def test_depth_is_planar_within_a_millimetre(renderer: SnapshotRenderer, tilt: float) -> None:
     state = snapshot(tilt)
     _, depth = draw(renderer, state)
     T = pose_of(state)
@@ -81,7 +82,8 @@ def test_a28_a29_depth_is_planar_within_a_millimetre(renderer: SnapshotRenderer,
 
 
 @pytest.mark.parametrize("ball", [(0.05, 0.1, 0.2), (-0.2, -0.1, 0.3)])
-def test_a28_depth_of_a_sphere_is_that_of_the_ray_that_meets_it(
+@pytest.mark.requirement("A-28")
+def test_depth_of_a_sphere_is_that_of_the_ray_that_meets_it(
     renderer: SnapshotRenderer, ball: tuple[float, float, float]
 ) -> None:
     radius = 0.05
@@ -100,7 +102,8 @@ def test_a28_depth_of_a_sphere_is_that_of_the_ray_that_meets_it(
     assert np.abs(depth[inside] * 1e-3 - expected[inside]).max() <= 1e-3
 
 
-def test_p27_a30_a_point_is_seen_where_the_intrinsics_project_it(renderer: SnapshotRenderer) -> None:
+@pytest.mark.requirement("P-27", "A-30")
+def test_a_point_is_seen_where_the_intrinsics_project_it(renderer: SnapshotRenderer) -> None:
     for ball in ((0.2, 0.1, 0.3), (-0.25, 0.3, 0.2), (0.1, -0.05, 0.5)):
         state = snapshot(0.2, ball, radius=0.03)
         colour, depth = draw(renderer, state)
@@ -132,7 +135,8 @@ def test_depth_rounds_to_the_nearest_millimetre() -> None:
     assert millimetres(np.append(metres, np.float32(np.nan))).tolist() == [300, 301, 1234, 0]
 
 
-def test_a47_depth_in_metres_says_the_same_with_nan_for_invalid(renderer: SnapshotRenderer) -> None:
+@pytest.mark.requirement("A-47")
+def test_depth_in_metres_says_the_same_with_nan_for_invalid(renderer: SnapshotRenderer) -> None:
     state = snapshot(1.2)
     _, mm = draw(renderer, state)
     metres = np.empty((240, 320), np.float32)
@@ -157,7 +161,8 @@ def test_a_camera_that_the_model_lacks_is_named(renderer: SnapshotRenderer) -> N
     assert caught.value.code is Code.CONFIG_INVALID
 
 
-def test_a26_a27_the_two_cameras_are_640_by_480_with_60_degrees() -> None:
+@pytest.mark.requirement("A-26", "A-27")
+def test_the_two_cameras_are_640_by_480_with_60_degrees() -> None:
     cameras = load_cameras()
     for name in ("overhead", "wrist"):
         camera = cameras[name]

@@ -17,7 +17,8 @@ from openarm_common.scene.scene import PALETTE, load_scene
 from openarm_sim_bridge.world.export import VIEWS, export, render, render_png
 
 
-def test_a12_mjcf_round_trip_keeps_joints_links_and_kinematics() -> None:
+@pytest.mark.requirement("A-12")
+def test_mjcf_round_trip_keeps_joints_links_and_kinematics() -> None:
     description = RobotDescription.load()
     model = mujoco.MjModel.from_xml_string(export("mjcf"))
     data = mujoco.MjData(model)

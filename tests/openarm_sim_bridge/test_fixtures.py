@@ -22,7 +22,8 @@ BODY = '<body name="thing"><geom name="thing" size="0.01" contype="0" conaffinit
 @pytest.mark.parametrize(
     ("scene", "carrier"), [("calibration_wrist", ""), ("calibration_overhead", "openarm_right_link7")]
 )
-def test_a43_the_board_of_the_calibration_scenes_is_where_the_scene_says(scene: str, carrier: str) -> None:
+@pytest.mark.requirement("A-43")
+def test_the_board_of_the_calibration_scenes_is_where_the_scene_says(scene: str, carrier: str) -> None:
     """Fixed on the table, or carried by the hand in whatever posture; nothing can touch it."""
     description = RobotDescription.load()
     world = load_scene(scene)

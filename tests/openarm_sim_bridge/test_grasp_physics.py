@@ -11,7 +11,8 @@ from benchmarks.grasp_trials import BACK, MUJOCO_DEFAULTS, OBJECTS, OPEN, TABLE,
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("kind", [kind for kind in OBJECTS if kind != "cube_8cm"])
-def test_a07_a69_p16_an_object_is_held_by_friction_through_lift_hold_shake_and_put_back(kind: str, seed: int) -> None:
+@pytest.mark.requirement("A-07", "A-69", "P-16")
+def test_an_object_is_held_by_friction_through_lift_hold_shake_and_put_back(kind: str, seed: int) -> None:
     item, error = make(kind, seed)
     trial = Trial(item, ("right", "left")[(seed + len(kind)) % 2], error)
     start = trial.position
@@ -42,7 +43,8 @@ def test_a07_a69_p16_an_object_is_held_by_friction_through_lift_hold_shake_and_p
 
 
 @pytest.mark.parametrize("kind", ["cube_5cm", "can"])
-def test_a07_with_mujocos_own_defaults_the_same_grasp_loses_the_object(kind: str) -> None:
+@pytest.mark.requirement("A-07")
+def test_with_mujocos_own_defaults_the_same_grasp_loses_the_object(kind: str) -> None:
     item, error = make(kind, 0)
     trial = Trial(item, "right", error, MUJOCO_DEFAULTS)
     start = trial.position
@@ -54,7 +56,8 @@ def test_a07_with_mujocos_own_defaults_the_same_grasp_loses_the_object(kind: str
     assert trial.position[2] - start[2] < 0.05 or slipped > 5e-3
 
 
-def test_a71_closing_on_nothing_shows_in_gap_and_effort() -> None:
+@pytest.mark.requirement("A-71")
+def test_closing_on_nothing_shows_in_gap_and_effort() -> None:
     item, error = make("cube_5cm", 0)
     trial = Trial(item, "right", error)
     trial.run(0.6, lambda u: trial.fingers(OPEN * (1 - u)))  # at the pre-grasp, above the object
@@ -63,7 +66,8 @@ def test_a71_closing_on_nothing_shows_in_gap_and_effort() -> None:
     assert trial.effort < 1.0
 
 
-def test_a07_repeated_grasps_of_one_object_neither_throw_nor_lose_it() -> None:
+@pytest.mark.requirement("A-07")
+def test_repeated_grasps_of_one_object_neither_throw_nor_lose_it() -> None:
     item, error = make("cylinder", 3)
     trial = Trial(item, "right", error)
     for _ in range(6):

@@ -51,7 +51,8 @@ class Finger:
 
 
 @pytest.mark.parametrize("position", [0.005, 0.035, 0.025, 0.0, 0.044])
-def test_p22_the_finger_reaches_its_goal(position: float) -> None:
+@pytest.mark.requirement("P-22")
+def test_the_finger_reaches_its_goal(position: float) -> None:
     finger = Finger(position=0.02)
     finger.start(position)
     outcome = finger.run()
@@ -59,7 +60,8 @@ def test_p22_the_finger_reaches_its_goal(position: float) -> None:
     assert outcome.position == pytest.approx(position, abs=0.001)
 
 
-def test_b53_closing_takes_six_tenths_of_a_second() -> None:
+@pytest.mark.requirement("B-53")
+def test_closing_takes_six_tenths_of_a_second() -> None:
     finger = Finger()
     finger.start(0.0)
     finger.run()

@@ -74,7 +74,8 @@ def test_every_link_is_a_body_and_every_actuator_is_named_like_its_joint(
         assert model.actuator(name).trnid[0] == model.joint(name).id
 
 
-def test_a13_collision_shapes_are_boxes_and_cylinders_and_not_drawn(
+@pytest.mark.requirement("A-13")
+def test_collision_shapes_are_boxes_and_cylinders_and_not_drawn(
     description: RobotDescription, model: mujoco.MjModel
 ) -> None:
     simple = {mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_PLANE}
@@ -89,7 +90,8 @@ def test_a13_collision_shapes_are_boxes_and_cylinders_and_not_drawn(
             assert (geom.contype[0], geom.conaffinity[0], geom.group[0]) == (1, 1, 3)
 
 
-def test_a13_a_step_is_cheap(description: RobotDescription, model: mujoco.MjModel) -> None:
+@pytest.mark.requirement("A-13")
+def test_a_step_is_cheap(description: RobotDescription, model: mujoco.MjModel) -> None:
     data = put(model, description, home(description))
     mujoco.mj_step(model, data, 200)
     best = np.inf
@@ -157,7 +159,8 @@ def test_no_contact_is_computed_for_the_pairs_of_the_srdf(description: RobotDesc
 
 
 @pytest.mark.parametrize("state", ["home", "hands_up", "zero"])
-def test_a74_named_postures_touch_nothing(description: RobotDescription, model: mujoco.MjModel, state: str) -> None:
+@pytest.mark.requirement("A-74")
+def test_named_postures_touch_nothing(description: RobotDescription, model: mujoco.MjModel, state: str) -> None:
     data = put(model, description, home(description) | description.group_state("both_arms", state))
     touching = {
         tuple(sorted((body_of(model, c.geom1), body_of(model, c.geom2))))
@@ -167,9 +170,8 @@ def test_a74_named_postures_touch_nothing(description: RobotDescription, model: 
     assert not touching
 
 
-def test_a74_arms_crossed_in_front_of_the_chest_are_a_contact(
-    description: RobotDescription, model: mujoco.MjModel
-) -> None:
+@pytest.mark.requirement("A-74")
+def test_arms_crossed_in_front_of_the_chest_are_a_contact(description: RobotDescription, model: mujoco.MjModel) -> None:
     q = home(description) | description.group_state("both_arms", "official_home")
     q |= {"openarm_left_joint3": 0.6, "openarm_right_joint3": -0.6}
     q |= {"openarm_left_joint1": -0.3, "openarm_right_joint1": 0.3}
@@ -178,7 +180,8 @@ def test_a74_arms_crossed_in_front_of_the_chest_are_a_contact(
     assert any({a[:12], b[:12]} == {"openarm_left", "openarm_righ"} for a, b in touching), touching
 
 
-def test_a21_targets_move_the_arm_through_the_actuators(description: RobotDescription, model: mujoco.MjModel) -> None:
+@pytest.mark.requirement("A-21")
+def test_targets_move_the_arm_through_the_actuators(description: RobotDescription, model: mujoco.MjModel) -> None:
     data = put(model, description, home(description))
     name = "openarm_right_joint5"
     address = model.joint(name).qposadr[0]
@@ -231,7 +234,8 @@ def free_bodies_first(spec: mujoco.MjSpec, names: set[str]) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
 
 
-def test_a22_the_world_works_with_free_bodies_first(
+@pytest.mark.requirement("A-22")
+def test_the_world_works_with_free_bodies_first(
     description: RobotDescription, demo: Scene, cameras: dict[str, CameraConfig], model: mujoco.MjModel
 ) -> None:
     names = {item.name for item in demo.objects}
@@ -252,7 +256,8 @@ def test_a22_the_world_works_with_free_bodies_first(
     np.testing.assert_allclose(states[0], states[1], atol=1e-6)
 
 
-def test_a27_cameras_see_60_degrees(model: mujoco.MjModel, cameras: dict[str, CameraConfig]) -> None:
+@pytest.mark.requirement("A-27")
+def test_cameras_see_60_degrees(model: mujoco.MjModel, cameras: dict[str, CameraConfig]) -> None:
     assert {model.camera(i).name for i in range(model.ncam)} == set(cameras)
     for name in ("overhead", "wrist"):
         assert model.camera(name).fovy[0] == 60.0
@@ -262,7 +267,8 @@ def test_a27_cameras_see_60_degrees(model: mujoco.MjModel, cameras: dict[str, Ca
 
 
 @pytest.mark.parametrize("seed", [None, 1, 2])
-def test_p27_cameras_stand_where_the_mount_seed_puts_them(
+@pytest.mark.requirement("P-27")
+def test_cameras_stand_where_the_mount_seed_puts_them(
     description: RobotDescription, demo: Scene, cameras: dict[str, CameraConfig], seed: int | None
 ) -> None:
     compiled = compile_model(description, demo, cameras, seed)
@@ -280,7 +286,8 @@ def test_p27_cameras_stand_where_the_mount_seed_puts_them(
         assert off <= 0.0151
 
 
-def test_a29_depth_comes_from_the_renderer_and_shows_the_table_at_its_distance(
+@pytest.mark.requirement("A-29")
+def test_depth_comes_from_the_renderer_and_shows_the_table_at_its_distance(
     description: RobotDescription, cameras: dict[str, CameraConfig]
 ) -> None:
     scene = load_scene("empty")
@@ -300,7 +307,8 @@ def test_a29_depth_comes_from_the_renderer_and_shows_the_table_at_its_distance(
         assert p[2] == pytest.approx(scene.table.top_z, abs=1e-3)
 
 
-def test_p27_an_object_is_seen_at_the_pixel_where_its_centre_projects(
+@pytest.mark.requirement("P-27")
+def test_an_object_is_seen_at_the_pixel_where_its_centre_projects(
     description: RobotDescription, demo: Scene, cameras: dict[str, CameraConfig], model: mujoco.MjModel
 ) -> None:
     data = put(model, description, home(description))

@@ -19,7 +19,8 @@ def plane(z: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("z", [0.3, 0.5, 1.0, 2.0])
-def test_a52_the_error_grows_with_the_square_of_the_distance(z: float) -> None:
+@pytest.mark.requirement("A-52")
+def test_the_error_grows_with_the_square_of_the_distance(z: float) -> None:
     noisy = add_depth_noise(plane(z), FOCAL, D435, np.random.default_rng(0))
     rms = np.nanstd(noisy)
     # RMS of the matcher and, independent of it, of rounding to steps.
@@ -29,7 +30,8 @@ def test_a52_the_error_grows_with_the_square_of_the_distance(z: float) -> None:
     assert np.isnan(noisy).mean() == pytest.approx(D435.dropout, rel=0.2)
 
 
-def test_a52_disparity_comes_in_steps() -> None:
+@pytest.mark.requirement("A-52")
+def test_disparity_comes_in_steps() -> None:
     noisy = add_depth_noise(plane(1.0), FOCAL, D435, np.random.default_rng(0))
     steps = FOCAL * D435.baseline / noisy[np.isfinite(noisy)] / D435.step
     np.testing.assert_allclose(steps, np.round(steps), atol=0.01)
@@ -37,7 +39,8 @@ def test_a52_disparity_comes_in_steps() -> None:
     np.testing.assert_allclose(add_depth_noise(plane(1.0), FOCAL, clean, np.random.default_rng(0)), 1.0, atol=1e-6)
 
 
-def test_a52_edges_fly_and_drop_out_and_planes_do_not() -> None:
+@pytest.mark.requirement("A-52")
+def test_edges_fly_and_drop_out_and_planes_do_not() -> None:
     z = plane(1.0)
     z[:, 320:] = 0.6
     config = D435.model_copy(update={"subpixel": 0.0, "step": 0.0, "dropout": 0.0})

@@ -21,7 +21,8 @@ def drive(pacer: Pacer, ticks: int, now: int = 0) -> list[int]:
     return begun
 
 
-def test_a18_ticks_are_a_period_apart_and_do_not_drift() -> None:
+@pytest.mark.requirement("A-18")
+def test_ticks_are_a_period_apart_and_do_not_drift() -> None:
     assert drive(Pacer(10 * MS), 5) == [0, 10 * MS, 20 * MS, 30 * MS, 40 * MS]
 
 
@@ -57,7 +58,8 @@ def test_nothing_is_made_up_after_a_pause() -> None:
     assert drive(pacer, 2, 300 * MS) == [300 * MS, 310 * MS]
 
 
-def test_a19_real_time_factor_is_simulated_over_wall_time_of_the_window() -> None:
+@pytest.mark.requirement("A-19")
+def test_real_time_factor_is_simulated_over_wall_time_of_the_window() -> None:
     factor = RealTimeFactor(1000 * MS)
     assert factor.value == 0.0
     for i in range(300):  # half speed for two seconds, then full speed
@@ -80,7 +82,8 @@ def test_period_figures() -> None:
 
 
 @pytest.mark.parametrize("rate", [5.0, 15.0, 30.0, 33.3, 100.0])
-def test_p24_frames_keep_their_mean_rate_though_it_does_not_divide_the_ticks(rate: float) -> None:
+@pytest.mark.requirement("P-24")
+def test_frames_keep_their_mean_rate_though_it_does_not_divide_the_ticks(rate: float) -> None:
     divider = RateDivider(rate)
     start = 123_450_000_000
     due = [t for t in range(start, start + 60 * 10**9, 10_000_000) if divider.due(t)]

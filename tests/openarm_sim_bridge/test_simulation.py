@@ -69,7 +69,8 @@ def bench() -> Iterator[Bench]:
 
 
 @pytest.mark.alone
-def test_a18_a19_ticks_keep_pace_with_the_wall_clock(bench: Bench) -> None:
+@pytest.mark.requirement("A-18", "A-19")
+def test_ticks_keep_pace_with_the_wall_clock(bench: Bench) -> None:
     bench.wait(lambda: len(bench.states) > 200)
     (wall_0, first), (wall_1, last) = bench.states[50], bench.states[200]
     assert last.t_ns - first.t_ns == 1_500_000_000
@@ -81,7 +82,8 @@ def test_a18_a19_ticks_keep_pace_with_the_wall_clock(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("speed", [5.0, 0.0])
-def test_a20_a_faster_world_is_still_told_at_a_hundred_hertz(speed: float) -> None:
+@pytest.mark.requirement("A-20")
+def test_a_faster_world_is_still_told_at_a_hundred_hertz(speed: float) -> None:
     bench = Bench(speed)
     bench.simulation.start()
     try:
@@ -94,7 +96,8 @@ def test_a20_a_faster_world_is_still_told_at_a_hundred_hertz(speed: float) -> No
     assert ratio > 6.0 if speed == 0.0 else ratio == pytest.approx(speed, rel=0.1)
 
 
-def test_p25_a_paused_world_stands_shows_life_and_steps(bench: Bench) -> None:
+@pytest.mark.requirement("P-25")
+def test_a_paused_world_stands_shows_life_and_steps(bench: Bench) -> None:
     bench.wait(lambda: len(bench.states) > 5)
     bench.simulation.call(lambda: bench.simulation.set_paused(True)).result(1.0)
     t_ns, n = bench.world.t_ns, len(bench.states)
@@ -191,7 +194,8 @@ def test_a_trajectory_moves_the_physical_joint(bench: Bench) -> None:
 
 
 # --- the controller alone
-def test_a23_commands_may_be_partial_permuted_and_hold_unknown_names() -> None:
+@pytest.mark.requirement("A-23")
+def test_commands_may_be_partial_permuted_and_hold_unknown_names() -> None:
     _, controller = make_controller()
     command = controller.check_command(["f1", "tail", "j1"], [0.02, 1.0, 0.3])
     assert dict(command.positions) == {"f1": 0.02, "j1": 0.3}
@@ -231,7 +235,8 @@ def test_commands_for_a_joint_that_follows_a_goal_are_told() -> None:
     np.testing.assert_allclose(world.read_joints().position, [0.6, 0.02], atol=0.01)
 
 
-def test_p23_stale_commands_hold() -> None:
+@pytest.mark.requirement("P-23")
+def test_stale_commands_hold() -> None:
     """Commands that cease leave the arm at rest soon after half a second, short of its target; a stream arrives."""
     world = World(mujoco.MjSpec.from_string(MODEL), joint_names=("j1", "f1"), home={"f1": 0.01})
     config = TrajectoryConfig(command_velocity=0.5)
@@ -255,7 +260,8 @@ def test_p23_stale_commands_hold() -> None:
     np.testing.assert_allclose([run(3.0, again=True)[-1], world.read_joints().position[1]], [0.9, 0.04], atol=0.01)
 
 
-def test_p23_a_trajectory_needs_no_stream() -> None:
+@pytest.mark.requirement("P-23")
+def test_a_trajectory_needs_no_stream() -> None:
     world, controller = make_controller()
     controller.command(controller.check_command(["j1"], [0.1]))
     arm = controller.arms["right"]

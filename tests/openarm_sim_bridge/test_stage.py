@@ -112,7 +112,8 @@ class Hand:
         return outcomes[0]
 
 
-def test_a07_p16_a_cube_is_lifted_and_put_down_by_friction_alone(stage: Stage) -> None:
+@pytest.mark.requirement("A-07", "P-16")
+def test_a_cube_is_lifted_and_put_down_by_friction_alone(stage: Stage) -> None:
     cube = {"name": "cube", "shape": "box", "size": (0.05,) * 3, "color": "red", "mass": 0.1, "position": (0.27, -0.2)}
     hand = Hand(stage, with_object(load_scene("empty"), cube))
     over, at = np.array([0.27, -0.2, 0.53]), np.array([0.27, -0.2, 0.425])
@@ -165,7 +166,8 @@ def test_an_object_in_the_robot_or_with_a_taken_name_is_refused(stage: Stage, de
     assert caught.value.code is Code.SCENE_INVALID
 
 
-def test_a73_moving_edges_equal_the_forward_kinematics(stage: Stage) -> None:
+@pytest.mark.requirement("A-73")
+def test_moving_edges_equal_the_forward_kinematics(stage: Stage) -> None:
     description = RobotDescription.load()
     edges = MovingEdges(description, stage.joint_names)
     assert len(edges.frames) == 18  # the mimicking fingers move too
@@ -217,7 +219,8 @@ def test_thirty_objects_stand_still_in_real_time(stage: Stage) -> None:
     np.testing.assert_allclose([o.T_world_object for o in world.objects()], before, atol=1e-4)
 
 
-def test_p25_a_keyframe_is_a_posture_of_both_arms(stage: Stage) -> None:
+@pytest.mark.requirement("P-25")
+def test_a_keyframe_is_a_posture_of_both_arms(stage: Stage) -> None:
     look, home = stage.posture("wrist_look"), stage.posture("home")
     assert home == stage.home
     assert look.keys() == home.keys()

@@ -22,7 +22,8 @@ PAD = '<body name="pad" pos="0 0 -0.05"><geom name="pad" type="box" size=".1 .1 
 
 
 @pytest.mark.parametrize("bodies", [BOX + PAD, PAD + BOX], ids=["pad second", "pad first"])
-def test_a69_contact_force_has_its_sign_in_both_orders_of_the_geoms(bodies: str) -> None:
+@pytest.mark.requirement("A-69")
+def test_contact_force_has_its_sign_in_both_orders_of_the_geoms(bodies: str) -> None:
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, nstep=1000)
@@ -36,7 +37,8 @@ def test_a69_contact_force_has_its_sign_in_both_orders_of_the_geoms(bodies: str)
     np.testing.assert_allclose(up, -force, atol=1e-6)
 
 
-def test_a69_the_force_is_given_in_the_frame_of_the_body() -> None:
+@pytest.mark.requirement("A-69")
+def test_the_force_is_given_in_the_frame_of_the_body() -> None:
     turned = PAD.replace('name="pad" pos', 'name="pad" euler="180 0 0" pos', 1)
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{BOX}{turned}</worldbody></mujoco>")
     data = mujoco.MjData(model)
@@ -54,7 +56,8 @@ def test_nothing_touches_nothing() -> None:
     assert not torque.any()
 
 
-def test_p26_a_wrist_feels_the_weight_beyond_it() -> None:
+@pytest.mark.requirement("P-26")
+def test_a_wrist_feels_the_weight_beyond_it() -> None:
     spec = mujoco.MjSpec.from_string(
         '<mujoco><worldbody><body name="arm"><joint axis="0 0 1" damping="1"/><geom size=".05" mass="1"/>'
         '<body name="hand" pos=".3 0 0"><geom size=".02" pos=".1 0 0" mass=".5"/></body></body></worldbody></mujoco>'
@@ -68,7 +71,8 @@ def test_p26_a_wrist_feels_the_weight_beyond_it() -> None:
     np.testing.assert_allclose(torque, [0.0, -0.1 * WEIGHT, 0.0], atol=1e-6)
 
 
-def test_a24_the_robot_has_the_sensors() -> None:
+@pytest.mark.requirement("A-24")
+def test_the_robot_has_the_sensors() -> None:
     stage = Stage(RobotDescription.load(), load_cameras(), None, PhysicsConfig())
     world = stage.world(load_scene("empty"))
     for _ in range(30):

@@ -115,7 +115,8 @@ def test_columns_are_put_in_the_order_of_the_joints() -> None:
         ),
     ],
 )
-def test_p21_bad_trajectories_are_refused_with_joint_and_value(
+@pytest.mark.requirement("P-21")
+def test_bad_trajectories_are_refused_with_joint_and_value(
     changes: dict, code: Code, result: TrajectoryResult, message: str
 ) -> None:
     with pytest.raises(TrajectoryError, match=message) as caught:
@@ -155,7 +156,8 @@ def test_the_spline_passes_its_points_with_their_velocities(q, v, a, gaps, degre
             np.testing.assert_allclose(slope, a[i], atol=1e-2)
 
 
-def test_p21_the_curve_is_of_the_degree_that_the_points_give() -> None:
+@pytest.mark.requirement("P-21")
+def test_the_curve_is_of_the_degree_that_the_points_give() -> None:
     """As joint_trajectory_controller: straight, cubic, quintic; here from rest to rest, at a quarter of the time."""
     t, q, rest = np.array([0.0, 1.0]), np.array([[0.0], [1.0]]), np.zeros((2, 1))
     for derivatives, expected in (((), 0.25), ((rest,), 0.15625), ((rest, rest), 0.103515625)):

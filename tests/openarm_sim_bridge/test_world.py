@@ -51,7 +51,8 @@ def make(extra: str = BALL.format(z=0.05), objects: tuple[TrackedObject, ...] = 
     return World(spec(extra), joint_names=JOINTS, home=HOME, objects=objects, **kwargs)
 
 
-def test_a22_joint_index_uses_qposadr_with_free_body_first() -> None:
+@pytest.mark.requirement("A-22")
+def test_joint_index_uses_qposadr_with_free_body_first() -> None:
     world = make()
     assert world.model.joint("shoulder").qposadr[0] == 7
     state = world.read_joints()
@@ -61,7 +62,8 @@ def test_a22_joint_index_uses_qposadr_with_free_body_first() -> None:
 
 
 @pytest.mark.parametrize(("timestep", "steps"), [(0.002, 5), (0.001, 10), (0.005, 2), (0.01, 1)])
-def test_a19_a_tick_is_ten_milliseconds_whatever_the_time_step(timestep: float, steps: int) -> None:
+@pytest.mark.requirement("A-19")
+def test_a_tick_is_ten_milliseconds_whatever_the_time_step(timestep: float, steps: int) -> None:
     world = World(spec(timestep=timestep), joint_names=JOINTS, home=HOME)
     assert world.steps_per_tick == steps
     for _ in range(7):
@@ -70,13 +72,15 @@ def test_a19_a_tick_is_ten_milliseconds_whatever_the_time_step(timestep: float, 
     assert world.data.time == pytest.approx(0.07)
 
 
-def test_a19_a_time_step_that_does_not_divide_the_tick_is_refused() -> None:
+@pytest.mark.requirement("A-19")
+def test_a_time_step_that_does_not_divide_the_tick_is_refused() -> None:
     with pytest.raises(OpenArmError, match="10 ms is not a whole number of physics steps of 3 ms") as caught:
         World(spec(timestep=0.003), joint_names=JOINTS, home=HOME)
     assert caught.value.code is Code.CONFIG_INVALID
 
 
-def test_a21_targets_move_joints_by_force_and_never_write_qpos() -> None:
+@pytest.mark.requirement("A-21")
+def test_targets_move_joints_by_force_and_never_write_qpos() -> None:
     world = make()
     before = world.data.qpos.copy()
     world.set_targets(np.array([0.5, 0.2, 0.0]))
@@ -89,7 +93,8 @@ def test_a21_targets_move_joints_by_force_and_never_write_qpos() -> None:
     np.testing.assert_allclose(world.read_joints().position, [0.5, 0.2, 0.0], atol=gravity_sag)
 
 
-def test_a21_p16_qpos_is_written_in_one_place_of_the_package_and_nothing_is_welded() -> None:
+@pytest.mark.requirement("A-21", "P-16")
+def test_qpos_is_written_in_one_place_of_the_package_and_nothing_is_welded() -> None:
     writers: list[str] = []
     for path in sorted(Path(openarm_sim_bridge.__file__).parent.rglob("*.py")):
         source = path.read_text(encoding="utf-8")
@@ -169,7 +174,8 @@ def test_reset_puts_everything_back_and_time_goes_on() -> None:
     np.testing.assert_allclose(world.read_joints().position, [-0.3, 0.8, 0.02], atol=0.05)
 
 
-def test_p25_a_reset_may_start_elsewhere_and_the_next_one_is_at_home_again() -> None:
+@pytest.mark.requirement("P-25")
+def test_a_reset_may_start_elsewhere_and_the_next_one_is_at_home_again() -> None:
     world = make()
     elsewhere = se3.make(None, (-0.4, 0.3, 0.05))
     world.reset({"finger": 0.03, "elbow": -0.2}, {"ball": elsewhere})
@@ -182,7 +188,8 @@ def test_p25_a_reset_may_start_elsewhere_and_the_next_one_is_at_home_again() -> 
     np.testing.assert_allclose(world.objects()[0].T_world_object[:3, 3], [0.5, 0.0, 0.05])
 
 
-def test_p25_a_start_that_overlaps_leaves_the_world_as_it_was() -> None:
+@pytest.mark.requirement("P-25")
+def test_a_start_that_overlaps_leaves_the_world_as_it_was() -> None:
     world = make()
     for _ in range(3):
         world.step_tick()

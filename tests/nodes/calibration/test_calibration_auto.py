@@ -103,9 +103,8 @@ class Bench:
 
 
 @pytest.mark.parametrize(("setup", "told"), [("in_hand", True), ("to_hand", False)])
-def test_a33_a34_a40_a45_calibrates_by_itself_and_stores(
-    ros, posed_robot, tmp_path: Path, setup: str, told: bool
-) -> None:
+@pytest.mark.requirement("A-33", "A-34", "A-40", "A-45")
+def test_calibrates_by_itself_and_stores(ros, posed_robot, tmp_path: Path, setup: str, told: bool) -> None:
     """From a board in view, or from where a ruler says it is; refused poses are passed over; the board is announced."""
     bench = Bench(ros, posed_robot, tmp_path, setup, told=told)
     bench.planner.refuse = lambda k: "IN_COLLISION" if k == 1 else ""

@@ -52,9 +52,8 @@ def start(ros, store: CalibrationStore, camera: str = "wrist", **more) -> None:
 
 
 @pytest.mark.parametrize(("camera", "setup"), [("wrist", "in_hand"), ("overhead", "to_hand")])
-def test_a33_a34_a45_from_images_to_a_stored_mount(
-    ros, posed_robot, store, tmp_path: Path, camera: str, setup: str
-) -> None:
+@pytest.mark.requirement("A-33", "A-34", "A-45")
+def test_from_images_to_a_stored_mount(ros, posed_robot, store, tmp_path: Path, camera: str, setup: str) -> None:
     """Ten samples by service, solved and stored: the true mount to 0.3 mm and 0.03°; saved and loaded the same."""
     known = make_session(setup, 10, px=1e-9)
     robot = posed_robot(camera, known)
@@ -87,7 +86,8 @@ def test_a33_a34_a45_from_images_to_a_stored_mount(
     assert again.success
 
 
-def test_a44_a41_refusals_come_with_a_code_and_the_node_goes_on(ros, posed_robot, store) -> None:
+@pytest.mark.requirement("A-44", "A-41")
+def test_refusals_come_with_a_code_and_the_node_goes_on(ros, posed_robot, store) -> None:
     """Late stamps, a moving robot, no board, no image, too few samples, wrong names."""
     robot = posed_robot("wrist", make_session("in_hand", 3, px=1e-9))
     robot.pose(0)

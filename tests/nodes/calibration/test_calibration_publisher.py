@@ -34,7 +34,8 @@ def edges(ros) -> dict[tuple[str, str], np.ndarray]:
     return {(e.header.frame_id, e.child_frame_id): transform_to_matrix(e.transform) for e in got[0].transforms}
 
 
-def test_a73_b34_mounts_and_optical_frames_of_all_cameras(ros) -> None:
+@pytest.mark.requirement("A-73", "B-34")
+def test_mounts_and_optical_frames_of_all_cameras(ros) -> None:
     """Parent → link is the nominal mount, link → optical the turn of the axes; a late listener gets them (latched)."""
     ros.add(PublisherNode())
     published = edges(ros)
@@ -51,7 +52,8 @@ def test_a73_b34_mounts_and_optical_frames_of_all_cameras(ros) -> None:
         np.testing.assert_allclose(turn[:3, 0], (0.0, -1.0, 0.0), atol=1e-9)
 
 
-def test_a34_b14_the_overhead_camera_looks_at_the_region_and_the_wrist_camera_moves_with_the_arm(ros) -> None:
+@pytest.mark.requirement("A-34", "B-14")
+def test_the_overhead_camera_looks_at_the_region_and_the_wrist_camera_moves_with_the_arm(ros) -> None:
     """Through the tree: the object region projects into the overhead image; joint 1 moves the wrist camera alone."""
     ros.add(PublisherNode())
     description = RobotDescription.load()
@@ -85,7 +87,8 @@ def stored(x: float, seed: int | None, parent: str = "openarm_right_link7") -> S
     return StoredCalibration.of_mount("wrist", parent, T, mount_seed=seed)
 
 
-def test_a45_stored_calibrations_are_latched_and_a_change_arrives_without_a_restart(ros) -> None:
+@pytest.mark.requirement("A-45")
+def test_stored_calibrations_are_latched_and_a_change_arrives_without_a_restart(ros) -> None:
     """Stored, replaced, damaged (the last good one stays), rolled back."""
     store = CalibrationStore(default_folder())
     store.save(stored(0.10, 3))

@@ -35,7 +35,8 @@ def test_the_client_picks_from_plain_python(bench):
         results[1].raise_for_code()
 
 
-def test_p01_p02_the_client_picks_and_places_in_two_requests(bench):
+@pytest.mark.requirement("P-01", "P-02")
+def test_the_client_picks_and_places_in_two_requests(bench):
     results = []
 
     def script() -> None:
@@ -56,7 +57,8 @@ def test_p01_p02_the_client_picks_and_places_in_two_requests(bench):
     assert bench.world.objects["red"][:2] == pytest.approx((0.3, -0.3), abs=0.005)
 
 
-def test_p03_the_client_means_an_object_by_its_position_and_leaves_others(bench):
+@pytest.mark.requirement("P-03")
+def test_the_client_means_an_object_by_its_position_and_leaves_others(bench):
     results = []
 
     def script() -> None:

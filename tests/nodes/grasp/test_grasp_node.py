@@ -36,7 +36,8 @@ def test_a_grasp_by_service_places_the_object_and_tells_its_states(bench):
     assert answer.duration == pytest.approx(stamps[-1] - stamps[0], abs=0.2)
 
 
-def test_b51_b53_b71_order_of_hand_and_arm(bench):
+@pytest.mark.requirement("B-51", "B-53", "B-71")
+def test_order_of_hand_and_arm(bench):
     assert bench.ask().success
     log = [entry for entry in bench.world.log if not entry.startswith("plan")]
     assert sorted(log[:2]) == ["execute", "gripper 0.044"]  # at the same time
@@ -52,7 +53,8 @@ def test_b51_b53_b71_order_of_hand_and_arm(bench):
     ]
 
 
-def test_p01_the_action_gives_feedback_and_the_same_answer(bench):
+@pytest.mark.requirement("P-01")
+def test_the_action_gives_feedback_and_the_same_answer(bench):
     heard: list[str] = []
     goal = Pick.Goal(label="blue", has_place_position=True)
     goal.place_position.x, goal.place_position.y = 0.3, 0.3
@@ -67,7 +69,8 @@ def test_p01_the_action_gives_feedback_and_the_same_answer(bench):
     assert {"DETECT", "PLAN", "LIFT", "PLACE"} <= set(heard)
 
 
-def test_a71_an_empty_hand_is_tried_again_and_then_named(bench):
+@pytest.mark.requirement("A-71")
+def test_an_empty_hand_is_tried_again_and_then_named(bench):
     bench.world.slips = 99
     answer = bench.ask()
     assert (answer.code, answer.attempts) == ("GRASP_MISSED", 3)
@@ -76,7 +79,8 @@ def test_a71_an_empty_hand_is_tried_again_and_then_named(bench):
     assert bench.world.log[-1] == "move home"
 
 
-def test_a70_a_slip_is_made_good_by_the_next_attempt(bench):
+@pytest.mark.requirement("A-70")
+def test_a_slip_is_made_good_by_the_next_attempt(bench):
     bench.world.slips = 1
     answer = bench.ask()
     assert answer.success, answer.message
@@ -139,7 +143,8 @@ def test_a_dry_run_moves_nothing(bench):
     assert len(bench.markers[-1].markers) > 20
 
 
-def test_p01_p21_a_cancel_stops_the_arm_and_keeps_the_hand_closed(bench):
+@pytest.mark.requirement("P-01", "P-21")
+def test_a_cancel_stops_the_arm_and_keeps_the_hand_closed(bench):
     never = Future()
     bench.world.during = lambda what: never if bench.world.held else None
     handle, result = bench.ros.send_goal(bench.action, Pick.Goal(label="red"))
@@ -184,7 +189,8 @@ def test_without_motion_or_detector_the_answer_names_what_is_missing(benches):
     assert "joint_states" not in answer.message
 
 
-def test_b69_nothing_is_subscribed_while_idle_and_detections_only_while_looking(bench):
+@pytest.mark.requirement("B-69")
+def test_nothing_is_subscribed_while_idle_and_detections_only_while_looking(bench):
     probe = bench.ros.node
     assert probe.count_subscribers("/joint_states") == 0
     assert probe.count_subscribers("/detections_3d") == 0
@@ -200,7 +206,8 @@ def test_b69_nothing_is_subscribed_while_idle_and_detections_only_while_looking(
     assert probe.count_subscribers("/detections_3d") == 0
 
 
-def test_b48_a_pregrasp_within_the_path_tolerance_is_refused_at_start(ros):
+@pytest.mark.requirement("B-48")
+def test_a_pregrasp_within_the_path_tolerance_is_refused_at_start(ros):
     wrong = [Parameter("approach.pregrasp_distance", value=0.05), Parameter("approach.path_tolerance", value=0.04)]
     with pytest.raises(OpenArmError, match="at least twice path_tolerance") as error:
         GraspNode(parameter_overrides=wrong)

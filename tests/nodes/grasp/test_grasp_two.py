@@ -40,7 +40,8 @@ def at_once(bench) -> tuple[object, Future]:
     return handle, result
 
 
-def test_a65_two_objects_are_picked_at_once_each_by_its_arm_and_each_tells_its_states(bench) -> None:
+@pytest.mark.requirement("A-65")
+def test_two_objects_are_picked_at_once_each_by_its_arm_and_each_tells_its_states(bench) -> None:
     heard: list[PickTwo.Feedback] = []
     wish = goal("red", "blue")
     wish.requests[1].has_place_position = True
@@ -99,7 +100,8 @@ def test_one_request_at_a_time_whatever_its_kind(bench) -> None:
     assert bench.ask("red").success
 
 
-def test_p01_p21_a_cancel_stops_both_arms_and_each_hand_keeps_its_object_until_it_is_placed(bench) -> None:
+@pytest.mark.requirement("P-01", "P-21")
+def test_a_cancel_stops_both_arms_and_each_hand_keeps_its_object_until_it_is_placed(bench) -> None:
     handle, result = at_once(bench)
     assert bench.ros.result(handle.cancel_goal_async()).goals_canceling
     end = bench.ros.result(result, 5.0)
@@ -166,7 +168,8 @@ def test_of_two_that_one_arm_is_asked_for_one_waits_for_the_other(bench) -> None
     assert "the same arm is asked for: one after the other" in result.message.replace(")", "")
 
 
-def test_p02_one_of_two_that_is_not_in_view_is_refused_and_the_other_placed(bench) -> None:
+@pytest.mark.requirement("P-02")
+def test_one_of_two_that_is_not_in_view_is_refused_and_the_other_placed(bench) -> None:
     result = ask(bench, "mug", "blue")
     assert (result.success, result.outcome, result.code) == (False, "PARTIAL", "UNKNOWN_OBJECT")
     assert [answer.outcome for answer in result.answers] == ["REFUSED", "SUCCESS"]
@@ -181,7 +184,8 @@ def test_what_is_no_pair_is_refused_before_anything_moves(bench) -> None:
     assert bench.world.log == []
 
 
-def test_a65_the_client_picks_two_from_plain_python(bench) -> None:
+@pytest.mark.requirement("A-65")
+def test_the_client_picks_two_from_plain_python(bench) -> None:
     heard: list[tuple[str, str]] = []
     results: list[PairResult] = []
 

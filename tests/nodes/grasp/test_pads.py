@@ -11,7 +11,8 @@ from openarm_common.ros.node import QOS_SENSOR, BaseNode
 from openarm_grasp.ros.pad_listener import Pads
 
 
-def test_a69_both_pads_of_a_hand_are_heard_while_listening_and_a_silent_one_says_nothing(ros) -> None:
+@pytest.mark.requirement("A-69")
+def test_both_pads_of_a_hand_are_heard_while_listening_and_a_silent_one_says_nothing(ros) -> None:
     pads = Pads(ros.add(BaseNode("listener", Config)))
     topics = [f"/openarm_right_{finger}_finger/contact_wrench" for finger in ("left", "right")]
     left, right = (ros.node.create_publisher(WrenchStamped, topic, QOS_SENSOR) for topic in topics)

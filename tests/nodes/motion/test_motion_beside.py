@@ -52,7 +52,8 @@ def leaving(bench) -> tuple[object, object]:
     return slow, right.trajectory
 
 
-def test_n12_an_arm_rests_until_the_one_under_way_leaves_room(bench) -> None:
+@pytest.mark.requirement("N-12")
+def test_an_arm_rests_until_the_one_under_way_leaves_room(bench) -> None:
     slow, quick = leaving(bench)
     refused = bench.run(bench.execute_client, execute("right", quick, 0.0))
     assert refused.code == "IN_COLLISION"
@@ -69,7 +70,8 @@ def test_n12_an_arm_rests_until_the_one_under_way_leaves_room(bench) -> None:
     np.testing.assert_allclose(tip, MIDDLE, atol=2e-3)
 
 
-def test_n12_no_rest_is_long_enough_for_an_arm_that_ends_in_the_way(bench) -> None:
+@pytest.mark.requirement("N-12")
+def test_no_rest_is_long_enough_for_an_arm_that_ends_in_the_way(bench) -> None:
     both = [bench.run(bench.move_client, to(bench, side, MIDDLE, plan_only=True)) for side in ("left", "right")]
     _, left = bench.start(bench.execute_client, execute("left", both[0].trajectory))
     right = bench.run(bench.execute_client, execute("right", both[1].trajectory))
@@ -79,7 +81,8 @@ def test_n12_no_rest_is_long_enough_for_an_arm_that_ends_in_the_way(bench) -> No
     assert bench.ros.result(left).result.success
 
 
-def test_n12_hands_are_kept_apart_as_if_they_were_open(bench) -> None:
+@pytest.mark.requirement("N-12")
+def test_hands_are_kept_apart_as_if_they_were_open(bench) -> None:
     """The closed hands would stand 41 mm apart; one that opens there would come within 11 mm of the other."""
     assert bench.run(bench.move_client, to(bench, "left", (0.28, 0.08, 0.60))).success
     there = bench.run(bench.move_client, to(bench, "right", (0.28, -0.08, 0.68), plan_only=True))
@@ -89,7 +92,8 @@ def test_n12_hands_are_kept_apart_as_if_they_were_open(bench) -> None:
     assert "finger" in refused.message
 
 
-def test_n12_an_arm_holds_when_the_other_stops_in_its_way(bench) -> None:
+@pytest.mark.requirement("N-12")
+def test_an_arm_holds_when_the_other_stops_in_its_way(bench) -> None:
     slow, quick = leaving(bench)
     handle, left = bench.start(bench.execute_client, execute("left", slow))
     _, right = bench.start(bench.execute_client, execute("right", quick))
@@ -122,7 +126,8 @@ def approach(arm: str, y: float) -> PlanApproach.Goal:
     )
 
 
-def test_a68_an_approach_is_planned_beside_where_the_other_arm_will_end(bench) -> None:
+@pytest.mark.requirement("A-68")
+def test_an_approach_is_planned_beside_where_the_other_arm_will_end(bench) -> None:
     slow, _ = leaving(bench)
     blocked = bench.run(bench.plan_client, approach("right", -0.02))
     assert (blocked.success, blocked.failure.stage) == (False, "goal"), blocked.message
@@ -138,7 +143,8 @@ def test_a68_an_approach_is_planned_beside_where_the_other_arm_will_end(bench) -
     assert right.result().result.success, right.result().result.message
 
 
-def test_n12_two_grasps_are_carried_out_at_once(bench) -> None:
+@pytest.mark.requirement("N-12")
+def test_two_grasps_are_carried_out_at_once(bench) -> None:
     """Each arm is asked for itself: free path, approach and retreat, the next as soon as the last has ended."""
     sides = {"left": 0.10, "right": -0.10}
     plans = {side: bench.run(bench.plan_client, approach(side, y)) for side, y in sides.items()}
@@ -181,7 +187,8 @@ def holding(bench):
     return bench
 
 
-def test_p04_what_is_held_stays_so_until_a_request_says_otherwise(holding) -> None:
+@pytest.mark.requirement("P-04")
+def test_what_is_held_stays_so_until_a_request_says_otherwise(holding) -> None:
     bench = holding
     shelf = CollisionBox(id="shelf", pose=matrix_to_pose(se3.make(None, (0.27, -0.24, 0.465))))
     shelf.size.x, shelf.size.y, shelf.size.z = 0.30, 0.30, 0.01
@@ -209,7 +216,8 @@ def test_p04_what_is_held_stays_so_until_a_request_says_otherwise(holding) -> No
     bench.ros.spin_until(lambda: bench.held() == [], 5.0, "an empty hand")
 
 
-def test_p04_motions_of_both_arms_keep_what_is_held(holding) -> None:
+@pytest.mark.requirement("P-04")
+def test_motions_of_both_arms_keep_what_is_held(holding) -> None:
     bench = holding
     targets = [ArmTarget(arm=side, kind=ArmTarget.NAMED, named="home") for side in ("left", "right")]
     assert bench.run(bench.both_client, MoveArms.Goal(targets=targets, velocity_scale=1.0)).success

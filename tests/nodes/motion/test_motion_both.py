@@ -39,7 +39,8 @@ def watched(bench, goal: MoveArms.Goal) -> tuple[MoveArms.Result, float]:
 
 
 @pytest.mark.parametrize("strategy", [MoveArms.Goal.TOGETHER, MoveArms.Goal.STAGGERED])
-def test_n12_arms_take_each_others_place_at_once(bench, strategy: int) -> None:
+@pytest.mark.requirement("N-12")
+def test_arms_take_each_others_place_at_once(bench, strategy: int) -> None:
     result, _ = watched(bench, both_goal(over_the_middle(bench, "left"), home("right"), strategy=strategy))
     assert result.success, result.message
     result, gap = watched(bench, both_goal(over_the_middle(bench, "right"), home("left"), strategy=strategy))
@@ -54,7 +55,8 @@ def test_n12_arms_take_each_others_place_at_once(bench, strategy: int) -> None:
     np.testing.assert_allclose(tip, [0.30, 0.0, 0.62], atol=2e-3)
 
 
-def test_a74_an_arm_in_the_way_yields(bench) -> None:
+@pytest.mark.requirement("A-74")
+def test_an_arm_in_the_way_yields(bench) -> None:
     result, _ = watched(bench, both_goal(over_the_middle(bench, "left"), home("right")))
     assert result.success, result.message
     blocked = bench.run(

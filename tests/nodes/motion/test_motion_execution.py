@@ -11,6 +11,7 @@ import sys
 import time
 
 import numpy as np
+import pytest
 from control_msgs.action import FollowJointTrajectory
 from openarm_interfaces.action import ExecuteTrajectory
 
@@ -70,7 +71,8 @@ def test_the_controllers_reason_is_passed_on(bench) -> None:
     assert "rejected" in result.message
 
 
-def test_a71_a_controller_that_says_success_is_not_evidence(bench) -> None:
+@pytest.mark.requirement("A-71")
+def test_a_controller_that_says_success_is_not_evidence(bench) -> None:
     bench.robot.stuck = {"openarm_right_joint2"}
     result = bench.run(bench.move_client, bench.named())
     assert (result.success, result.code) == (False, "EXECUTION_FAILED")
@@ -78,7 +80,8 @@ def test_a71_a_controller_that_says_success_is_not_evidence(bench) -> None:
     assert "rad from its goal" in result.message
 
 
-def test_b40_the_tool_must_end_within_its_tolerance(bench) -> None:
+@pytest.mark.requirement("B-40")
+def test_the_tool_must_end_within_its_tolerance(bench) -> None:
     arm, goal = bench.node._arms["right"], bench.description.group_state("right_arm", "official_home")
     q = np.array([goal[name] for name in arm.names])
     ways = [0.019 * np.array(signs) for signs in itertools.product((-1, 1), repeat=7)]  # within each joint's tolerance

@@ -23,7 +23,8 @@ from openarm_motion.ros.node import table_boxes
 
 
 # --- inverse kinematics
-def test_a66_compute_ik_in_the_table_frame(bench) -> None:
+@pytest.mark.requirement("A-66")
+def test_compute_ik_in_the_table_frame(bench) -> None:
     target = se3.make(bench.DOWN, (0.4, 0.2, 0.3))
     request = ComputeIK.Request(arm="left", pose=bench.stamped(target, "table"), free_orientation=True)
     answer = bench.ros.call(bench.ik_client, request)
@@ -57,7 +58,8 @@ def test_compute_ik_answers_what_is_wrong(bench) -> None:
 
 
 # --- moves
-def test_a25_a_move_is_planned_sent_as_joint_targets_and_verified(bench) -> None:
+@pytest.mark.requirement("A-25")
+def test_a_move_is_planned_sent_as_joint_targets_and_verified(bench) -> None:
     feedback: list[MoveArm.Feedback] = []
     arrived = lambda: feedback and feedback[-1].progress == 1.0  # noqa: E731
     result = bench.ros.hear_all(bench.move_client, bench.named(), feedback, arrived)
@@ -210,14 +212,16 @@ def test_an_approach_that_fails_carries_all_refusals(bench) -> None:
     assert bench.run(bench.plan_client, goal).code == "INVALID_ARGUMENT"
 
 
-def test_b49_table_comes_from_the_scene_description() -> None:
+@pytest.mark.requirement("B-49")
+def test_table_comes_from_the_scene_description() -> None:
     (table,) = table_boxes("empty")
     np.testing.assert_allclose(table.T[:3, 3], [0.46, 0.0, 0.38])
     np.testing.assert_allclose(table.size, [0.70, 1.20, 0.04])
     assert table_boxes("") == ()
 
 
-def test_b50_obstacles_travel_with_the_request(bench) -> None:
+@pytest.mark.requirement("B-50")
+def test_obstacles_travel_with_the_request(bench) -> None:
     # no planning scene that could lack them: the same goal is refused with the box and planned without it
     arm = bench.node._arms["right"]
     goal = bench.named("right", "official_home", plan_only=True)

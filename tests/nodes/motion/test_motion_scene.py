@@ -35,7 +35,8 @@ def goal_tip(bench) -> np.ndarray:
     return bench.node._arms["right"].kinematics.fk([0, 0, 0, 1.5708, 0, 0, 0])[:3, 3]
 
 
-def test_b50_bodies_are_in_force_when_the_answer_comes(bench) -> None:
+@pytest.mark.requirement("B-50")
+def test_bodies_are_in_force_when_the_answer_comes(bench) -> None:
     shown: list[MarkerArray] = []
     bench.ros.node.create_subscription(MarkerArray, "/motion/scene", shown.append, QOS_LATCHED)
     first = bench.ros.call(bench.get_client, GetScene.Request())
@@ -77,7 +78,8 @@ def test_every_shape_is_taken_told_again_and_kept_clear_of(bench) -> None:
         assert (result.code, result.failure.second) == ("IN_COLLISION", message.id), result.message
 
 
-def test_b50_what_was_meant_for_another_version_is_refused(bench) -> None:
+@pytest.mark.requirement("B-50")
+def test_what_was_meant_for_another_version_is_refused(bench) -> None:
     plan = bench.run(bench.move_client, bench.named(plan_only=True, expected_scene_version=1))
     assert (plan.success, plan.scene_version) == (True, 1)
     far = body(bench, "far", (0.9, 0.9, 0.9))
@@ -125,7 +127,8 @@ def test_bad_bodies_change_nothing_and_say_why(bench) -> None:
     assert [o.id for o in bench.ros.call(bench.get_client, GetScene.Request()).objects] == ["table"]
 
 
-def test_p20_a_plan_is_shown_and_carried_out_when_a_human_agrees(bench) -> None:
+@pytest.mark.requirement("P-20")
+def test_a_plan_is_shown_and_carried_out_when_a_human_agrees(bench) -> None:
     shown: list[MarkerArray] = []
     bench.ros.node.create_subscription(MarkerArray, "/motion/preview", shown.append, QOS_LATCHED)
     before = bench.q("right")
@@ -167,7 +170,8 @@ def parameters(**values) -> dict:
     return {"parameter_overrides": [Parameter(f"map.{name}", value=value) for name, value in values.items()]}
 
 
-def test_a59_the_map_is_in_the_way_unless_something_known_explains_it(make_bench, writer) -> None:
+@pytest.mark.requirement("A-59")
+def test_the_map_is_in_the_way_unless_something_known_explains_it(make_bench, writer) -> None:
     bench = make_bench()
     cell = goal_tip(bench)
     write(writer, [cell])
