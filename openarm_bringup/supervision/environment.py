@@ -9,7 +9,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -108,11 +107,9 @@ def node_arguments(graph: Graph, name: str, run_dir: Path) -> list[str]:
     # Everything a node says goes to its log through the supervisor; rcl's own log files would only repeat it.
     ros = ["--disable-external-lib-logs", "-r", f"__node:={name}"]
     ros += [part for old, new in spec.remaps.items() for part in ("-r", f"{old}:={new}")]
-    if spec.params:
+    if params := graph.parameters(name):
         path = run_dir / "params" / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
-        # ROS parameter files know no null; a parameter that is left out takes its default.
-        params: dict[str, Any] = {key: value for key, value in spec.params.items() if value is not None}
         path.write_text(yaml.safe_dump({name: {"ros__parameters": params}}, sort_keys=False), encoding="utf-8")
         ros += ["--params-file", str(path)]
     return [*argv, "--ros-args", *ros]

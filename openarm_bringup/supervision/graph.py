@@ -16,7 +16,7 @@ import yaml
 from pydantic import Field, model_validator
 
 from openarm_bringup.supervision.params import flatten, read_params, substitute
-from openarm_common.config import Config, validate
+from openarm_common.config import Config, ConfigT, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 
@@ -25,6 +25,8 @@ ConditionKind = Literal["topic", "message", "service", "action"]
 
 #: Values of the graph that parameters may refer to.
 VARIABLES = ("scene", "seed", "mount_seed")
+#: Parameters that rclpy declares for every node.
+_OF_ROS = ("use_sim_time", "qos_overrides.")
 
 
 class Ready(Config):
@@ -137,6 +139,41 @@ class Graph(Config):
                 Code.INVALID_ARGUMENT, f"graph {self.name} has no node {name!r}; its nodes are {', '.join(self.nodes)}"
             )
         return self.nodes[name]
+
+    def parameters(self, name: str) -> dict[str, Any]:
+        """Return the ROS parameters of a node by dotted name: parameter file, inline parameters, then `--set`.
+
+        This is the one source of a node's parameters: the supervisor writes them to the file that the node is started
+        with. Those that are null are left out and take the node's default.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for an unknown node.
+        """
+        return {key: value for key, value in self.node(name).params.items() if value is not None}
+
+    def config(self, name: str, model: type[ConfigT]) -> ConfigT:
+        """Return the configuration that a node of this graph runs with, for code that runs its core in process.
+
+        Args:
+            name: The node.
+            model: Its configuration model, such as `openarm_motion.config.MotionConfig` for `motion`.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for an unknown node; CONFIG_INVALID, naming each wrong parameter.
+
+        Example:
+            >>> load_graph("sim", sets=["motion.planning.seed=7"]).config("motion", MotionConfig)  # doctest: +SKIP
+        """
+        nested: dict[str, Any] = {}
+        for key, value in self.parameters(name).items():
+            if key.startswith(_OF_ROS):
+                continue
+            *groups, last = key.split(".")
+            place = nested
+            for group in groups:
+                place = place.setdefault(group, {})
+            place[last] = value
+        return validate(model, nested, f"parameters of {name} in graph {self.name}")
 
 
 class _UniqueKeys(yaml.SafeLoader):

@@ -9,6 +9,7 @@ import pytest
 
 from openarm_bringup.supervision.draw import mermaid, text
 from openarm_bringup.supervision.graph import load_graph
+from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 
 BASE = """
@@ -54,6 +55,39 @@ def test_overrides_come_before_substitution_and_set_comes_last(tmp_path: Path) -
     assert graph.node("bridge").params["seed"] == 8
     assert graph.node("bridge").params["label"] == [1, 2]
     assert graph.domain is None
+
+
+class Depth(Config):
+    x: int = 0
+    y: float = 0.5
+
+
+class Nested(Config):
+    deep: Depth = Depth()
+
+
+class Bridge(Config):
+    scene: str = ""
+    seed: int = 0
+    label: tuple[str, ...] | str = ""
+    nested: Nested = Nested()
+    rate: float = 30.0
+
+
+def test_the_configuration_of_a_node_is_that_of_its_parameters(tmp_path: Path) -> None:
+    sets = ["bridge.nested.deep.y=2", "bridge.use_sim_time=true", "bridge.rate=null"]
+    graph = load_graph(write(tmp_path, BASE), overrides={"scene": "random"}, sets=sets)
+    assert graph.config("bridge", Bridge) == Bridge(
+        scene="random", seed=3, label="run 3", nested=Nested(deep=Depth(x=1, y=2.0))
+    )
+    assert graph.config("arm", Bridge) == Bridge()
+    assert "rate" not in graph.parameters("bridge")
+
+
+def test_a_wrong_parameter_of_a_node_is_refused_by_its_name(tmp_path: Path) -> None:
+    graph = load_graph(write(tmp_path, BASE), sets=["bridge.nested.deep.z=2"])
+    with pytest.raises(OpenArmError, match=r"parameters of bridge in graph toy:nested\.deep\.z: unknown key"):
+        graph.config("bridge", Bridge)
 
 
 def test_levels_follow_the_needs(tmp_path: Path) -> None:
