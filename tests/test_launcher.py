@@ -155,14 +155,17 @@ def test_a_changed_message_rebuilds_its_package_only_and_a_second_clone_builds_n
 
 def test_kernels_that_a_pull_has_changed_are_compiled_before_anything_runs(machine: Machine) -> None:
     """Else every node would compile at its first use, and miss its time limits."""
-    kernels = machine.root / "openarm_motion" / "kernels.py"
-    kernels.parent.mkdir()
+    kernels = machine.root / "openarm_motion" / "planning" / "kernels.py"
+    compiled = kernels.parent / "__pycache__" / "kernels.search-1.nbc"
+    compiled.parent.mkdir(parents=True)
     kernels.write_text("from numba import njit\n")
     machine.run()
+    compiled.touch()
     assert machine.run("x").stderr == ""
     kernels.write_text("from numba import njit, prange\n")
     answer = machine.run("x")
     assert "numba kernels have changed" in answer.stderr
+    assert not compiled.exists()
     assert answer.stdout.startswith("args: x\n")
     assert machine.run("x").stderr == ""
 

@@ -14,8 +14,12 @@ from pathlib import Path
 
 import pytest
 
+from openarm_common.errors import Code
+from openarm_sim_bridge.faults.faults import FAULTS
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = sorted(path.name for path in ROOT.glob("openarm_*") if (path / "__init__.py").exists())
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(ROOT.glob("docs/*.md"))]
 #: Message packages that a wheel of ROS 2 brings, and those that `interfaces/` brings.
 FROM_WHEELS = {
     "action_msgs",
@@ -91,8 +95,32 @@ def test_the_viewer_example_steps_a_thousand_times_without_a_display() -> None:
 
 
 @pytest.mark.requirement("B-02")
-def test_the_readme_states_who_offers_what() -> None:
+def test_the_interfaces_of_all_parts_are_documented() -> None:
     """tests/graph/test_contract.py holds these tables against the running graph."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
     for part in ("/overhead/color/image_raw", "/detections_3d", "/tf_static", "/motion/execute", "gripper_cmd"):
-        assert part in readme, part
+        assert part in text, part
+
+
+def test_the_table_of_codes_and_that_of_faults_are_complete() -> None:
+    text = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
+    codes = text[text.index("## Result codes") : text.index("## Fault injection")]
+    faults = text[text.index("## Fault injection") : text.index("## Frames")]
+    assert re.findall(r"^\| `([A-Z_]+)` \|", codes, re.MULTILINE) == list(Code)
+    rows = re.findall(r"^\| `([a-z_]+)` \| ([a-z_, ]+) \|", faults, re.MULTILINE)
+    assert {name: fields.split(", ") for name, fields in rows} == {
+        name: list(model.model_fields) for name, model in FAULTS.items()
+    }
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\((?!https?://)([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
+    assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+def test_the_readme_is_short_and_links_every_guide() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 200
+    guides = {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} - {"docs/lockstep.md"}
+    assert guides <= set(re.findall(r"\]\(([^)#]+)", text))

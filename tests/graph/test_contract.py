@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of the README against the running graph: what they name exists, with that type and QoS, and no more."""
+"""docs/interfaces.md against the running graph: what it states exists with that type and QoS, and nothing else."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from openarm_common.domain import reserve_domain
 
 ROOT = Path(__file__).resolve().parents[2]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+INTERFACES = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
 ROW = re.compile(r"^\| `(/[^`]+)` \| `([^`]+/(?:msg|srv|action)/[^`]+)` \|(.*)\|$", re.MULTILINE)
+PARAMETER_ROW = re.compile(r"^\| (`[a-z_]+\.[^|]+) \| [^|]+ \| [^|]+ \|$", re.MULTILINE)
 QOS = {
     "reliable": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
     "latched": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
     "best effort": (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
 }
-#: What rclpy and actions add by themselves, what is listened to, and what is beside a camera that is only looked at.
-UNTOLD = re.compile(
+#: What rclpy and actions add by themselves, subscriptions of the bridge, and the camera info of the spectator camera.
+IMPLICIT = re.compile(
     r"/_action/|^/rosout$|^/parameter_events$|^/joint_commands$|/joint_trajectory$|^/cloud_in$"
     r"|^/spectator/color/camera_info$"
 )
@@ -42,7 +43,7 @@ pytestmark = pytest.mark.graph
 
 @pytest.fixture(scope="module")
 def graph() -> Iterator[Node]:
-    """A probe beside the running graph `sim`."""
+    """A probe in the domain of the running graph `sim`."""
     domain = reserve_domain()
     command = [sys.executable, "-m", "openarm_bringup.cli", "up", "sim", "--domain", str(domain)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
@@ -66,16 +67,16 @@ def graph() -> Iterator[Node]:
 
 
 def _settled(node: Node) -> dict[str, list[str]]:
-    """Topics and types, once every topic of the README has every publisher that the README names (or 20 s later)."""
+    """Topics and types, once every stated topic has every stated publisher (or 20 s later)."""
     for _ in range(200):
-        if all(_publishers(node, name) == told for name, told in _told_publishers().items()):
+        if all(_publishers(node, name) == stated for name, stated in _stated_publishers().items()):
             break
         rclpy.spin_once(node, timeout_sec=0.1)
     return dict(node.get_topic_names_and_types())
 
 
-def _told_publishers() -> dict[str, list[str]]:
-    rows = [(name, rest.split("|")[1].strip()) for name, kind, rest in ROW.findall(README) if "/msg/" in kind]
+def _stated_publishers() -> dict[str, list[str]]:
+    rows = [(name, rest.split("|")[1].strip()) for name, kind, rest in ROW.findall(INTERFACES) if "/msg/" in kind]
     everyone = ["calibration_publisher", "cloud", "detector", "grasp", "motion", "mujoco_bridge", "octomap"]
     everyone.append("wrist_detector")
     return {name: everyone if who == "all" else sorted(w.strip() for w in who.split(",")) for name, who in rows}
@@ -87,9 +88,9 @@ def _publishers(node: Node, topic: str) -> list[str]:
 
 def test_topics_have_the_stated_type_publishers_and_qos(graph: Node) -> None:
     topics = _settled(graph)
-    rows = [row for row in ROW.findall(README) if "/msg/" in row[1]]
+    rows = [row for row in ROW.findall(INTERFACES) if "/msg/" in row[1]]
     assert len(rows) >= 25
-    assert {name: _publishers(graph, name) for name, _, _ in rows} == _told_publishers()
+    assert {name: _publishers(graph, name) for name, _, _ in rows} == _stated_publishers()
     for name, kind, rest in rows:
         assert topics[name] == [kind], name
         for info in graph.get_publishers_info_by_topic(name):
@@ -97,15 +98,17 @@ def test_topics_have_the_stated_type_publishers_and_qos(graph: Node) -> None:
             assert qos == QOS[rest.split("|")[0].strip()], name
 
 
-def test_no_topic_is_left_untold(graph: Node) -> None:
-    told = {name for name, _, _ in ROW.findall(README)}
-    untold = [name for name in _settled(graph) if name not in told and not UNTOLD.search(name)]
-    assert untold == []
+def test_every_topic_is_stated(graph: Node) -> None:
+    stated = {name for name, _, _ in ROW.findall(INTERFACES)}
+    missing = [name for name in _settled(graph) if name not in stated and not IMPLICIT.search(name)]
+    assert missing == []
 
 
 def test_services_and_actions_have_the_stated_type_and_node(graph: Node) -> None:
     _settled(graph)
-    rows = {name: (kind, rest.split("|")[0].strip()) for name, kind, rest in ROW.findall(README) if "/msg/" not in kind}
+    rows = {
+        name: (kind, rest.split("|")[0].strip()) for name, kind, rest in ROW.findall(INTERFACES) if "/msg/" not in kind
+    }
     assert len(rows) >= 14
     for _ in range(200):
         found = _services(graph)
@@ -127,6 +130,25 @@ def _services(node: Node) -> dict[str, tuple[str, str]]:
             if not re.search(STANDARD, name):
                 found[name] = (kinds[0], offering)
     return found
+
+
+def test_parameters_exist_at_their_nodes(graph: Node) -> None:
+    from rcl_interfaces.srv import ListParameters
+
+    stated: dict[str, set[str]] = {}
+    for cell in PARAMETER_ROW.findall(INTERFACES):
+        node = ""
+        for name in re.findall(r"`([^`]+)`", cell):
+            node = name.partition(".")[0] or node  # `.seed` is another parameter of the node before it
+            stated.setdefault(node, set()).add(name.partition(".")[2])
+    assert {"mujoco_bridge", "detector", "octomap", "motion", "grasp"} <= stated.keys()
+    for node, names in stated.items():
+        client = graph.create_client(ListParameters, f"/{node}/list_parameters")
+        assert client.wait_for_service(timeout_sec=20.0), node
+        answer = client.call_async(ListParameters.Request())
+        rclpy.spin_until_future_complete(graph, answer, timeout_sec=20.0)
+        assert answer.done(), f"no answer of {node}"
+        assert names <= set(answer.result().result.names), node
 
 
 @pytest.mark.requirement("A-73")

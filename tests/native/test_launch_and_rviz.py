@@ -93,7 +93,7 @@ def test_arguments_reach_the_parameters(launch_file: Any, tmp_path: Path) -> Non
 @pytest.mark.parametrize("stage", STAGES)
 @pytest.mark.requirement("A-77")
 def test_views_show_topics_that_are_offered_as_they_are_offered(stage: str) -> None:
-    offered = dict(ROW.findall((ROOT / "README.md").read_text(encoding="utf-8")))
+    offered = dict(ROW.findall((ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")))
     view = yaml.safe_load((config_dir() / "rviz" / f"{stage}.rviz").read_text(encoding="utf-8"))
     manager = view["Visualization Manager"]
     assert manager["Global Options"]["Fixed Frame"] in RobotDescription.load().links
