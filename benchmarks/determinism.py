@@ -1,70 +1,96 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the same seed gives the same run in lock-step, on an idle machine and beside a busy one.
+"""Whether the same seed gives the same run, bit by bit, on an idle machine and beside busy processes.
 
-    python -m benchmarks.determinism [--quick] [--runs N] [--scene NAME] [--seed S] [--timeout T] [--json PATH]
+    python -m benchmarks.determinism [--quick] [--runs N] [--set NAME] [--seed S] [--tasks N] [--noise] [--json PATH]
 
-Starts the graph `lockstep` N times with the same seed, the last time beside one busy process for each core; each run
-grasps the first object of the scene. Prints for each run the SHA-256 of every joint state (stamp, positions rounded to
-1e-9) and of every transition of the grasp (stamp, states, reason), and exits with 1 when they differ. It holds for one
-machine and one set of versions.
+Runs the tasks of a campaign N times in process, each time in a new process, the last time beside one busy process for
+each core. Prints for each run the SHA-256 of all joint positions and efforts at every control tick (exact, not rounded)
+and of the rows of the report (without wall times), and exits with 1 when they differ. It holds for one machine and one
+set of versions. Nodes that meet over DDS never repeat to the last bit, because messages arrive when they arrive.
 
-    lockstep_distinct_motions   different hashes of the joint states, 1 when all runs are equal
-    lockstep_distinct_logs      the same of the grasp's transitions
-    lockstep_speed              simulated seconds a wall second, of the slowest run
+    distinct_motions   different hashes of the joint positions and efforts, 1 when all runs are equal
+    distinct_rows      different hashes of the rows
+    speed              simulated seconds per second of wall time, of the slowest run
 """
 
 from __future__ import annotations
 
 import argparse
-import asyncio
+import hashlib
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from benchmarks.report import Row, write_report
-from openarm_bringup.supervision.graph import load_graph
-from openarm_bringup.supervision.keeper import NodeState
-from openarm_bringup.supervision.session import running_graph
-from openarm_common.domain import release_domain, reserve_domain
-from openarm_common.scene.scene import load_scene
+from openarm_evaluation.campaign.robot import SimulatedSenses
+from openarm_evaluation.campaign.sets import make_task
+from openarm_evaluation.campaign.trial import Trials
+from openarm_grasp.config import GraspConfig
+
+#: Keys of a row that depend on the wall clock.
+_WALL = frozenset({"wall_s", "planning_ms_median"})
 
 
-async def run_once(scene: str, seed: int, folder: Path, timeout: float) -> dict[str, Any]:
-    """Run the script once; return what it wrote, and `wall_s` since the graph was ready.
+@dataclass(frozen=True)
+class Run:
+    """What a run of some tasks came to.
 
-    Raises:
-        OpenArmError: what ended a node.
+    Attributes:
+        motion: SHA-256 of joint positions and efforts at every tick.
+        rows: SHA-256 of the rows without wall times.
+        codes: Outcome of each task.
+        sim_s: Simulated time.
+        wall_s: Wall time.
     """
-    domain = reserve_domain()
-    result, label = folder / "script.json", load_scene(scene, seed).objects[0].label
-    sets = (
-        f"script.result={result}",
-        f"script.labels=[{label}]",
-        f"mujoco_bridge.barrier.timeout={timeout}",
-    )
-    try:
-        graph = load_graph("lockstep", overrides={"scene": scene, "seed": seed, "domain": domain}, sets=sets)
-        async with running_graph(graph, folder) as supervisor:
-            await supervisor.wait_ready()
-            began = time.monotonic()
-            trouble = asyncio.create_task(supervisor.wait_stop_asked())
-            while supervisor.states()["script"] != NodeState.EXITED:
-                await asyncio.wait({trouble}, timeout=0.1)
-                if trouble.done():
-                    trouble.result()
-                    raise KeyboardInterrupt
-            trouble.cancel()
-            wall_s = time.monotonic() - began
-    finally:
-        release_domain(domain)
-    return {**json.loads(result.read_text(encoding="utf-8")), "wall_s": wall_s}
+
+    motion: str
+    rows: str
+    codes: tuple[str, ...]
+    sim_s: float
+    wall_s: float
+
+
+def run_tasks(set_name: str, seeds: Sequence[int], noise: bool) -> Run:
+    """Run tasks of a campaign in this process.
+
+    Args:
+        set_name: Set of tasks, as `openarm campaign --set`.
+        seeds: One task each.
+        noise: Whether depth is as noisy as a D435's.
+    """
+    motion, rows = hashlib.sha256(), hashlib.sha256()
+    codes: list[str] = []
+    sim_s, began = 0.0, time.monotonic()
+    for seed in seeds:
+        trials = Trials(make_task(set_name, seed), SimulatedSenses(depth_noise=noise), GraspConfig())
+        row = trials.run()
+        for t_ns, position, effort in trials.robot.trace:
+            motion.update(t_ns.to_bytes(8, "little") + position.tobytes() + effort.tobytes())
+        rows.update(json.dumps(_without_wall_times(row), sort_keys=True).encode())
+        codes.append(row["code"])
+        sim_s += trials.robot.t_ns * 1e-9
+    return Run(motion.hexdigest(), rows.hexdigest(), tuple(codes), sim_s, time.monotonic() - began)
+
+
+def _without_wall_times(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_wall_times(item) for key, item in value.items() if key not in _WALL}
+    return [_without_wall_times(item) for item in value] if isinstance(value, list) else value
+
+
+def run_in_new_process(set_name: str, seeds: Sequence[int], noise: bool = False) -> Run:
+    """As `run_tasks`, in a process that has computed nothing before."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(run_tasks, set_name, seeds, noise).result()
 
 
 @contextmanager
@@ -82,34 +108,35 @@ def busy(processes: int) -> Iterator[None]:
 def main() -> int:
     """Run it; 0 when all runs are equal."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="two runs, one of them beside a busy machine")
+    parser.add_argument("--quick", action="store_true", help="one task")
     parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--scene", default="demo")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--timeout", type=float, default=10.0, help="of an answer to a tick, s")
+    parser.add_argument("--set", default="nominal", dest="set_name")
+    parser.add_argument("--seed", type=int, default=0, help="of the first task")
+    parser.add_argument("--tasks", type=int, default=5)
+    parser.add_argument("--noise", action="store_true", help="depth as noisy as a D435's")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    runs: list[dict[str, Any]] = []
-    count = 2 if args.quick else args.runs
-    for k in range(count):
-        disturbed = k == count - 1
-        with tempfile.TemporaryDirectory() as folder, busy((os.cpu_count() or 1) if disturbed else 0):
-            found = asyncio.run(run_once(args.scene, args.seed, Path(folder), args.timeout))
-        runs.append(found)
-        print(f"run {k + 1}{' beside busy processes' if disturbed else ''}: {found['answers'][0]['message']}")
-        print(f"  joint states {found['joint_states']['n']:6d}  {found['joint_states']['sha256']}")
-        print(f"  transitions  {found['grasp_states']['n']:6d}  {found['grasp_states']['sha256']}")
-        print(f"  {found['sim_s']:.2f} s simulated in {found['wall_s']:.1f} s", flush=True)
-    motions = {run["joint_states"]["sha256"] for run in runs}
-    logs = {run["grasp_states"]["sha256"] for run in runs}
-    speed = min(run["sim_s"] / run["wall_s"] for run in runs)
-    rows = [
-        Row("lockstep_distinct_motions", len(motions), "", "lower", 1, n=len(runs)),
-        Row("lockstep_distinct_logs", len(logs), "", "lower", 1, n=len(runs)),
-        Row("lockstep_speed", speed, "", "higher", None, n=len(runs)),
-    ]
-    write_report(rows, args.json)
-    return 0 if len(motions) == len(logs) == 1 else 1
+    seeds = range(args.seed, args.seed + (1 if args.quick else args.tasks))
+    runs: list[Run] = []
+    for k in range(args.runs):
+        disturbed = k == args.runs - 1
+        with busy((os.cpu_count() or 1) if disturbed else 0):
+            run = run_in_new_process(args.set_name, seeds, args.noise)
+        runs.append(run)
+        print(f"run {k + 1}{' beside busy processes' if disturbed else ''}: {', '.join(run.codes)}")
+        print(f"  joints  {run.motion}")
+        print(f"  rows    {run.rows}")
+        print(f"  {run.sim_s:.2f} s simulated in {run.wall_s:.1f} s", flush=True)
+    motions, rows = len({run.motion for run in runs}), len({run.rows for run in runs})
+    write_report(
+        [
+            Row("distinct_motions", motions, "", "lower", 1, n=len(runs)),
+            Row("distinct_rows", rows, "", "lower", 1, n=len(runs)),
+            Row("speed", min(run.sim_s / run.wall_s for run in runs), "", "higher", None, n=len(runs)),
+        ],
+        args.json,
+    )
+    return 0 if motions == rows == 1 else 1
 
 
 if __name__ == "__main__":

@@ -14,16 +14,6 @@ from openarm_sim_bridge.control.gripper import GripperConfig
 from openarm_sim_bridge.world.model import PhysicsConfig
 
 
-class BarrierConfig(Config):
-    """Of a lock-step, which the parameter `lockstep` switches on."""
-
-    participants: tuple[str, ...] = Field(default=(), description="nodes that simulated time waits for")
-    command_rate: float = Field(
-        default=50.0, gt=0.0, le=100.0, description="ticks at which commands are taken, beside those with a frame, Hz"
-    )
-    timeout: float = Field(default=10.0, gt=0.0, description="an answer to a tick that misses so long ends the run, s")
-
-
 class BridgeConfig(Config):
     """What is simulated and how it is told."""
 
@@ -49,7 +39,6 @@ class BridgeConfig(Config):
     )
     depth_noise: DepthNoiseConfig = DepthNoiseConfig()
     colour_noise: ColourNoiseConfig = ColourNoiseConfig()
-    barrier: BarrierConfig = BarrierConfig()
     physics: PhysicsConfig = PhysicsConfig()
     trajectory: TrajectoryConfig = TrajectoryConfig()
     gripper: GripperConfig = GripperConfig()

@@ -2,8 +2,7 @@
 """The thread that steps the world: commands, physics, and telling those who publish, at a steady rate.
 
 Everything that touches the world or the controller happens in this thread. Others hand it functions (`call`), which it
-runs between two ticks; they never wait for physics, and physics never waits for them. In lock-step there is no such
-thread: whoever leads calls `turn`, and everything else, in one thread.
+runs between two ticks; they never wait for physics, and physics never waits for them.
 """
 
 from __future__ import annotations
@@ -68,7 +67,6 @@ class Simulation:
         dump_folder: Gets the last second before physics diverged; None: the system's folder for temporary files.
         crashed: Called when the thread ends by an error that nobody expected.
         clock: Monotonic wall clock, ns.
-        driven: There is no thread; one caller does everything. Every tick is told of, and a halt is not.
     """
 
     #: How often a paused world tells its (unchanged) state, so that a pause is not taken for a death.
@@ -84,7 +82,6 @@ class Simulation:
         dump_folder: Path | None = None,
         crashed: Callable[[Exception], None] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
-        driven: bool = False,
     ) -> None:
         self.world = world
         self.controller = controller
@@ -98,11 +95,8 @@ class Simulation:
         self._history: deque[tuple[JointReadout, Array]] = deque(maxlen=max(1, 1_000_000_000 // world.period_ns))
         self._crashed = crashed
         self._clock = clock
-        self._driven = driven
-        #: How many ticks there were.
-        self.ticks = 0
         self._pacer = Pacer(world.period_ns, speed)
-        self._throttled = not driven and (speed == 0.0 or speed > 1.0)
+        self._throttled = speed == 0.0 or speed > 1.0
         self._told_ns = 0
         self._paused = False
         self._steps_left = 0
@@ -123,9 +117,8 @@ class Simulation:
         return self._pacer.skipped_ns * 1e-9
 
     def start(self) -> None:
-        """Start the thread; nothing where there is none."""
-        if not self._driven:
-            self._thread.start()
+        """Start the thread."""
+        self._thread.start()
 
     def stop(self) -> None:
         """Stop the thread and wait for it; calls that still wait are cancelled."""
@@ -140,9 +133,7 @@ class Simulation:
         """Run a (short) function between two ticks; the future has its result within a tick or so."""
         future: Future[T] = Future()
         self._calls.append(_Call(fn, future))
-        if self._driven:
-            self._run_calls()
-        elif self._paused:
+        if self._paused:
             self._wake.set()
         return future
 
@@ -189,11 +180,11 @@ class Simulation:
 
     def _loop(self) -> None:
         while not self._stopping:
-            wait_s = self.turn()
+            wait_s = self._turn()
             if wait_s > 0.0 and not self._calls:
                 self._wait(wait_s)
 
-    def turn(self) -> float:
+    def _turn(self) -> float:
         """Do what is due: calls, and a tick; return for how long there is nothing to do, s."""
         self._run_calls()
         if self.fault or (self._paused and not self._steps_left):
@@ -203,10 +194,6 @@ class Simulation:
         if wait_ns <= 0:
             self._tick(self._clock())
         return max(0.0, wait_ns * 1e-9)
-
-    def tell(self) -> None:
-        """Tell the state as it is, without time going on."""
-        self._observe(self.world.read_joints())
 
     def _run_calls(self) -> None:
         while self._calls:
@@ -220,8 +207,7 @@ class Simulation:
         """Pass a moment without time going on."""
         self._pacer.restart()
         self.periods.restart()
-        if not self._driven:
-            self.tell()
+        self._observe(self.world.read_joints())
 
     def _tick(self, now_ns: int) -> None:
         world, controller = self.world, self.controller
@@ -240,7 +226,6 @@ class Simulation:
             self._end_stepping(self.fault)
             controller.abort(self.fault)
             return
-        self.ticks += 1
         self.real_time_factor.add(now_ns, world.t_ns)
         last = self._paused and steps == self._steps_left
         if last or not self._throttled or now_ns - self._told_ns >= 0.9 * world.period_ns:

@@ -99,13 +99,6 @@ class NodeSpec(Config):
         return self
 
 
-class Lockstep(Config):
-    """Simulated time waits for nodes: the same seed gives the same run, however fast the machine is."""
-
-    leader: str = Field(default="mujoco_bridge", description="node that steps the simulation")
-    participants: tuple[str, ...] = Field(min_length=1, description="nodes that it waits for")
-
-
 class Graph(Config):
     """All nodes that run together."""
 
@@ -116,7 +109,6 @@ class Graph(Config):
     mount_seed: int | Literal["none"] = Field(default="none", description="of the true camera mounts; none = nominal")
     domain: int | None = Field(default=None, ge=0, le=232, description="ROS_DOMAIN_ID; null = of the environment, or 0")
     discovery: Discovery = Field(default="localhost", description="ROS_AUTOMATIC_DISCOVERY_RANGE")
-    lockstep: Lockstep | None = Field(default=None, description="null = every node at its own pace")
     nodes: dict[str, NodeSpec] = Field(min_length=1)
 
     def levels(self) -> tuple[tuple[str, ...], ...]:
@@ -243,7 +235,7 @@ def load_graph(
         node: spec.model_copy(update={"params": _node_params(node, spec, path, variables)})
         for node, spec in graph.nodes.items()
     }
-    graph = _in_lockstep(graph.model_copy(update={"nodes": nodes}), str(path))
+    graph = graph.model_copy(update={"nodes": nodes})
     for item in sets:
         set_parameter(graph, item)
     return graph
@@ -332,29 +324,6 @@ def _node_params(node: str, spec: NodeSpec, graph_file: Path, variables: Mapping
     return {
         key: substitute(value, variables, f"{graph_file}:nodes.{node}.params.{key}") for key, value in params.items()
     }
-
-
-def _in_lockstep(graph: Graph, where: str) -> Graph:
-    """Give the nodes of a lock-step their parameters; the end of any of them ends the run."""
-    if graph.lockstep is None:
-        return graph
-    leader, participants = graph.lockstep.leader, graph.lockstep.participants
-    for key, names in (("leader", (leader,)), ("participants", participants)):
-        unknown = [name for name in names if name not in graph.nodes]
-        if unknown:
-            raise OpenArmError(
-                Code.CONFIG_INVALID,
-                f"{where}:lockstep.{key}: unknown node {unknown[0]!r}; nodes are {', '.join(graph.nodes)}",
-            )
-    nodes, never = dict(graph.nodes), Restart(policy="never")
-    for name in (leader, *participants):
-        params = {**nodes[name].params, "lockstep": True}
-        if name == leader:
-            params["barrier.participants"] = list(participants)
-        # The order of sets of strings differs from process to process unless it is asked not to.
-        env = {"PYTHONHASHSEED": "0", **nodes[name].env}
-        nodes[name] = nodes[name].model_copy(update={"params": params, "env": env, "restart": never, "essential": True})
-    return graph.model_copy(update={"nodes": nodes})
 
 
 def set_parameter(graph: Graph, item: str) -> None:

@@ -122,7 +122,7 @@ async def wait_until(node: BaseNode[Any], condition: Callable[[], bool], timeout
         if not future.done() and (condition() or left <= 0):
             future.set_result(left > 0)
 
-    timer = node.create_timer(_POLL, look, clock=node.wall_clock)
+    timer = node.create_timer(_POLL, look, clock=node.steady_clock)
     try:
         return bool(await future)
     finally:

@@ -46,7 +46,7 @@ class PublisherNode(BaseNode[PublisherConfig]):
         self._last: dict[str, Array] = {}
         self._mounts = self.create_publisher(TFMessage, "/tf_static", QOS_LATCHED)
         self._publish()
-        self.create_timer(self.config.period, self._look, clock=self.wall_clock)
+        self.create_timer(self.config.period, self._look, clock=self.steady_clock)
 
     def _state(self) -> tuple[object, ...]:
         return tuple(store.state() for store in self._stores)

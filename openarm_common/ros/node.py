@@ -18,6 +18,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
@@ -30,7 +31,6 @@ from rclpy.task import Future
 from openarm_common.config import AT_RUN_TIME, Config, validate
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.lockstep_node import LockstepNode
 
 ConfigT = TypeVar("ConfigT", bound=Config)
 P = ParamSpec("P")
@@ -83,8 +83,8 @@ def offered_qos(node: Node, topic: str, depth: int) -> QoSProfile:
     return _profile(depth, reliable=dependable, latched=latched)
 
 
-class BaseNode(LockstepNode, Generic[ConfigT]):
-    """A node with validated parameters, /diagnostics and a worker pool; it can take part in a lock-step.
+class BaseNode(Node, Generic[ConfigT]):
+    """A node with validated parameters, /diagnostics, a worker pool, and `steady_clock`, which no simulated time stops.
 
     Args:
         name: Node name.
@@ -98,6 +98,7 @@ class BaseNode(LockstepNode, Generic[ConfigT]):
 
     def __init__(self, name: str, model: type[ConfigT], **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
+        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         data = _declare(self, model, "")
         self.config: ConfigT = validate(model, data, f"parameters of {self.get_fully_qualified_name()}")
         self.__pool = ThreadPoolExecutor(max_workers=4, thread_name_prefix=name)
@@ -157,8 +158,7 @@ class BaseNode(LockstepNode, Generic[ConfigT]):
     def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Any:
         """Run `fn` in a worker thread; await the returned rclpy future (which carries no type) in a coroutine callback.
 
-        A future completed from another thread does not wake a waiting executor, so this does. In lock-step `fn` runs at
-        once: simulated time waits for it.
+        A future completed from another thread does not wake a waiting executor, so this does.
         """
         future = Future(executor=self.executor)
 
@@ -172,21 +172,8 @@ class BaseNode(LockstepNode, Generic[ConfigT]):
             if self.executor is not None:
                 self.executor.wake()
 
-        if self.lockstep:
-            work()
-        else:
-            self.__pool.submit(work)
+        self.__pool.submit(work)
         return future
-
-    def make_executor(self) -> Executor:
-        """Make the executor that spins this node in a process of its own; the node is in it."""
-        if self.lockstep:
-            from openarm_common.ros.lockstep_executor import ParticipantExecutor  # an ordinary node needs none of it
-
-            return ParticipantExecutor(self)
-        executor = SingleThreadedExecutor()
-        executor.add_node(self)
-        return executor
 
     async def hold(self) -> None:
         """Bring to rest what the node moves: called when the process is to end, while the graph is still there."""
@@ -257,7 +244,8 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
         node = factory()
         if not rclpy.ok():  # the signal came while the node was being made
             raise ExternalShutdownException
-        executor = node.make_executor()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
         signals.node = node
         executor.spin()
     except OpenArmError as error:
@@ -301,8 +289,7 @@ class _Signals:
             pass
         faulthandler.register(signal.SIGTERM)
         executor = self.node.executor if self.node is not None else None
-        # In lock-step nothing moves any more: simulated time waits for a node that ends.
-        if self.node is not None and executor is not None and not self.node.lockstep:
+        if self.node is not None and executor is not None:
             rested = threading.Event()
             executor.create_task(self.node.hold).add_done_callback(lambda _: rested.set())
             rested.wait(_HOLD)

@@ -8,11 +8,13 @@ the same.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
@@ -21,7 +23,6 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import stamp_to_ns, transform_to_matrix
-from openarm_common.ros.lockstep_node import LockstepNode
 from openarm_common.ros.node import BASE_FRAME, QOS_STATIC_TF, reliable
 
 #: Who has heard no joint state for this long waits for none, s of wall clock.
@@ -57,7 +58,7 @@ class RobotStateListener:
 
     def __init__(
         self,
-        node: LockstepNode,
+        node: Node,
         description: RobotDescription,
         *,
         joints: bool = True,
@@ -75,15 +76,13 @@ class RobotStateListener:
         self._received_at = self._listening_since = -math.inf
         self._joints: Subscription | None = None
         node.create_subscription(TFMessage, "/tf_static", self._on_static, QOS_STATIC_TF)
-        if joints or node.lockstep:
-            self.enable(True)
-            self.enable(joints)
+        self.enable(joints)
 
     def enable(self, on: bool) -> None:
         """Listen to /joint_states, or stop; what is old when listening starts again is forgotten."""
         if on and self._joints is None:
             self.buffer.clear()
-            self._received_at, self._listening_since = -math.inf, self._node.monotonic()
+            self._received_at, self._listening_since = -math.inf, time.monotonic()
             self._joints = self._node.create_subscription(
                 JointState, "/joint_states", self._on_joints, reliable(self._depth)
             )
@@ -93,7 +92,7 @@ class RobotStateListener:
 
     def age_s(self) -> float:
         """Seconds of wall clock since the newest joint state arrived; infinite before the first."""
-        return self._node.monotonic() - self._received_at
+        return time.monotonic() - self._received_at
 
     def posture(self, frame: str, t_ns: int, since: float, *, joints: bool) -> Posture | None:
         """Where a frame was at a stamp, and the joints; None while what is still to come may decide it.
@@ -110,7 +109,7 @@ class RobotStateListener:
         Raises:
             OpenArmError: STALE_DATA or NO_TRANSFORM, when nothing that may still come can help, or the time is over.
         """
-        now = self._node.monotonic()
+        now = time.monotonic()
         in_time = now < since + self._wait
         heard = now < max(self._received_at, self._listening_since) + max(self._wait, _SILENT)
         to_come = in_time and heard and self._joints is not None and not self.buffer.settled(t_ns)
@@ -125,7 +124,7 @@ class RobotStateListener:
             raise
 
     def _on_joints(self, message: JointState) -> None:
-        self._received_at = self._node.monotonic()
+        self._received_at = time.monotonic()
         self.buffer.add_joint_state(stamp_to_ns(message.header.stamp), message.name, message.position)
         self.efforts = dict(zip(message.name, message.effort, strict=False))
         self.velocities = dict(zip(message.name, message.velocity, strict=False))

@@ -8,6 +8,7 @@ only while a grasp runs, /detections_3d only in states that look.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -56,13 +57,10 @@ class OtherNodes:
         self._frame_id = BASE_FRAME
         self._looking_since_ns = 0
         self._next_tick = Future()
-        self._timer = node.create_timer(_TICK_S, self._on_tick, clock=node.wall_clock)
+        self._timer = node.create_timer(_TICK_S, self._on_tick, clock=node.steady_clock)
         self._timer.cancel()
         self._silence = Silence(_STARVED_S)
         self._cancelled = self._active = False
-        if node.lockstep:
-            self._look(DETECTIONS)
-            self.stop_looking()
 
     # --- begin, end, cancel
     async def begin(self, missing: Callable[[], list[str]]) -> None:
@@ -77,10 +75,10 @@ class OtherNodes:
         self.robot.enable(True)
         self.pads.enable(self._config.held.use_finger_force)
         self._timer.reset()
-        deadline = self._node.monotonic() + self._config.limits.ready_timeout
+        deadline = time.monotonic() + self._config.limits.ready_timeout
         while faults := missing():
             self.check()
-            if self._node.monotonic() > deadline:
+            if time.monotonic() > deadline:
                 raise OpenArmError(Code.NOT_READY, f"not ready: no {'; no '.join(faults)}")
             await self.tick()
 
@@ -114,7 +112,7 @@ class OtherNodes:
 
     # --- waiting
     def _on_tick(self) -> None:
-        self._silence.look(self._node.monotonic(), self.now_ns if self.hears_joints else -1)
+        self._silence.look(time.monotonic(), self.now_ns if self.hears_joints else -1)
         done, self._next_tick = self._next_tick, Future()
         done.set_result(None)
 
@@ -146,12 +144,12 @@ class OtherNodes:
         Raises:
             OpenArmError: TIMEOUT, CANCELLED, ROBOT_LOST, or from `guard`.
         """
-        deadline = self._node.monotonic() + limit
+        deadline = time.monotonic() + limit
         while not done():
             self.check()
             if guard is not None:
                 guard()
-            if self._node.monotonic() > deadline:
+            if time.monotonic() > deadline:
                 raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
             await self.tick()
 
@@ -195,8 +193,8 @@ class OtherNodes:
             await self.until(result.done, limit, what, watch)
         except OpenArmError as error:
             handle.cancel_goal_async()
-            deadline = self._node.monotonic() + (0.0 if error.code is Code.ROBOT_LOST else _STOP_LIMIT_S)
-            while not result.done() and self._node.monotonic() < deadline:
+            deadline = time.monotonic() + (0.0 if error.code is Code.ROBOT_LOST else _STOP_LIMIT_S)
+            while not result.done() and time.monotonic() < deadline:
                 await self.tick()
             raise
         return result.result().result

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from typing import Any
 
@@ -43,11 +44,11 @@ class Pads:
 
     def _hear(self, link: str, message: WrenchStamped) -> None:
         f = message.wrench.force
-        self._heard[link] = (self._node.monotonic(), float(np.linalg.norm((f.x, f.y, f.z))))
+        self._heard[link] = (time.monotonic(), float(np.linalg.norm((f.x, f.y, f.z))))
 
     def of(self, arm: str) -> tuple[float, ...]:
         """Newest force on each pad of a hand, N; empty when one is silent."""
-        now = self._node.monotonic()
+        now = time.monotonic()
         heard = [self._heard.get(f"openarm_{arm}_{finger}", (-np.inf, 0.0)) for finger in _FINGERS]
         return tuple(force for _, force in heard) if all(now - at <= _FRESH_S for at, _ in heard) else ()
 

@@ -249,8 +249,8 @@ class Watch:
     def __init__(self, node: BaseNode[Any], states: RobotStateListener) -> None:
         self._node, self._states = node, states
         self._next = Future(executor=node.executor)
-        self._timer = node.create_timer(_WATCH, self._tick, clock=node.wall_clock)
-        self._last_ns = self._start_ns = node.wall_clock.now().nanoseconds
+        self._timer = node.create_timer(_WATCH, self._tick, clock=node.steady_clock)
+        self._last_ns = self._start_ns = node.steady_clock.now().nanoseconds
         #: How long the controller has not been in the graph, s.
         self.missing = 0.0
         #: How long this process was awake without a joint state, s: messages wait unread while it is not.
@@ -258,11 +258,11 @@ class Watch:
 
     def restart(self) -> None:
         """Count `elapsed` from now."""
-        self._start_ns = self._node.wall_clock.now().nanoseconds
+        self._start_ns = self._node.steady_clock.now().nanoseconds
 
     def elapsed(self) -> float:
         """Wall clock since the beginning or the last `restart`, s."""
-        return (self._node.wall_clock.now().nanoseconds - self._start_ns) * 1e-9
+        return (self._node.steady_clock.now().nanoseconds - self._start_ns) * 1e-9
 
     async def until(self, done: Callable[[], bool], look: Callable[[], None], limit: float) -> bool:
         """Call `look` at each wake until `done` or for `limit` seconds; returns whether it is done."""
@@ -290,7 +290,7 @@ class Watch:
         self._node.destroy_timer(self._timer)
 
     def _tick(self) -> None:
-        now = self._node.wall_clock.now().nanoseconds
+        now = self._node.steady_clock.now().nanoseconds
         awake = min((now - self._last_ns) * 1e-9, 2.0 * _WATCH)
         self._last_ns = now
         self.silence = min(self._states.age_s(), self.silence + awake)

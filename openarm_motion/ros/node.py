@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
 from openarm_interfaces.srv import ComputeIK
-from rclpy.action import CancelResponse
+from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from trajectory_msgs.msg import JointTrajectory
 
@@ -24,7 +24,6 @@ from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose
-from openarm_common.ros.lockstep_node import NamedActionServer
 from openarm_common.ros.node import BaseNode, run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_motion.config import MotionConfig
@@ -79,7 +78,7 @@ class MotionNode(BaseNode[MotionConfig]):
             self._serve(ExecuteTrajectory, "/motion/execute", self._on_execute),
         ]
         self.create_service(ComputeIK, "/motion/compute_ik", self._on_ik)
-        self.create_timer(1.0, self._report, clock=self.wall_clock)
+        self.create_timer(1.0, self._report, clock=self.steady_clock)
         for arm in self._arms.values():
             self.get_logger().info(f"{arm.name} arm: {', '.join(arm.names)}; inverse kinematics: {arm.inverse.method}")
 
@@ -108,7 +107,7 @@ class MotionNode(BaseNode[MotionConfig]):
         def report(stage: str, tried: int) -> None:
             feedback.stage, feedback.tried = stage, tried
 
-        timer = self.create_timer(_FEEDBACK, lambda: handle.publish_feedback(feedback), clock=self.wall_clock)
+        timer = self.create_timer(_FEEDBACK, lambda: handle.publish_feedback(feedback), clock=self.steady_clock)
         result = PlanApproach.Result(chosen=-1)
         try:
             arm, stopped = self._arm(goal.arm), self._stopper(handle)
@@ -295,8 +294,8 @@ class MotionNode(BaseNode[MotionConfig]):
     def _stopper(self, handle: ServerGoalHandle) -> Callable[[], bool]:
         return lambda: self._closing or handle.is_cancel_requested
 
-    def _serve(self, kind: Any, name: str, execute: Callable[[ServerGoalHandle], Any]) -> NamedActionServer:
-        return NamedActionServer(self, kind, name, execute, cancel_callback=lambda _: CancelResponse.ACCEPT)
+    def _serve(self, kind: Any, name: str, execute: Callable[[ServerGoalHandle], Any]) -> ActionServer:
+        return ActionServer(self, kind, name, execute, cancel_callback=lambda _: CancelResponse.ACCEPT)
 
     @staticmethod
     def _end(handle: ServerGoalHandle, result: Result) -> Result:

@@ -9,13 +9,13 @@ from collections import deque
 from typing import Generic, TypeVar
 
 import numpy as np
+from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import image_to_array, intrinsics_from_info, points_from_cloud, stamp_to_ns
-from openarm_common.ros.lockstep_node import LockstepNode
 from openarm_common.ros.node import QOS_NEWEST
 from openarm_common.ros.tf import RobotStateListener
 from openarm_octomap.grid import CloudScan, DepthScan
@@ -40,7 +40,7 @@ class Source(ABC, Generic[MessageT]):
         used_t_ns: Its stamp.
     """
 
-    def __init__(self, node: LockstepNode, name: str) -> None:
+    def __init__(self, node: Node, name: str) -> None:
         self.name = name
         self.used = self.refused = self.late = 0
         self.fault = ""
@@ -107,23 +107,23 @@ class Source(ABC, Generic[MessageT]):
         """The scan of a message; OpenArmError where it does not fit."""
 
     @abstractmethod
-    def _subscribe(self, node: LockstepNode) -> list[Subscription]:
+    def _subscribe(self, node: Node) -> list[Subscription]:
         """Begin to listen."""
 
     def _keep(self, message: MessageT) -> None:
-        self._waiting.append((message, self._node.monotonic()))
+        self._waiting.append((message, time.monotonic()))
 
 
 class DepthSource(Source[Image]):
     """Depth images of one camera, in its optical frame."""
 
-    def __init__(self, node: LockstepNode, camera: CameraConfig, depth_topic: str, info_topic: str) -> None:
+    def __init__(self, node: Node, camera: CameraConfig, depth_topic: str, info_topic: str) -> None:
         super().__init__(node, camera.name)
         self._camera = camera
         self._topics = [topic.format(camera=camera.name) for topic in (depth_topic, info_topic)]
         self._info: CameraInfo | None = None
 
-    def _subscribe(self, node: LockstepNode) -> list[Subscription]:
+    def _subscribe(self, node: Node) -> list[Subscription]:
         depth, info = self._topics
         return [
             node.create_subscription(Image, depth, self._keep, QOS_NEWEST),
@@ -152,10 +152,10 @@ class DepthSource(Source[Image]):
 class CloudSource(Source[PointCloud2]):
     """Clouds in any known frame, whose origin is taken for that of the rays."""
 
-    def __init__(self, node: LockstepNode, topic: str) -> None:
+    def __init__(self, node: Node, topic: str) -> None:
         super().__init__(node, topic)
 
-    def _subscribe(self, node: LockstepNode) -> list[Subscription]:
+    def _subscribe(self, node: Node) -> list[Subscription]:
         return [node.create_subscription(PointCloud2, self.name, self._keep, QOS_NEWEST)]
 
     def _scan(self, message: PointCloud2, T_base_frame: np.ndarray) -> CloudScan:

@@ -82,7 +82,7 @@ class _Camera:
         if self._robot is None:
             self._publish(t_ns, messages, None)
         elif self._waiting is None:
-            self._waiting = (t_ns, messages, self._node.monotonic())
+            self._waiting = (t_ns, messages, time.monotonic())
             self.try_waiting()
 
     def try_waiting(self) -> None:
@@ -161,7 +161,7 @@ class CloudNode(BaseNode[CloudNodeConfig]):
                 self, self.description, joints=False, depth=100, wait=wait, on_news=self._try_waiting
             )
         self._cameras = {name: _Camera(self, name) for name in self.config.cameras}
-        self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
+        self.create_timer(0.1, self._follow_demand, clock=self.steady_clock)
 
     def waiting_ns(self, camera: str) -> int | None:
         """Stamp of the frame of a camera that waits for the robot's posture."""

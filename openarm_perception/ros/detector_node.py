@@ -87,12 +87,10 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._picture = self.create_publisher(Image, "/detection_image", QOS_SENSOR)
         self._mask = self.create_publisher(Image, "/detection_mask", QOS_SENSOR)
         self._markers = self.create_publisher(MarkerArray, "/detection_markers", reliable(5))
-        self.create_timer(0.1, self._follow_demand, clock=self.wall_clock)
+        self.create_timer(0.1, self._follow_demand, clock=self.steady_clock)
         self.diagnose(True, "idle: nobody listens", **self._counts)
         self.create_service(MeasureTable, "~/measure_table", self._on_measure_table)
         self._began: deque[float] = deque(maxlen=20)
-        if self.lockstep:
-            self._subscribe()
 
     def _make(self, config: DetectNodeConfig, before: Pipeline | None = None) -> Pipeline:
         return make_pipeline(
@@ -117,16 +115,6 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._pipeline = self._make(config, self._pipeline)
         self._fallback = ""
 
-    def lockstep_missing(self) -> str:
-        """The pose of a fixed camera, without which its first frames would be skipped."""
-        if self._rides:
-            return ""
-        try:
-            self._poses.buffer.lookup(BASE_FRAME, self._optical_frame, 0)
-        except OpenArmError as error:
-            return error.message
-        return ""
-
     @property
     def waiting_ns(self) -> int | None:
         """Stamp of the frame that waits for the pose of its camera."""
@@ -135,12 +123,12 @@ class DetectNode(BaseNode[DetectNodeConfig]):
     @property
     def measurable(self) -> bool:
         """Whether there is an image that the table can be measured in."""
-        return self._newest is not None and self.monotonic() - self._newest.at <= _FRESH
+        return self._newest is not None and time.monotonic() - self._newest.at <= _FRESH
 
     def _follow_demand(self) -> None:
         self._try_waiting()  # what is waited for may never come
         outputs = (self._boxes, self._objects, self._picture, self._mask, self._markers)
-        asked = self.monotonic() < self._asked_until
+        asked = time.monotonic() < self._asked_until
         wanted = asked or any(output.get_subscription_count() for output in outputs)
         if wanted and not self._inputs:
             self._subscribe()
@@ -164,7 +152,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
 
     def _subscribe(self) -> None:
         self._poses.enable(self._rides or self._robot is not None)
-        self._listening_since = self.monotonic()
+        self._listening_since = time.monotonic()
         for stream, (kind, topic) in self._topics().items():
 
             def add(message: Image | CameraInfo, stream: str = stream) -> None:
@@ -202,7 +190,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             if "depth" in messages
             else np.zeros(rgb.shape[:2], np.uint16),
             intrinsics_from_info(info),
-            self.monotonic(),
+            time.monotonic(),
         )
 
     def _try_waiting(self) -> None:
@@ -224,7 +212,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         try:
             started = time.perf_counter()
             robot = self._find_robot(frame, posture)
-            self._newest = Placed(frame, posture.T_base_frame, robot, self.monotonic())
+            self._newest = Placed(frame, posture.T_base_frame, robot, time.monotonic())
             perceived = self._pipeline.run(frame.rgb, frame.depth, frame.intrinsics, posture.T_base_frame, robot)
         except OpenArmError as error:
             self._complain("refused_frames", f"frame refused: {error.message}")
@@ -247,7 +235,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
 
     def _starting(self) -> bool:
         """Whether the first joint states may still be on their way."""
-        return self.monotonic() < self._listening_since + self.config.transform_wait
+        return time.monotonic() < self._listening_since + self.config.transform_wait
 
     def _find_robot(self, frame: Frame, posture: Posture) -> Mask | None:
         if self._robot is None or not posture.joints:
@@ -288,14 +276,14 @@ class DetectNode(BaseNode[DetectNodeConfig]):
 
     def _rate(self) -> str:
         """Frames a second of the wall clock, over the last twenty."""
-        self._began.append(self.monotonic())
+        self._began.append(time.monotonic())
         span = self._began[-1] - self._began[0]
         return f"{(len(self._began) - 1) / span:.1f}" if span > 0.0 else "0"
 
     def _on_measure_table(
         self, request: MeasureTable.Request, response: MeasureTable.Response
     ) -> MeasureTable.Response:
-        self._asked_until = self.monotonic() + 5.0
+        self._asked_until = time.monotonic() + 5.0
         return answer(request, response, self._newest if self.measurable else None, self._pipeline, self.config.camera)
 
     def _complain(self, count: str, message: str) -> None:

@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 
-from openarm_common.errors import Code, OpenArmError
 from openarm_sim_bridge.cameras.handover import CameraReport, CameraSetup, StateSender, pair
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.pacing import RateDivider
@@ -58,7 +57,6 @@ class CameraFeed:
         self._died_at: float | None = None
         self._faults: tuple[Fault, ...] = ()
         self.lost = 0
-        self._offered_ns: int | None = None
         self.fault = ""
         self.report = CameraReport()
         self._start()
@@ -89,33 +87,6 @@ class CameraFeed:
             self.poll()
         return True
 
-    def finish(self, timeout_s: float) -> bool:
-        """Wait until the state that was handed over last is drawn and published; for lock-step.
-
-        Returns:
-            Whether one was handed over since the last call.
-
-        Raises:
-            OpenArmError: TIMEOUT; INTERNAL, when the process can't draw or has ended.
-        """
-        offered_ns, self._offered_ns = self._offered_ns, None
-        lost, self.lost = self.lost, 0
-        if lost:
-            raise OpenArmError(Code.INTERNAL, f"{lost} frames could not be handed to mujoco_cameras")
-        if offered_ns is None:
-            return False
-        deadline = time.monotonic() + timeout_s
-        while self.report.t_ns != offered_ns:
-            if self.fault:
-                raise OpenArmError(Code.INTERNAL, self.fault)
-            if time.monotonic() > deadline:
-                raise OpenArmError(
-                    Code.TIMEOUT, f"mujoco_cameras did not draw {offered_ns * 1e-9:.3f} s within {timeout_s:g} s"
-                )
-            self._sender.wait(0.1)
-            self.poll()
-        return True
-
     @property
     def watched(self) -> tuple[str, ...]:
         """Cameras with a subscriber, as far as is known."""
@@ -143,9 +114,7 @@ class CameraFeed:
         if names:
             snapshot = world.snapshot()
             with self._lock:
-                if self._sender.offer(snapshot, names):
-                    self._offered_ns = snapshot.t_ns
-                else:
+                if not self._sender.offer(snapshot, names):
                     self.lost += len(names)
 
     def poll(self) -> None:

@@ -42,7 +42,6 @@ class CameraSetup(Config):
     depth_noise: DepthNoiseConfig = DepthNoiseConfig()
     colour_noise: ColourNoiseConfig = ColourNoiseConfig()
     noise_seed: int = Field(default=0, ge=0, description="of all noise")
-    lockstep: bool = Field(default=False, description="every frame is published reliably, and reported at once")
     topics: dict[str, str] = Field(description="name on the graph of each topic, by its name without remapping")
 
 
@@ -54,9 +53,6 @@ class CameraReport(Config):
     watched: tuple[str, ...] = Field(default=(), description="cameras with a subscriber")
     rendered: dict[str, int] = Field(default={}, description="frames drawn so far, by camera")
     dropped: int = Field(default=0, description="frames that were replaced by newer ones before they were drawn")
-    t_ns: int = Field(default=-1, description="stamp of the last state that was drawn and published")
-    sent: dict[str, int] = Field(default={}, description="messages sent so far, by topic")
-    listeners: dict[str, int] = Field(default={}, description="subscriptions, by topic")
     draw_ms: float = Field(default=0.0, description="mean time of the frames drawn since the last report")
 
 

@@ -48,7 +48,6 @@ class CameraNode(Node):
         self._fault = ""
         self._faults = receiver.faults
         self._report_at = 0.0
-        self._last_ns = -1
 
     def work(self) -> None:
         """Draw until the bridge ends.
@@ -63,9 +62,6 @@ class CameraNode(Node):
                 self._images.set_faults(self._faults)
             if work is not None and not self._fault:
                 self._attempt(work)
-                self._last_ns = work.snapshot.t_ns
-                if self._receiver.setup.lockstep:
-                    self._tell()
             if time.monotonic() >= self._report_at:
                 self._tell()
 
@@ -109,12 +105,8 @@ class CameraNode(Node):
 
     def _tell(self) -> None:
         self._report_at = time.monotonic() + _REPORT_S
-        sent, listeners = self._images.counts() if self._receiver.setup.lockstep else ({}, {})
         self._receiver.report(
             CameraReport(
-                t_ns=self._last_ns,
-                sent=sent,
-                listeners=listeners,
                 ready=self._ready,
                 fault=self._fault,
                 watched=self._images.poll(),

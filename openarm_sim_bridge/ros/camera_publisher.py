@@ -7,7 +7,6 @@ import copy
 import math
 import sys
 import time
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import cast
@@ -20,7 +19,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from openarm_common.camera.cameras import CameraConfig, Intrinsics
 from openarm_common.ros.convert import ENCODINGS, info_from_intrinsics, ns_to_stamp
-from openarm_common.ros.node import QOS_SENSOR, reliable
+from openarm_common.ros.node import QOS_SENSOR
 from openarm_sim_bridge.cameras.handover import CameraSetup
 from openarm_sim_bridge.cameras.noise import add_colour_noise, add_depth_noise
 from openarm_sim_bridge.cameras.renderer import Colour, Depth, SnapshotRenderer
@@ -55,11 +54,10 @@ class _Stream:
         message.header.frame_id = camera.optical_frame
         message.data = bytes(message.step * camera.height)
         shape = (camera.height, camera.width, channels) if channels > 1 else (camera.height, camera.width)
-        qos = reliable(QOS_SENSOR.depth) if setup.lockstep else QOS_SENSOR
         image, info = (setup.topics[f"/{camera.name}/{stream}/{kind}"] for kind in ("image_raw", "camera_info"))
         return cls(
-            image=node.create_publisher(Image, image, qos),
-            info=node.create_publisher(CameraInfo, info, qos),
+            image=node.create_publisher(Image, image, QOS_SENSOR),
+            info=node.create_publisher(CameraInfo, info, QOS_SENSOR),
             message=message,
             info_message=info_from_intrinsics(camera.intrinsics, camera.optical_frame, 0),
             pixels=np.frombuffer(message.data, dtype=dtype).reshape(shape),
@@ -106,7 +104,6 @@ class CameraPublisher:
         self.faults = CameraFaults()
         self._depth_noise, self._colour_noise = setup.depth_noise, setup.colour_noise
         self._rng = np.random.default_rng(setup.noise_seed)
-        self._sent: Counter[Publisher] = Counter()
         self._late: list[tuple[float, Publisher, Image | CameraInfo]] = []
         self._configs = {camera.name: camera for camera in setup.cameras}
         self._cameras = {
@@ -158,18 +155,7 @@ class CameraPublisher:
                 if delay_s > 0.0:
                     self._late.append((time.monotonic() + delay_s, publisher, copy.deepcopy(message)))
                 else:
-                    self._publish(publisher, message)
-
-    def _publish(self, publisher: Publisher, message: Image | CameraInfo) -> None:
-        publisher.publish(message)
-        self._sent[publisher] += 1
-
-    def counts(self) -> tuple[dict[str, int], dict[str, int]]:
-        """Messages sent so far, and listeners at present, by topic."""
-        streams = [stream for camera in self._cameras.values() for stream in camera.streams]
-        publishers = {publisher.topic_name: publisher for s in streams for publisher in (s.image, s.info)}
-        sent = {name: self._sent[publisher] for name, publisher in publishers.items()}
-        return sent, {name: publisher.get_subscription_count() for name, publisher in publishers.items()}
+                    publisher.publish(message)
 
     def set_faults(self, faults: tuple[Fault, ...]) -> None:
         """Take the faults that are active from now on."""
@@ -184,7 +170,7 @@ class CameraPublisher:
         waiting, self._late = self._late, []
         for item in waiting:
             if item[0] <= now:
-                self._publish(item[1], item[2])
+                item[1].publish(item[2])
             else:
                 self._late.append(item)
         return min((due - now for due, _, _ in self._late), default=math.inf)

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from control_msgs.action import GripperCommand, ParallelGripperCommand
-from rclpy.action import CancelResponse, GoalResponse
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from sensor_msgs.msg import JointState
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.lockstep_node import NamedActionServer
 from openarm_common.ros.node import BaseNode
 from openarm_sim_bridge.control.actuation import End
 from openarm_sim_bridge.control.gripper import GripperFollower, GripperGoal, GripperOutcome
@@ -58,7 +57,7 @@ class GripperActionServer:
         self._type = _TYPES[action]
         self._joint = follower.group.names[0]
         self._column = simulation.world.joint_names.index(self._joint)
-        self._server = NamedActionServer(
+        self._server = ActionServer(
             node,
             self._type.action,
             f"/{side}_gripper_controller/gripper_cmd",

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-from rclpy.executors import Executor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
@@ -36,7 +35,6 @@ from openarm_sim_bridge.ros.camera_publisher import topic_names
 from openarm_sim_bridge.ros.fault_server import FaultServices
 from openarm_sim_bridge.ros.force_publisher import ForcePublisher
 from openarm_sim_bridge.ros.gripper_server import GripperActionServer
-from openarm_sim_bridge.ros.lockstep_executor import LeadExecutor
 from openarm_sim_bridge.ros.simulation_server import SimulationServices
 from openarm_sim_bridge.ros.state_publisher import StatePublisher, until_shutdown
 from openarm_sim_bridge.ros.trajectory_server import ArmActionServer
@@ -74,9 +72,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         world = stage.world(scene)
         controller = RobotController(stage.arms(), stage.grippers(), world, config.trajectory, config.gripper)
         self._controller = controller
-        self._simulation = Simulation(
-            world, controller, self._observe, speed=config.speed, crashed=self._on_crash, driven=self.lockstep
-        )
+        self._simulation = Simulation(world, controller, self._observe, speed=config.speed, crashed=self._on_crash)
         self._simulation.set_paused(config.paused)
 
         self._states = StatePublisher(
@@ -110,21 +106,14 @@ class MujocoBridge(BaseNode[BridgeConfig]):
                 self.get_logger().warning(f"no image yet after {WARM_UP_S:.0f} s; the simulation begins without")
         self._on_scene(scene)
         self._simulation.start()
-        how = "waits for the lock-step" if self.lockstep else "is running"
-        self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation {how}")
+        self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation is running")
 
     def keep_time(self) -> None:
         """Ask the system for real-time scheduling of this process, where the simulation has to wait for the clock."""
         # As fast as it can, it would take a core from everything else.
-        if 0.0 < self.config.speed <= 1.0 and not self.lockstep:
+        if 0.0 < self.config.speed <= 1.0:
             self._scheduling = use_fifo(self.config.thread_priority)
             self.get_logger().info(f"scheduled as {self._scheduling}")
-
-    def make_executor(self) -> Executor:
-        """In lock-step the bridge leads, and its executor steps the world."""
-        if not self.lockstep:
-            return super().make_executor()
-        return LeadExecutor(self, self._simulation, self._images, self.config.barrier)
 
     def close(self) -> None:
         """Stop physics and drawing, then the rest."""
@@ -175,14 +164,12 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             depth_noise=self.config.depth_noise,
             colour_noise=self.config.colour_noise,
             noise_seed=self.config.seed,
-            lockstep=self.lockstep,
             topics={name: self.resolve_topic_name(name) for name in topics},
         )
         environ = {**os.environ, "ROS_DOMAIN_ID": str(self.context.get_domain_id())}
         if LARGE_PROFILE in environ:
             environ[PROFILE] = environ[LARGE_PROFILE]
-        speed = 1.0 if self.lockstep else self.config.speed
-        return CameraFeed(setup, environ, first, self._on_no_images, speed)
+        return CameraFeed(setup, environ, first, self._on_no_images, self.config.speed)
 
     def _on_no_images(self, fault: str) -> None:
         if fault:

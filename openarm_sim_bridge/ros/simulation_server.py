@@ -153,7 +153,7 @@ class SimulationServices:
         return "paused" if paused else "running"
 
     async def _step(self, steps: int) -> str:
-        """Not in a worker thread: in lock-step that would wait for steps that wait for it."""
+        """Wait in the executor, not in a worker thread: many steps take long."""
         begun = self._node.in_thread(between_ticks, self._simulation, lambda: self._simulation.advance(steps))
         stepped = Future(executor=self._node.executor)
 

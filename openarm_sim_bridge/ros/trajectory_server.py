@@ -13,14 +13,13 @@ from typing import Any, Generic, TypeVar
 
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
-from rclpy.action import CancelResponse
+from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from openarm_common.errors import OpenArmError
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
-from openarm_common.ros.lockstep_node import NamedActionServer
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_sim_bridge.control.actuation import End, FollowerState, TrajectoryFollower, TrajectoryOutcome
 from openarm_sim_bridge.control.trajectory import JointTolerance, Trajectory, TrajectoryError, TrajectoryResult
@@ -76,9 +75,9 @@ class ArmActionServer:
         self._running: ServerGoalHandle | None = None
         self._columns = [simulation.world.joint_names.index(name) for name in follower.group.names]
         self._feedback_timer = node.create_timer(
-            FEEDBACK_PERIOD_S, self._publish_feedback, clock=node.wall_clock, autostart=False
+            FEEDBACK_PERIOD_S, self._publish_feedback, clock=node.steady_clock, autostart=False
         )
-        self._server = NamedActionServer(
+        self._server = ActionServer(
             node,
             FollowJointTrajectory,
             f"/{side}_joint_trajectory_controller/follow_joint_trajectory",
@@ -87,7 +86,7 @@ class ArmActionServer:
         )
         controller = f"/{side}_joint_trajectory_controller"
         self._states = node.create_publisher(JointTrajectoryControllerState, f"{controller}/controller_state", 10)
-        node.create_timer(STATE_PERIOD_S, self._publish_state, clock=node.wall_clock)
+        node.create_timer(STATE_PERIOD_S, self._publish_state, clock=node.steady_clock)
         node.create_subscription(JointTrajectory, f"{controller}/joint_trajectory", self._on_trajectory, QOS_COMMAND)
 
     def destroy(self) -> None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
@@ -54,7 +56,7 @@ class Eye:
         self.listener.buffer.add_joint_state(t_ms * MS, ARM, [q] * len(ARM))
 
     def posture(self, frame: str, t_ms: int, *, joints: bool = False):
-        return self.listener.posture(frame, t_ms * MS, self.node.monotonic(), joints=joints)
+        return self.listener.posture(frame, t_ms * MS, time.monotonic(), joints=joints)
 
 
 @pytest.mark.parametrize(("frame", "joints"), [(HAND, False), ("openarm_body_link0", True)])

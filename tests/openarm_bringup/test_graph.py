@@ -185,21 +185,3 @@ def test_drawings_show_who_gives_what_to_whom(tmp_path: Path) -> None:
     assert 'bridge -- "/joint_states" --> arm' in mermaid(graph)
     assert "/joint_states → arm" in text(graph)
     assert "after bridge, arm" in text(graph)
-
-
-@pytest.mark.requirement("N-18")
-def test_a_lockstep_gives_its_nodes_their_parameters_and_never_restarts_them(tmp_path: Path) -> None:
-    section = "lockstep: {leader: bridge, participants: [arm]}\n"
-    graph = load_graph(write(tmp_path, BASE + section))
-    assert graph.nodes["bridge"].params["lockstep"] is True
-    assert graph.nodes["bridge"].params["barrier.participants"] == ["arm"]
-    assert graph.nodes["arm"].params == {"lockstep": True}
-    assert "lockstep" not in graph.nodes["hand"].params
-    assert [graph.nodes[name].restart.policy for name in ("bridge", "arm", "hand")] == ["never", "never", "on_failure"]
-    assert graph.nodes["arm"].env == {"PYTHONHASHSEED": "0"}
-
-
-def test_an_unknown_participant_is_refused_with_the_choices(tmp_path: Path) -> None:
-    error = refused(tmp_path, BASE + "lockstep: {leader: bridge, participants: [arm, foot]}\n")
-    assert error.code == Code.CONFIG_INVALID
-    assert "lockstep.participants: unknown node 'foot'; nodes are bridge, arm, hand" in error.message

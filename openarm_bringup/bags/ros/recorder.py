@@ -47,7 +47,7 @@ PROFILES: Mapping[str, tuple[str, ...]] = {
     "all": (".*",),
 }
 #: Not recorded by a profile: a replay would be taken for the simulation or for a parameter service.
-_NEVER = r".*/_action/.*|/parameter_events|/rosout|/sim/tick|/sim/ack"
+_NEVER = r".*/_action/.*|/parameter_events|/rosout"
 _QUEUE_BYTES, _LARGE = 512 * 2**20, 64 * 2**10
 #: More than this waiting to be written: the disk gets it uncompressed, three times as fast.
 _BEHIND_BYTES = 32 * 2**20
