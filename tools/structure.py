@@ -3,7 +3,7 @@
 
     python tools/structure.py [--root DIR] [--against REV] [--chains]
 
-Code lines are lines that hold code: no blank lines, comments, docstrings or vendored files. `web` counts the JavaScript,
+Code lines hold code: no blank lines, comments, docstrings or vendored files. `web` counts the JavaScript,
 CSS and HTML of all packages. A chain is the longest sequence of modules of a package in which each imports the next;
 imports for type checking and `__init__.py` files do not count. `--against` prints another revision next to the working
 tree, `--chains` the modules of each longest chain.
