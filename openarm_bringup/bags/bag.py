@@ -7,8 +7,6 @@ the installed Python class, so that every installed type can be recorded, also a
 
 from __future__ import annotations
 
-import importlib
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,13 +20,13 @@ from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from openarm_bringup.bags.definitions import definition, nested_types
 from openarm_bringup.bags.mcap import DAMAGE, is_closed, mend
+from openarm_bringup.messages import interface
 from openarm_common.errors import Code, OpenArmError
 
-_PRIMITIVES = {"float": "float32", "double": "float64", "boolean": "bool", "octet": "byte"}
 #: Of zstd. Clouds come out smaller at 1 than at its default of 3, in half the time.
 _LEVEL = 1
-_ARRAY = re.compile(r"^sequence<(?P<seq>.+?)(?:, (?P<bound>\d+))?>$|^(?P<arr>.+)\[(?P<size>\d+)\]$")
 
 
 @dataclass(frozen=True)
@@ -39,44 +37,6 @@ class Record:
     type: str
     t_ns: int
     data: bytes
-
-
-def definition(message: type[Any]) -> str:
-    """Return the text of a message's definition, from its Python class.
-
-    Args:
-        message: A class that rosidl generated.
-    """
-    lines = [f"{_ros_type(kind)} {name}" for name, kind in message.get_fields_and_field_types().items()]
-    return "\n".join([*_constants(message), *lines]) + "\n"
-
-
-def _ros_type(kind: str) -> str:
-    match = _ARRAY.match(kind)
-    if match is None:
-        return _PRIMITIVES.get(kind, kind)
-    if match["arr"]:
-        return f"{_ros_type(match['arr'])}[{match['size']}]"
-    return f"{_ros_type(match['seq'])}[{'<=' + match['bound'] if match['bound'] else ''}]"
-
-
-def _constants(message: type[Any]) -> list[str]:
-    # rosidl keeps them on the metaclass, without their type; the hash of a type does not hold constants.
-    values: Mapping[str, Any] = getattr(type(message), f"_{type(message).__name__}__constants", {})
-    kinds = {bool: "bool", int: "int64", float: "float64", str: "string", bytes: "byte"}
-    return [f"{kinds[type(value)]} {name}={value!r}" for name, value in values.items() if type(value) in kinds]
-
-
-def nested_types(message: type[Any]) -> list[str]:
-    """Names, such as `std_msgs/msg/Header`, of the types of a message's fields that are messages themselves."""
-    found: list[str] = []
-    for kind in message.get_fields_and_field_types().values():
-        match = _ARRAY.match(kind)
-        base = (match["seq"] or match["arr"]) if match else kind
-        if "/" in base:
-            package, _, short = base.partition("/")
-            found.append(f"{package}/msg/{short.removeprefix('msg/')}")
-    return found
 
 
 class Types:
@@ -93,25 +53,10 @@ class Types:
         """
         if name in self.store.types:
             return
-        message = message_class(name)
+        message = interface(name)
         for inner in nested_types(message):
             self.add(inner)
         self.store.register(get_types_from_msg(definition(message), name))
-
-
-def message_class(name: str) -> type[Any]:
-    """Return the installed class of a message type.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, when there is none.
-    """
-    package, _, short = name.replace("/msg/", "/").partition("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), short)
-    except (AttributeError, ModuleNotFoundError, ValueError) as error:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT, f"no installed package has the message type {name!r} ({error})"
-        ) from error
 
 
 class BagWriter:

@@ -1,13 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Message definitions with all that they are made of, as MCAP and Foxglove expect them (`ros2msg`)."""
+"""Text of message definitions (`ros2msg`), made from the installed Python classes."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from openarm_bringup.bags.bag import definition, message_class, nested_types
+from openarm_bringup.messages import SEQUENCE, interface
 
 _LINE = "=" * 80
+_PRIMITIVES = {"float": "float32", "double": "float64", "boolean": "bool", "octet": "byte"}
+
+
+def definition(message: type[Any]) -> str:
+    """Return the text of a message's definition, from its Python class.
+
+    Args:
+        message: A class that rosidl generated.
+    """
+    lines = [f"{_ros_type(kind)} {name}" for name, kind in message.get_fields_and_field_types().items()]
+    return "\n".join([*_constants(message), *lines]) + "\n"
+
+
+def _ros_type(kind: str) -> str:
+    match = SEQUENCE.match(kind)
+    if match is None:
+        return _PRIMITIVES.get(kind, kind)
+    if match["array"]:
+        return f"{_ros_type(match['array'])}[{match['size']}]"
+    return f"{_ros_type(match['of'])}[{'<=' + match['most'] if match['most'] else ''}]"
+
+
+def _constants(message: type[Any]) -> list[str]:
+    # rosidl keeps them on the metaclass, without their type; the hash of a type does not hold constants.
+    values: Mapping[str, Any] = getattr(type(message), f"_{type(message).__name__}__constants", {})
+    kinds = {bool: "bool", int: "int64", float: "float64", str: "string", bytes: "byte"}
+    return [f"{kinds[type(value)]} {name}={value!r}" for name, value in values.items() if type(value) in kinds]
+
+
+def nested_types(message: type[Any]) -> list[str]:
+    """Names, such as `std_msgs/msg/Header`, of the types of a message's fields that are messages themselves."""
+    found: list[str] = []
+    for kind in message.get_fields_and_field_types().values():
+        match = SEQUENCE.match(kind)
+        base = (match["seq"] or match["array"]) if match else kind
+        if "/" in base:
+            package, _, short = base.partition("/")
+            found.append(f"{package}/msg/{short.removeprefix('msg/')}")
+    return found
 
 
 def full_definition(message: type[Any]) -> str:
@@ -22,7 +62,7 @@ def full_definition(message: type[Any]) -> str:
         if name in seen:
             continue
         seen.add(name)
-        kind = message_class(name)
+        kind = interface(name)
         parts.append(f"{_LINE}\nMSG: {name.replace('/msg/', '/')}\n{definition(kind)}")
         waiting += nested_types(kind)
     return "".join(parts)

@@ -144,14 +144,14 @@ def _all(
     told: CalibrationListeners,
     stop: threading.Event,
 ) -> None:
-    from openarm_bringup.calibration.ros.scene import SceneClient
+    from openarm_bringup.ros.simulation import reset_world
     from openarm_calibration.ros.client import CalibrationClient
 
-    with SceneClient() as scenes, CalibrationClient() as client:
+    with CalibrationClient() as client:
         for k, camera in enumerate(cameras):
             told.on_camera(camera)
             if k:
-                scenes.reset_world(scene_of(camera))
+                reset_world(client, scene_of(camera))
             run.results[camera] = client.auto(
                 camera,
                 poses=options.poses,

@@ -75,7 +75,7 @@ def echo(
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.ros.messages import interface, to_data
+    from openarm_bringup.messages import interface, to_data
     from openarm_bringup.ros.peer import Peer, find
     from openarm_common.ros.node import QOS_LATCHED
 
@@ -113,7 +113,7 @@ def hz(name: str, *, seconds: float = 5.0, domain: int | None = None) -> Outcome
     """
     meet_graph(domain)
     from openarm_bringup.bags.losses import Arrivals
-    from openarm_bringup.ros.messages import interface
+    from openarm_bringup.messages import interface
     from openarm_bringup.ros.peer import Peer, find
 
     at: list[float] = []
@@ -171,7 +171,7 @@ def pub(
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.ros.messages import fill, interface, type_and_fields
+    from openarm_bringup.messages import fill, interface, type_and_fields
     from openarm_bringup.ros.peer import Peer, find
     from openarm_common.ros.node import QOS_COMMAND
 
@@ -222,7 +222,7 @@ def call(name: str, *request: str, timeout: float = 30.0, domain: int | None = N
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.ros.messages import fields_of, fill, interface, to_data
+    from openarm_bringup.messages import fields_of, fill, interface, to_data
     from openarm_bringup.ros.peer import Peer, find
 
     with Peer() as peer:
@@ -267,7 +267,7 @@ def send(
         domain: ROS_DOMAIN_ID of the graph.
     """
     meet_graph(domain)
-    from openarm_bringup.ros.messages import fields_of, fill, interface, to_data
+    from openarm_bringup.messages import fields_of, fill, interface, to_data
     from openarm_bringup.ros.peer import Peer, find
 
     def tell(message: Any) -> None:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from cyclopts import App
 
 from openarm_bringup.commands.pick import meet_graph
-from openarm_bringup.meant import unknown
 from openarm_bringup.outcome import Outcome
+from openarm_bringup.suggest import unknown
 from openarm_bringup.view.tree_picture import Row, check, write
 from openarm_common.errors import Code, OpenArmError
 

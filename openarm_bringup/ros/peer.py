@@ -1,29 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node for the length of one command: it looks at a graph, listens and asks, and waits with deadlines."""
+"""A node for the length of one command: it inspects a graph, subscribes and asks, and waits with deadlines."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import rclpy
 from numpy.typing import NDArray
 from rclpy.action import ActionClient
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile
-from rclpy.signals import SignalHandlerOptions
 from tf2_msgs.msg import TFMessage
 
-from openarm_bringup.meant import unknown
-from openarm_bringup.ros.messages import to_data
+from openarm_bringup.messages import to_data
+from openarm_bringup.suggest import unknown
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.client import ContextNode
 from openarm_common.ros.convert import transform_to_matrix
 from openarm_common.ros.node import QOS_STATIC_TF, QOS_TF, offered_qos
 
@@ -37,22 +34,16 @@ _OF_ALL_NODES = ("rcl_interfaces/srv/", "type_description_interfaces/srv/")
 _ANSWER_S = 5.0
 
 
-class Peer:
-    """A node and its executor; a context manager. Inside, those who run are known.
+class Peer(ContextNode):
+    """A hidden node; a context manager, in which the nodes that run are discovered.
 
     Raises:
-        OpenArmError: NOT_READY, on entering, when nobody runs.
+        OpenArmError: NOT_READY, on entering, when no node runs.
     """
 
     def __init__(self) -> None:
-        self._context = Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        name = f"_openarm_cli_{os.getpid()}"  # hidden, as those of ros2cli
-        self.node: Any = rclpy.create_node(
-            name, context=self._context, use_global_arguments=False, start_parameter_services=False, enable_rosout=False
-        )
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
+        super().__init__(f"_openarm_cli_{os.getpid()}", bare=True)  # hidden, as those of ros2cli
+        self.node = self._node
 
     def __enter__(self) -> Peer:
         began = changed = time.monotonic()
@@ -67,7 +58,7 @@ class Peer:
                 break
             self._executor.spin_once(timeout_sec=0.05)
         if not self.nodes():
-            self.__exit__()
+            self.close()
             reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
             raise OpenArmError(
                 Code.NOT_READY,
@@ -75,31 +66,6 @@ class Peer:
                 "`openarm up`, or set both as they are set where it runs (--domain N says the domain, too)",
             )
         return self
-
-    def __exit__(self, *_: object) -> None:
-        self._executor.shutdown(timeout_sec=1.0)
-        self.node.destroy_node()
-        self._context.try_shutdown()
-
-    def spin_until(self, condition: Callable[[], Any], seconds: float) -> bool:
-        """Work on what arrives until a condition holds; returns whether it did in time."""
-        deadline = time.monotonic() + seconds
-        while not condition():
-            left = deadline - time.monotonic()
-            if left <= 0.0:
-                return False
-            self._executor.spin_once(timeout_sec=min(left, 0.1))
-        return True
-
-    def result(self, future: Any, seconds: float, what: str) -> Any:
-        """Wait for a future.
-
-        Raises:
-            OpenArmError: TIMEOUT, saying what was waited for.
-        """
-        if not self.spin_until(future.done, seconds):
-            raise OpenArmError(Code.TIMEOUT, f"{what}: no answer within {seconds:g} s")
-        return future.result()
 
     def nodes(self) -> list[str]:
         """Full names of the nodes, without hidden ones."""

@@ -11,7 +11,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from openarm_bringup.meant import unknown
+from openarm_bringup.suggest import unknown
 from openarm_bringup.supervision import environment, shm
 from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready
 from openarm_bringup.supervision.process import Haste, Ladder, NodeProcess

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node that spins in the background, for programs that ask something of the graph and wait for the answer."""
+"""Nodes of programs that ask something of the graph: in a context of their own, spun by the caller or by a thread."""
 
 from __future__ import annotations
 
@@ -28,25 +28,29 @@ _GONE = 20
 _UP = "is the graph up, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE?"
 
 
-class BackgroundNode:
-    """A context manager with a ROS context, node and thread of its own, so that it also works beside an rclpy program.
+class ContextNode:
+    """A node in a ROS context of its own, so that it works next to an rclpy program; a context manager.
+
+    Nothing spins it but `spin_until`. Ctrl-C stays the caller's.
 
     Args:
-        name: Of the node.
-        timeout: Longest wait for a server to be there, s of wall clock.
+        name: Of the node; names that begin with _ are hidden.
+        domain: ROS_DOMAIN_ID; None takes the environment's.
+        bare: Without parameter services and /rosout.
     """
 
-    def __init__(self, name: str, *, timeout: float = 10.0) -> None:
-        self._timeout = timeout
+    def __init__(self, name: str, *, domain: int | None = None, bare: bool = False) -> None:
         self._context = Context()
-        # Ctrl-C stays the caller's.
-        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node = Node(name, context=self._context, use_global_arguments=False)
+        rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+        self._node: Any = Node(
+            name,
+            context=self._context,
+            use_global_arguments=False,
+            start_parameter_services=not bare,
+            enable_rosout=not bare,
+        )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._clients: dict[str, Any] = {}
-        self._thread = threading.Thread(target=self._spin, name=name, daemon=True)
-        self._thread.start()
 
     def __enter__(self) -> Self:
         return self
@@ -55,13 +59,54 @@ class BackgroundNode:
         self.close()
 
     def close(self) -> None:
+        """Leave the graph."""
+        if self._context.ok():
+            self._executor.shutdown(timeout_sec=2.0)
+            self._node.destroy_node()
+            self._context.try_shutdown()
+
+    def spin_until(self, condition: Callable[[], Any], seconds: float) -> bool:
+        """Handle what arrives until a condition holds; return whether it did in time."""
+        deadline = time.monotonic() + seconds
+        while not condition():
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return False
+            self._executor.spin_once(timeout_sec=min(left, 0.1))
+        return True
+
+    def result(self, future: Any, seconds: float, what: str) -> Any:
+        """Spin until a future is done and return its result.
+
+        Raises:
+            OpenArmError: TIMEOUT, naming `what` did not answer.
+        """
+        if not self.spin_until(future.done, seconds):
+            raise OpenArmError(Code.TIMEOUT, f"{what}: no answer within {seconds:g} s")
+        return future.result()
+
+
+class BackgroundNode(ContextNode):
+    """A node that spins in a thread of its own: its methods block, and answers are awaited with deadlines.
+
+    Args:
+        name: Of the node.
+        domain: ROS_DOMAIN_ID; None takes the environment's.
+        timeout: Longest wait for a server to be there, s of wall clock.
+    """
+
+    def __init__(self, name: str, *, domain: int | None = None, timeout: float = 10.0) -> None:
+        super().__init__(name, domain=domain)
+        self._timeout = timeout
+        self._clients: dict[str, Any] = {}
+        self._thread = threading.Thread(target=self._spin, name=name, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
         """Stop the thread and leave the graph."""
-        if not self._context.ok():
-            return
         self._executor.shutdown(timeout_sec=2.0)
         self._thread.join(timeout=5.0)
-        self._node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
+        super().close()
 
     def call(self, kind: Any, name: str, request: Any, timeout: float = 60.0) -> Any:
         """Call a service and return its response.

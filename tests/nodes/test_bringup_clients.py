@@ -79,7 +79,7 @@ def test_probe_lists_parameters_and_says_who_does_not_answer(ros, probe: Readine
     finally:
         spinning.set()
         spinner.join()
-    with pytest.raises(OpenArmError, match="/nobody/list_parameters did not answer") as caught:
+    with pytest.raises(OpenArmError, match="/nobody/list_parameters: no answer within") as caught:
         probe.parameters("nobody", timeout_s=0.2)
     assert caught.value.code == Code.TIMEOUT
 

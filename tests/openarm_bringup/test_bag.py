@@ -9,10 +9,12 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import String
 
-from openarm_bringup.bags.bag import BagWriter, definition, message_class, open_bag
+from openarm_bringup.bags.bag import BagWriter, open_bag
+from openarm_bringup.bags.definitions import definition
 from openarm_bringup.bags.mcap import whole_chunks
 from openarm_bringup.bags.ros.player import to_profile
 from openarm_bringup.bags.ros.recorder import from_profile
+from openarm_bringup.messages import interface
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 
@@ -146,11 +148,11 @@ def test_folders_that_are_no_bag_and_bags_that_exist_are_refused(tmp_path: Path)
 
 
 def test_a_definition_has_constants_arrays_and_bounds() -> None:
-    text = definition(message_class("sensor_msgs/msg/JointState"))
+    text = definition(interface("sensor_msgs/msg/JointState"))
     assert "float64[] position" in text
-    assert "int64 CUBE=1" in definition(message_class("visualization_msgs/msg/Marker"))
+    assert "int64 CUBE=1" in definition(interface("visualization_msgs/msg/Marker"))
     with pytest.raises(OpenArmError, match="no_such_msgs"):
-        message_class("no_such_msgs/msg/Thing")
+        interface("no_such_msgs/msg/Thing")
 
 
 @pytest.mark.parametrize("profile", [QOS_COMMAND, QOS_LATCHED, QOS_SENSOR])

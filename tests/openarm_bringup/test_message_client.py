@@ -9,8 +9,8 @@ from openarm_interfaces.srv import Grasp
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import UInt8
 
-from openarm_bringup.meant import unknown
-from openarm_bringup.ros.messages import fill, interface, to_data
+from openarm_bringup.messages import fill, interface, to_data
+from openarm_bringup.suggest import unknown
 from openarm_common.errors import OpenArmError
 
 

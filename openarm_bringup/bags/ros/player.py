@@ -8,21 +8,21 @@ import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
-import rclpy
-from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 
-from openarm_bringup.bags.bag import Bag, Record, message_class
+from openarm_bringup.bags.bag import Bag, Record
+from openarm_bringup.messages import interface
 from openarm_bringup.supervision.environment import profiled, write_profile
 from openarm_bringup.supervision.graph import NodeSpec
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.client import ContextNode
 from openarm_common.ros.convert import ns_to_stamp
 
 _CLOCK = "/clock"
@@ -35,7 +35,7 @@ _MEET_S = 4.0
 _SETTLE_S = 1.0
 
 
-class Player:
+class Player(ContextNode):
     """Publishers for the topics of a bag; a context manager.
 
     Args:
@@ -58,17 +58,15 @@ class Player:
         self._folder = tempfile.TemporaryDirectory()
         spec = NodeSpec(module="openarm_bringup", large_messages=True, segment_mib=24)
         profile = write_profile(spec, Path(self._folder.name) / "fastdds.xml")
-        self._context = Context()
         with profiled(profile):
-            rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-            self._node = rclpy.create_node("openarm_player", context=self._context, use_global_arguments=False)
+            super().__init__("openarm_player")
         self._publishers: dict[str, Publisher] = {}
         missing: set[str] = set()
         for topic, (kind, qos) in bag.topics.items():
             if topics is not None and topic not in topics:
                 continue
             try:
-                message = message_class(kind)
+                message = interface(kind)
             except OpenArmError:
                 missing.add(kind)
                 continue
@@ -94,7 +92,7 @@ class Player:
             if self._all:
                 self._yield_to_graph()
         except OpenArmError:
-            self.__exit__()
+            self.close()
             raise
         return self
 
@@ -119,9 +117,9 @@ class Player:
             self.left.append(name)
             self._node.destroy_publisher(self._publishers.pop(topic))
 
-    def __exit__(self, *_: object) -> None:
-        self._node.destroy_node()
-        self._context.try_shutdown()
+    def close(self) -> None:
+        """Leave the graph."""
+        super().close()
         self._folder.cleanup()
 
     def play(self, rate: float, start: float, duration: float, stop: threading.Event) -> None:
@@ -190,24 +188,18 @@ class Player:
                 heard[topic] = time.monotonic()
 
             try:
-                kind = message_class(kinds[0])
+                kind = interface(kinds[0])
             except OpenArmError:
                 continue
             profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
             self._node.create_subscription(kind, topic, note, profile, raw=True)
-        executor = SingleThreadedExecutor(context=self._context)
-        executor.add_node(self._node)
         limit = time.monotonic() + limit_s
-        try:
+        with suppress(ExternalShutdownException):  # the end of the process
             while (now := time.monotonic()) - max(heard.values()) < quiet_s:
                 if now > limit:
                     topic = max(heard, key=lambda key: heard[key])
                     raise OpenArmError(Code.TIMEOUT, f"{topic} is still published {limit_s:g} s after the bag's end")
-                executor.spin_once(timeout_sec=0.1)
-        except ExternalShutdownException:
-            pass  # the context was shut down by the end of the process
-        finally:
-            executor.remove_node(self._node)
+                self._executor.spin_once(timeout_sec=0.1)
 
 
 def to_profile(qos: Qos | None) -> QoSProfile:

@@ -19,18 +19,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import rclpy
-from rclpy.context import Context
 from rclpy.qos import LivelinessPolicy, QoSProfile
-from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-from openarm_bringup.bags.bag import BagWriter, message_class
+from openarm_bringup.bags.bag import BagWriter
 from openarm_bringup.bags.losses import Arrivals
+from openarm_bringup.messages import interface
 from openarm_bringup.supervision.environment import PROFILE, profiled
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
+from openarm_common.ros.client import ContextNode
 from openarm_common.ros.node import offered_qos
 
 #: What the profiles record: regular expressions of whole topic names.
@@ -97,7 +96,7 @@ class _Message(NamedTuple):
     data: bytes
 
 
-class Recorder:
+class Recorder(ContextNode):
     """Records until `stop`; a context manager.
 
     Args:
@@ -127,11 +126,9 @@ class Recorder:
         self._bytes_in = self._bytes_out = 0  # each counted by one thread
         self._topics: set[str] = set()
         self._readers: list[tuple[Subscription, Take]] = []
-        self._context = Context()
         profile = os.environ.get(PROFILE) or config_dir() / "fastdds_recorder.xml"  # a user's own comes first
         with profiled(Path(profile)):
-            rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-            self._node = rclpy.create_node("openarm_recorder", context=self._context, use_global_arguments=False)
+            super().__init__("openarm_recorder", domain=domain)
         self._end = threading.Event()
         self._began = threading.Event()
         self._changed = threading.Condition()
@@ -146,13 +143,13 @@ class Recorder:
             thread.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+    def close(self) -> None:
+        """End the recording and close the bag."""
         self._end.set()
         self._threads[0].join()
         self._queue.put(None)
         self._threads[1].join()
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        super().close()
         full = OSError(self.recorded.ended) if self.recorded.ended else None
         self._bag.remember("lost", str(self.recorded.lost.total()))
         self._bag.__exit__(type(full) if full else None, full, None)
@@ -216,7 +213,7 @@ class Recorder:
                 continue
             self._topics.add(topic)
             try:
-                kind = message_class(kinds[0])
+                kind = interface(kinds[0])
             except OpenArmError as error:
                 self._node.get_logger().warning(f"{topic} is not recorded: {error.message}")
                 continue

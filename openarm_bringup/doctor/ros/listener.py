@@ -9,7 +9,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
 from openarm_bringup.doctor.graph import RATES, Heard
-from openarm_bringup.ros.messages import interface
+from openarm_bringup.messages import interface
 from openarm_bringup.ros.peer import Peer
 from openarm_bringup.supervision.runs import RunRecord
 from openarm_common.errors import Code, OpenArmError

@@ -7,25 +7,20 @@ identifiers: those that were there before a (re)start do not count.
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import rclpy
 from rcl_interfaces.srv import ListParameters
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 
+from openarm_bringup.messages import interface
 from openarm_bringup.supervision.graph import Ready
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.client import ContextNode
 
 
-class ReadinessClient:
+class ReadinessClient(ContextNode):
     """The probe of a supervisor. Not for use from two threads at once.
 
     Args:
@@ -34,17 +29,7 @@ class ReadinessClient:
 
     def __init__(self, environ: Mapping[str, str]) -> None:
         os.environ.update(environ)  # rmw reads the discovery range from the process environment
-        self._context = Context()
-        rclpy.init(
-            context=self._context,
-            domain_id=int(environ["ROS_DOMAIN_ID"]),
-            signal_handler_options=SignalHandlerOptions.NO,
-        )
-        self._node: Node = rclpy.create_node(
-            f"openarm_probe_{os.getpid()}", context=self._context, use_global_arguments=False
-        )
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        super().__init__(f"openarm_probe_{os.getpid()}", domain=int(environ["ROS_DOMAIN_ID"]))
         self._waiting: dict[str, Subscription] = {}
         self._received: set[str] = set()
 
@@ -68,21 +53,11 @@ class ReadinessClient:
         """
         client = self._node.create_client(ListParameters, f"/{node}/list_parameters")
         try:
-            if client.wait_for_service(timeout_sec=timeout_s):
-                future = client.call_async(ListParameters.Request())
-                self._executor.spin_until_future_complete(future, timeout_sec=timeout_s)
-                answer = future.result()
-                if answer is not None:
-                    return frozenset(answer.result.names)
+            ready = self.spin_until(client.service_is_ready, timeout_s)
+            answer = client.call_async(ListParameters.Request())
+            return frozenset(self.result(answer, timeout_s if ready else 0.0, client.srv_name).result.names)
         finally:
             self._node.destroy_client(client)
-        raise OpenArmError(Code.TIMEOUT, f"/{node}/list_parameters did not answer within {timeout_s:g} s")
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._executor.shutdown(timeout_sec=1.0)
-        self._node.destroy_node()
-        self._context.try_shutdown()
 
     def _met(self, condition: Ready, old: frozenset[str]) -> bool:
         if condition.kind == "message":
@@ -106,7 +81,7 @@ class ReadinessClient:
             infos = self._node.get_publishers_info_by_topic(topic)
             new = next((info for info in infos if bytes(info.endpoint_gid).hex() not in old), None)
             if new is not None:
-                kind, profile = _message_type(new.topic_type), _like(new.qos_profile)
+                kind, profile = interface(new.topic_type), _like(new.qos_profile)
                 self._waiting[topic] = self._node.create_subscription(
                     kind, topic, self._receiver(topic), profile, raw=True
                 )
@@ -131,12 +106,3 @@ class ReadinessClient:
 def _like(offered: QoSProfile) -> QoSProfile:
     """Return a profile that the publisher can serve, with its latched message if it keeps one."""
     return QoSProfile(depth=1, reliability=offered.reliability, durability=offered.durability)
-
-
-def _message_type(name: str) -> Any:
-    """Import a message class from its ROS name, such as sensor_msgs/msg/Image."""
-    package, kind, message = name.split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.{kind}"), message)
-    except (ImportError, AttributeError) as error:
-        raise OpenArmError(Code.ENVIRONMENT, f"message type {name} is not installed here") from error

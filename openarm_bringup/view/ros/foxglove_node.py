@@ -20,9 +20,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
-from openarm_bringup.bags.bag import message_class
 from openarm_bringup.bags.definitions import full_definition
-from openarm_bringup.ros.messages import interface
+from openarm_bringup.messages import interface
 from openarm_bringup.view.guard import LOOPBACK, Guard
 from openarm_bringup.view.proxy import Door, hidden_address
 from openarm_bringup.view.ros.layers import Polled
@@ -127,7 +126,7 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
 
     def _advertise(self, topic: str, name: str) -> None:
         try:
-            kind = message_class(name)
+            kind = interface(name)
         except OpenArmError as error:
             self._unknown.add(topic)
             self.get_logger().warning(f"{topic} is not shown: {error.message}")

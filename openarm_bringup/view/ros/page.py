@@ -9,20 +9,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import rclpy
 from action_msgs.srv import CancelGoal
 from openarm_interfaces.action import Pick
 from openarm_interfaces.srv import ResetWorld
-from rclpy.context import Context
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from openarm_bringup.view.ros.layers import Layer, makers
 from openarm_bringup.view.server import Item, Order, Reset
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.client import BackgroundNode
+from openarm_common.ros.client import BackgroundNode, ContextNode
 
 #: Camera whose cloud is shown.
 CLOUD_CAMERA = "overhead"
@@ -31,7 +27,7 @@ _PICK_S = 900.0
 _ANSWER_S = 30.0
 
 
-class GraphView:
+class GraphView(ContextNode):
     """Looks at the graph and asks it; a context manager.
 
     Args:
@@ -49,11 +45,7 @@ class GraphView:
         self._makers = makers(self.description, self.cameras, CLOUD_CAMERA)
         self._wanted: frozenset[str] = frozenset()
         self._ask = BackgroundNode("openarm_view", timeout=timeout)
-        self._context = Context()
-        rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        self._node: Node = rclpy.create_node(
-            "openarm_view_layers", context=self._context, use_global_arguments=False, start_parameter_services=False
-        )
+        super().__init__("openarm_view_layers", bare=True)
         self._ended = threading.Event()
         self._stop_picking = threading.Event()
         self._picking = threading.Lock()
@@ -63,13 +55,13 @@ class GraphView:
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the thread and the grasp that was asked for here, and leave the graph."""
         self._ended.set()
         self._stop_picking.set()
         self._thread.join(timeout=5.0)
         self._picking.acquire(timeout=5.0)  # until the grasp that was asked for here knows that it is cancelled
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        super().close()
         self._ask.close()
 
     @property

@@ -6,27 +6,23 @@ Runs in a thread and a ROS context of its own, so that whoever asks for grasps i
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
-import rclpy
 from openarm_interfaces.msg import GraspStatus, ObjectState, ObjectStateArray
-from openarm_interfaces.srv import ResetWorld
-from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image, JointState
 
+from openarm_bringup.ros.simulation import reset_world
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.client import BackgroundNode
 from openarm_common.ros.convert import image_to_array, stamp_to_ns
+from openarm_common.ros.node import reliable
 from openarm_evaluation.judging.film import Picture
 from openarm_evaluation.judging.judge import Sample
 from openarm_evaluation.judging.trial import Step
@@ -34,9 +30,8 @@ from openarm_evaluation.judging.trial import Step
 T = TypeVar("T")
 Frame = tuple[int, Picture]
 
-_RELIABLE = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
+_RELIABLE, _NEWEST = reliable(20), QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 _LATCHED = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_NEWEST = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 @dataclass(frozen=True)
@@ -48,8 +43,8 @@ class Truth:
     labels: Mapping[str, str]
 
 
-class Observer:
-    """A context manager; inside it, everything is watched.
+class Observer(BackgroundNode):
+    """Watches a running graph in a thread of its own; a context manager.
 
     Args:
         domain: ROS_DOMAIN_ID of the graph.
@@ -57,11 +52,6 @@ class Observer:
     """
 
     def __init__(self, domain: int, on_step: Callable[[Step], None] | None = None) -> None:
-        self._context = Context()
-        rclpy.init(context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-        self._node: Node = rclpy.create_node("openarm_observer", context=self._context, use_global_arguments=False)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
         self._changed = threading.Condition()
         self._on_step = on_step
         self._truth: Truth | None = None
@@ -71,20 +61,9 @@ class Observer:
         self._joint_states: Subscription | None = None
         self._cameras: dict[str, Subscription] = {}
         self._frames: dict[str, Frame] = {}
+        super().__init__("openarm_observer", domain=domain)
         self._node.create_subscription(ObjectStateArray, "/sim/ground_truth/objects", self._on_truth, _RELIABLE)
         self._node.create_subscription(GraspStatus, "/grasp/status", self._on_status, _LATCHED)
-        self._reset = self._node.create_client(ResetWorld, "/sim/reset_world")
-        self._thread = threading.Thread(target=self._spin, name="observer", daemon=True)
-
-    def __enter__(self) -> Observer:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._executor.shutdown(timeout_sec=1.0)
-        self._context.try_shutdown()
-        self._thread.join(timeout=2.0)
-        self._node.destroy_node()
 
     def wait(self, condition: Callable[[], T | None], seconds: float, what: str) -> T:
         """Wait until `condition` gives something.
@@ -162,19 +141,8 @@ class Observer:
         Raises:
             OpenArmError: SCENE_INVALID, when the bridge refused it; TIMEOUT, when it did not answer.
         """
-        future = self._call(self._reset, ResetWorld.Request(scene=scene, seed=seed))
-        self.wait(lambda: future.done() or None, timeout_s, "an answer of /sim/reset_world")
-        answer = future.result()
-        if not answer.success:
-            raise OpenArmError(Code.SCENE_INVALID, f"/sim/reset_world refused: {answer.message}")
+        reset_world(self, scene, seed, timeout_s)
         return self._truth.t_ns if self._truth is not None else 0
-
-    def _call(self, client: Any, request: Any) -> Any:
-        if not client.wait_for_service(timeout_sec=10.0):
-            raise OpenArmError(Code.TIMEOUT, f"{client.srv_name} has no server")
-        future = client.call_async(request)
-        self._executor.wake()
-        return future
 
     def _on_truth(self, message: ObjectStateArray) -> None:
         t_ns = stamp_to_ns(message.header.stamp)
@@ -207,10 +175,6 @@ class Observer:
             self._changed.notify_all()
         if self._on_step is not None:
             self._on_step(step)
-
-    def _spin(self) -> None:
-        with contextlib.suppress(ExternalShutdownException):  # __exit__ has shut the context down
-            self._executor.spin()
 
 
 def _sample(t_ns: int, state: ObjectState) -> Sample:

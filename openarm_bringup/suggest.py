@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What somebody perhaps meant, who named a thing that is not there."""
+"""Suggestions for a name that does not exist."""
 
 from __future__ import annotations
 
@@ -13,7 +13,13 @@ _MOST = 40
 
 
 def unknown(what: str, name: str, known: Iterable[str]) -> OpenArmError:
-    """Return an error that says what was meant, as far as that can be told."""
+    """Return the error of a name that does not exist, with similar names, or with all that exist.
+
+    Args:
+        what: Kind of the name, such as "topic".
+        name: As it was given.
+        known: All that exist.
+    """
     names = sorted(known)
     near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
     near += [other for other in names if name.strip("/") and name.strip("/") in other and other not in near][:3]

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from openarm_bringup.meant import unknown
+from openarm_bringup.suggest import unknown
 from openarm_common.errors import Code, OpenArmError
 
 _KINDS = ("msg", "srv", "action")
 _INTEGER = re.compile(r"(?P<unsigned>u?)int(?P<bits>8|16|32|64)|octet")
-_SEQUENCE = re.compile(r"^sequence<(?P<of>.+?)(, (?P<most>\d+))?>$|^(?P<array>.+)\[(?P<size>\d+)\]$")
+#: A field of several values: `of` and `most`, or `array` and `size`.
+SEQUENCE = re.compile(r"^sequence<(?P<of>.+?)(, (?P<most>\d+))?>$|^(?P<array>.+)\[(?P<size>\d+)\]$")
 
 
 def interface(name: str) -> Any:
@@ -82,7 +83,7 @@ def fill(message: Any, data: Any, where: str = "") -> Any:
 
 
 def _value(present: Any, kind: str, value: Any, where: str) -> Any:
-    match = _SEQUENCE.match(kind)
+    match = SEQUENCE.match(kind)
     if match is not None:
         inner = match["of"] or match["array"]
         if not isinstance(value, list | tuple):
