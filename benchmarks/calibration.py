@@ -22,7 +22,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
@@ -31,10 +30,10 @@ from openarm_calibration.handeye.refine import Noise
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.synthetic import synthetic
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 
 ROBOTS = {"exact": (0.0, 0.0), "0.2mm/0.02deg": (2e-4, math.radians(0.02))}
 SETUPS: tuple[Setup, ...] = ("in_hand", "to_hand")
-Array = NDArray[np.float64]
 
 
 @dataclass

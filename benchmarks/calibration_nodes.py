@@ -22,7 +22,6 @@ from typing import Any
 os.environ.setdefault("MUJOCO_GL", "egl")
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.report import Row, write_report
 from openarm_bringup.calibration.run import CalibrationOptions, as_row, run_calibration
@@ -32,9 +31,9 @@ from openarm_calibration.sampling.session_file import load_session
 from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.types import Array
 from openarm_evaluation.demo.demo import parse_seeds
 
-Array = NDArray[np.float64]
 #: Predicted errors that are never reached, so that the whole budget of poses is used: m, rad.
 WHOLE_BUDGET = (1e-9, 1e-9)
 FEW = 10

@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription, Side, mirror
 from openarm_common.scene.scene import Scene, SceneObject, Table
+from openarm_common.types import Array
 from openarm_sim_bridge.world.model import PhysicsConfig, compile_model
 
-Array = NDArray[np.float64]
 TABLE = Table()
 OPEN, LIFT, BACK = 0.044, 0.12, 0.08
 SHOULDER, UPPER, FORE, HAND = np.array([0.0, -0.1535, 0.698]), 0.220, 0.216, 0.1801

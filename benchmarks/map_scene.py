@@ -18,6 +18,7 @@ from openarm_common.camera.housings import with_housings
 from openarm_common.octree.lattice import Lattice
 from openarm_common.robot.description import SIDES, RobotDescription
 from openarm_common.scene.scene import Scene
+from openarm_common.types import Array
 from openarm_octomap.grid import DepthScan
 from openarm_octomap.mapper import Frame
 from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
@@ -25,7 +26,6 @@ from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
 from openarm_sim_bridge.world.model import compile_model
 from openarm_sim_bridge.world.world import Snapshot
 
-Array = NDArray[np.float64]
 _D435 = DepthNoiseConfig()
 
 

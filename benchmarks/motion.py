@@ -27,7 +27,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.motion_ik import ik_rows
 from benchmarks.motion_problems import (
@@ -45,6 +44,7 @@ from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.types import Array
 from openarm_motion.collision.collision import box_from
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.seen import Known
@@ -54,7 +54,6 @@ from openarm_motion.planning.both import BothArms
 from openarm_motion.planning.fast_planner import FastPlanner
 from openarm_motion.planning.planner import OmplPlanner, Planner, PlanQuery
 
-Array = NDArray[np.float64]
 #: A problem counts as feasible when some planner finds a path within this time, s.
 _LONG = 20.0
 _COAL = "OMPL RRTConnect, coal alone"

@@ -14,15 +14,14 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from benchmarks.report import Row
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.types import Scene, Table
+from openarm_common.types import Array
 from openarm_motion.planning.arm import Arm
 from openarm_sim_bridge.world.model import compile_model
 
-Array = NDArray[np.float64]
 #: What counts as reached: position (m) and rotation (rad).
 TOLERANCE = (1e-4, 1e-3)
 #: Seed of the poses.

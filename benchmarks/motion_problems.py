@@ -8,16 +8,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.motion_map import rendered
 from openarm_common import se3
+from openarm_common.types import Array
 from openarm_motion.collision.seen import NOTHING, Known
 from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.both import BothArms
 
-Array = NDArray[np.float64]
 #: Whether configurations collide that are free of everything else is asked of this.
 Collides = Callable[[Array], bool]
 

@@ -26,7 +26,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.motion_problems import around_box, random_free, table_boxes
 from benchmarks.motion_stand import FAR, Seen, Stand
@@ -37,6 +36,7 @@ from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
+from openarm_common.types import Array
 from openarm_motion.collision.collision import Box, box_from
 from openarm_motion.collision.seen import Known
 from openarm_motion.config import MotionConfig
@@ -47,8 +47,6 @@ from openarm_motion.planning.both import BothArms
 from openarm_motion.planning.together import BothGoals, plan_staggered, plan_together
 from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 #: Plans of one scene.
 _A_SCENE = 10

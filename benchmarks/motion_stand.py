@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
@@ -22,8 +21,6 @@ from openarm_sim_bridge.control.trajectory import Trajectory as Commanded
 from openarm_sim_bridge.world.model import PhysicsConfig, build_spec
 from openarm_sim_bridge.world.stage import Stage
 from openarm_sim_bridge.world.world import World
-
-Array = NDArray[np.float64]
 
 #: Distances of the arms are looked for up to here, m.
 FAR = 0.3

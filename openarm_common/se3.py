@@ -10,9 +10,9 @@ them.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 
 def identity() -> Array:

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, generate_binary_structure
 
+from openarm_common.types import Bytes
 from openarm_octomap.kernels import OCCUPIED
 
-Bytes = NDArray[np.uint8]
 Cells = NDArray[np.bool_]
 
 

@@ -6,15 +6,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.octree import distance_kernels as kernels
 from openarm_common.octree.lattice import Lattice
+from openarm_common.types import Bytes, Floats
 from openarm_octomap.config import UnknownPolicy
 from openarm_octomap.kernels import OCCUPIED, UNKNOWN
-
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float32]
 
 
 class DistanceTransform:

@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from openarm_common.camera.depth_view import DepthImage
 from openarm_common.octree.lattice import KEY_ZERO
 from openarm_common.robot.filter_kernels import Whole
+from openarm_common.types import Bytes, Floats, Ints
 from openarm_octomap.kernels import HIT_BIT, cell_distance
 
-Floats = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int64]
 Shorts = NDArray[np.uint16]
 
 

@@ -19,14 +19,11 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.codec import Leaves, OctreeEncoder, Payload
 from openarm_common.octree.lattice import DEPTH, Lattice
 from openarm_common.robot.self_filter import Shapes
+from openarm_common.types import Array, Bytes, Floats
 from openarm_octomap import end_kernels, kernels
 from openarm_octomap.config import GridConfig, UnknownPolicy
 from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN
 from openarm_octomap.reset_kernels import reset_cells
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
 
 #: Keys outside of the box that one scan may end in.
 _TABLE = 1 << 20

@@ -15,11 +15,7 @@ from numpy.typing import NDArray
 
 from openarm_common.octree.lattice import KEY_ZERO
 from openarm_common.robot.filter_kernels import Whole
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int64]
+from openarm_common.types import Bytes, Floats, Ints
 
 FREE_BIT, HIT_BIT = 1, 2
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2

@@ -22,11 +22,10 @@ from openarm_common.octree.lattice import DEPTH, Lattice
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.self_filter import SelfFilter, Shapes
+from openarm_common.types import Floats
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig, UnknownPolicy
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
-
-Floats = NDArray[np.float32]
 
 #: Beyond any workspace, and still a whole number of cells, m.
 _FAR = 1e6

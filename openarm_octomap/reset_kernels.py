@@ -9,12 +9,8 @@ from numpy.typing import NDArray
 
 from openarm_common.octree.lattice import KEY_ZERO
 from openarm_common.robot.filter_kernels import inside
+from openarm_common.types import Array, Bytes, Floats, Ints
 from openarm_octomap.kernels import OCCUPIED, UNKNOWN
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int64]
 
 
 @njit(cache=True, nogil=True)

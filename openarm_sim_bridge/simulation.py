@@ -19,16 +19,15 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_sim_bridge.control.controller import RobotController
 from openarm_sim_bridge.faults.world_faults import WorldFaults
 from openarm_sim_bridge.pacing import Pacer, PeriodMeter, RealTimeFactor
 from openarm_sim_bridge.world.world import JointReadout, World
 
 T = TypeVar("T")
-Array = NDArray[np.float64]
 
 
 class Observer(Protocol):

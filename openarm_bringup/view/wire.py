@@ -20,10 +20,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.codec import Leaves
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.urdf import Primitive
+from openarm_common.types import Bytes, Floats
 from openarm_perception.geometry.depth import Deprojector
-
-Floats = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
 
 _KEY_ZERO = 1 << 15
 _GREY = (0.6, 0.6, 0.6, 1.0)

@@ -18,8 +18,8 @@ from pydantic import Field, TypeAdapter, ValidationError, field_validator, model
 
 from openarm_common.config import Config, describe_faults
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
 DICTIONARIES = ("DICT_4X4_100", "DICT_5X5_100", "DICT_6X6_100")

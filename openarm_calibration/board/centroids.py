@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: Darkness is counted up to here, in radii of the circle; beyond it is the white that it is measured from.
 _INNER, _OUTER = 1.45, 1.85

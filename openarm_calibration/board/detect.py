@@ -19,8 +19,8 @@ from openarm_calibration.handeye.projection import fit_poses
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
 #: A plane's image is a homography but for distortion and the eccentricity of the circles, px rms.

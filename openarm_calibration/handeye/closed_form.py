@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from openarm_calibration.handeye.problem import Problem, Setup, inverses
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: AX = XB: the mount of the camera from relative motions.
 HAND_EYE = ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")

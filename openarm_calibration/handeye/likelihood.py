@@ -11,9 +11,8 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: Below these a robot counts as exact: far less than a mark moves by, and the arithmetic stays well conditioned.
 FLOOR_TRANSLATION = 1e-7  # m

@@ -12,14 +12,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.handeye.problem import Problem
 from openarm_calibration.handeye.refine import Estimate
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: Fewer can't determine twelve unknowns.
 FEWEST = 3

@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
 from openarm_calibration.handeye.observability import require_motion
@@ -22,8 +21,6 @@ from openarm_calibration.store.store import StoredCalibration
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.errors import Code, OpenArmError
-
-Array = NDArray[np.float64]
 
 REFINED = "REFINED"
 ALGORITHMS = (REFINED, *METHODS)

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from openarm_calibration.handeye.projection import COLUMNS, fit_poses
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 Setup = Literal["in_hand", "to_hand", "fixed"]

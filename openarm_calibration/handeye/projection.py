@@ -14,7 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from openarm_common.types import Array
+
 Indices = NDArray[np.int64]
 
 #: Twist (6), scale (1), intrinsics (4).

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from openarm_calibration.handeye.problem import Problem, chain, design
 from openarm_calibration.handeye.projection import normal_equations
 from openarm_calibration.handeye.refine import Estimate
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 #: Eigenvalues of scaled information below this are a direction that is not known at all.
 _UNKNOWN = 1e-10
 

@@ -12,7 +12,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy import stats
 
@@ -25,9 +24,8 @@ from openarm_calibration.handeye.residuals import PoseTest, pose_tests
 from openarm_common import se3
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array, Mask
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 #: With fewer poses the others can't tell which one is wrong; a clean set would lose poses by chance.
 _FEWEST_TO_REJECT = 7
 

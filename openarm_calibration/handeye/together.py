@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.handeye.observability import condition_number
 from openarm_calibration.handeye.offline import Result, judged
@@ -23,7 +22,6 @@ from openarm_calibration.sampling.samples import SampleSet
 from openarm_calibration.store.store import StoredCalibration
 from openarm_common.errors import Code, OpenArmError
 
-Array = NDArray[np.float64]
 #: Postures within this of each other have the same error of the robot, rad or m.
 _SAME_POSTURE = 1e-3
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
@@ -22,8 +21,8 @@ from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.config import Config
 from openarm_common.errors import OpenArmError
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 Grade = Literal["pass", "warn", "fail"]
 
 

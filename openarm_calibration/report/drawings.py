@@ -11,15 +11,13 @@ import html
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.handeye.offline import Result
 from openarm_calibration.handeye.problem import chain
 from openarm_calibration.handeye.projection import project
 from openarm_calibration.handeye.verdict import Check
 from openarm_calibration.sampling.samples import Sample, SampleSet
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: From where the poses are looked at: turned about the board's normal, and tilted, rad.
 _AZIMUTH, _ELEVATION = math.radians(35.0), math.radians(22.0)

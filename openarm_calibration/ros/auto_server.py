@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from openarm_interfaces.action import AutoCalibrate, MoveArm
 from openarm_interfaces.msg import CollisionBox
 from rclpy.action import ActionClient, ActionServer, CancelResponse
@@ -24,11 +23,11 @@ from openarm_calibration.sampling.session_file import session_path
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose, vector
+from openarm_common.types import Array
 
 if TYPE_CHECKING:
     from openarm_calibration.ros.session_node import SessionNode
 
-Array = NDArray[np.float64]
 
 #: What says that a pose can't be had, while another one may.
 _ELSEWHERE = frozenset({Code.IN_COLLISION, Code.NO_PLAN, Code.UNREACHABLE, Code.LIMITS})

@@ -12,8 +12,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from tf2_msgs.msg import TFMessage
 
 from openarm_calibration.store.store import default_folder, of_these_mounts, places
@@ -22,8 +20,7 @@ from openarm_common.camera.cameras import T_LINK_OPTICAL, CameraConfig, load_cam
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_transform
 from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 
 class PublisherNode(BaseNode[PublisherConfig]):

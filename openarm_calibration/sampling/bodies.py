@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.handeye.problem import exps
 from openarm_common.robot.description import RobotDescription
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: Added to half edges for sight, and taken off for contact.
 _SKIN = 0.004

@@ -29,8 +29,7 @@ from openarm_common import se3
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: Before the board was seen, its place is known as a person measures it, 1 cm and a few degrees: px of the image.
 _RULER = 45.0

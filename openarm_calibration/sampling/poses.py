@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.board.board import Board
 from openarm_calibration.handeye.observability import UNITS, motion
@@ -22,8 +21,7 @@ from openarm_calibration.handeye.refine import information_at, invert_scaled
 from openarm_calibration.handeye.solve import Solution
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: Marks nearer to the edge of the image do not count as seen, px.
 EDGE = 12.0

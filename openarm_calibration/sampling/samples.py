@@ -31,8 +31,8 @@ from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 #: Half the step of the derivative of the robot's pose by time, s.
 _RATE_STEP_NS = 10_000_000
 

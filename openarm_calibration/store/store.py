@@ -20,15 +20,13 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from openarm_common import se3
 from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 _FORMAT = 1

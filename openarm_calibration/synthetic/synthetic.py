@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.handeye.problem import Problem, Setup, View, assemble, inverses, moved
@@ -19,8 +18,7 @@ from openarm_calibration.handeye.projection import project
 from openarm_calibration.handeye.refine import Noise, information_at
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 INTRINSICS = Intrinsics(1280, 720, 900.0, 900.0, 640.0, 360.0)
 BOARD = CircleGrid()

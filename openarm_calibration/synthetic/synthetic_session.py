@@ -8,7 +8,6 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.board.board import Board, CircleGrid
 from openarm_calibration.board.detect import Detection
@@ -17,8 +16,7 @@ from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics, load_cameras, true_mount
 from openarm_common.robot.description import RobotDescription
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 BOARD = CircleGrid()
 

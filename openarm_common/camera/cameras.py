@@ -14,15 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, field_validator
 
 from openarm_common import se3
 from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 Vector3 = tuple[float, float, float]
 
 #: Columns: the optical axes (right, down, forward) in link axes (forward, left, up).

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array, Floats
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 #: Planar depth (h, w): millimetres (16UC1) or metres (32FC1).
 DepthImage = NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.uint16 | np.float32]
 

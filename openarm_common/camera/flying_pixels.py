@@ -13,13 +13,11 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from pydantic import Field
 
 from openarm_common.camera.depth_view import DepthImage, DepthView
 from openarm_common.config import Config
-
-Bytes = NDArray[np.uint8]
+from openarm_common.types import Bytes
 
 #: Label of a pixel whose depth says nothing: it neither marks nor clears.
 NOTHING_KNOWN = 2

@@ -21,10 +21,8 @@ from numpy.typing import NDArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree import codec_kernels as kernels
 from openarm_common.octree.lattice import DEPTH, Lattice
+from openarm_common.types import Bytes, Floats, Ints
 
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
 ScalarT = TypeVar("ScalarT", bound=np.generic)
 
 #: The class of tree that MoveIt and RViz know as a plain octree.

@@ -12,9 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
+from openarm_common.types import Bytes, Floats, Ints
 
 INNER = 3
 #: Why a payload is refused (negative returns of the readers).

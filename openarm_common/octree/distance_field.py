@@ -26,8 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.lattice import Lattice
-
-Floats = NDArray[np.float32]
+from openarm_common.types import Floats
 
 _MAGIC = b"OADIST01"
 _MAX_CAMERAS = 8

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float32]
+from openarm_common.types import Bytes, Floats
 
 
 @njit(cache=True, nogil=True)

@@ -17,17 +17,16 @@ from typing import Literal
 
 import numpy as np
 import xacro
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_common.robot.srdf import Semantics, parse_srdf
 from openarm_common.robot.urdf import Joint, Link, Primitive, parse_urdf
 from openarm_common.robot.xml_text import fault
+from openarm_common.types import Array
 
 __all__ = ["BASE_LINK", "SIDES", "Joint", "Link", "Primitive", "RobotDescription", "Side", "mirror"]
 
-Array = NDArray[np.float64]
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 BASE_LINK = "openarm_body_link0"

@@ -12,14 +12,10 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from openarm_common.camera.depth_view import DepthImage
+from openarm_common.types import Array, Bytes, Floats, Ints
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int64]
 Real = float | np.floating[Any]
 Whole = int | np.integer[Any]
 

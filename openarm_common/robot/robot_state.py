@@ -12,13 +12,11 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 TOLERANCE_NS = 5_000_000
 #: Two joint states further apart than this are not interpolated between: the arm may have done anything.

@@ -21,10 +21,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot import filter_kernels as kernels
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
-
-Array = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int64]
+from openarm_common.types import Array, Bytes, Ints
 
 
 class SelfFilterConfig(Config):

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.robot.xml_text import attribute, fault, floats, parse_root, unique
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 Rgba = tuple[float, float, float, float]
 JointType = Literal["revolute", "continuous", "prismatic", "fixed"]
 ShapeKind = Literal["box", "cylinder", "sphere"]

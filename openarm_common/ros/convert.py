@@ -23,8 +23,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.held import HeldBox
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: encoding: (dtype, channels)
 ENCODINGS: dict[str, tuple[type[np.generic], int]] = {

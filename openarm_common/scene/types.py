@@ -13,14 +13,13 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from openarm_common import se3
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 Rgba = tuple[float, float, float, float]
 
 #: Colours of objects; each lies inside one hue range of `config/params/detector.yaml`.

@@ -9,12 +9,12 @@ from copy import copy
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.types import Array
 from openarm_evaluation.campaign.planner import arms_behind, boxes_of, request_of
 from openarm_evaluation.campaign.robot import SimRobot
 from openarm_evaluation.campaign.traffic import Traffic
@@ -36,7 +36,6 @@ from openarm_sim_bridge.control.gripper import GripperGoal, GripperOutcome
 from openarm_sim_bridge.control.trajectory import Trajectory as FollowedTrajectory
 from openarm_sim_bridge.world.touch import pad_links
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 #: Simulated time that a plan takes, s: a robot's world goes on while it thinks.

@@ -15,7 +15,6 @@ from pathlib import Path
 import cv2
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.board.board_files import write_board
@@ -30,12 +29,11 @@ from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
+from openarm_common.types import Array
 from openarm_evaluation.campaign.robot import shared_renderer
 from openarm_evaluation.campaign.tasks import Task
 from openarm_sim_bridge.world.model import build_spec
 from openarm_sim_bridge.world.world import Snapshot
-
-Array = NDArray[np.float64]
 
 HAND = "openarm_right_link7"
 #: The board between the fingers, seen by a standing camera; and lying on the table, seen by one on the hand.

@@ -25,6 +25,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.scene.scene import Scene
+from openarm_common.types import Array
 from openarm_evaluation.judging.judge import Sample
 from openarm_grasp.evidence.observation import Detection, Frame
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
@@ -45,8 +46,6 @@ from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.faults.world_faults import WorldFaults
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
-
-Array = NDArray[np.float64]
 
 _TRUTH_NS = 50_000_000
 #: How long the joint trace reaches back, s.

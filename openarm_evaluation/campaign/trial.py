@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
+from openarm_common.types import Array
 from openarm_evaluation.campaign import record
 from openarm_evaluation.campaign.gap import LEAST_GAP, watch_gap
 from openarm_evaluation.campaign.link import DirectLink
@@ -34,8 +34,6 @@ from openarm_grasp.strategy.orders import Ask, Order
 from openarm_grasp.strategy.pair import PairRunner
 from openarm_grasp.strategy.performer import Performer
 from openarm_sim_bridge.faults.faults import checked_fault
-
-Array = NDArray[np.float64]
 
 _SETTLE_S = 0.5
 _REST_LIMIT_S = 5.0

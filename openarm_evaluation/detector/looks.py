@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.scene.scene import PALETTE
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 #: Shares of cylinders that lie, and of objects that have no colour.

@@ -20,11 +20,11 @@ from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES, RobotDescription
 from openarm_common.scene.scene import SHAPES, Scene, SceneObject, Table
+from openarm_common.types import Array
 from openarm_evaluation.detector.looks import colour, draw_shape, pattern, sensor, surface
 from openarm_sim_bridge.cameras.renderer import create_gl_context
 from openarm_sim_bridge.world.model import build_spec
 
-Array = NDArray[np.float64]
 Rng = np.random.Generator
 
 #: Views and how often each is taken.

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from openarm_common.config import load_yaml
 from openarm_common.errors import Code, OpenArmError
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 
 def write_labels(classes: NDArray[np.int64], boxes: Array, width: int, height: int) -> str:

@@ -13,12 +13,10 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from openarm_common.config import Config
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 
 class DriftConfig(Config):

@@ -12,14 +12,11 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code
+from openarm_common.types import Array
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.observation import Detection, Frame, apart, sticks_out
-
-Array = NDArray[np.float64]
-
 
 #: Largest turn of a placed object from the yaw that was asked for, rad.
 YAW_TOLERANCE = float(np.radians(15.0))

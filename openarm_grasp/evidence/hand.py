@@ -7,14 +7,12 @@ from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.types import Array
 from openarm_grasp.evidence.evidence import Evidence
-
-Array = NDArray[np.float64]
 
 #: Finger speed is the change of position over this time: drivers may report a velocity of 0.
 SPEED_WINDOW_NS = 100_000_000

@@ -13,13 +13,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_grasp.config import DetectConfig
-
-Array = NDArray[np.float64]
 
 #: An object that is meant by its position stands no farther from it than this, m.
 SAME_PLACE = 0.05

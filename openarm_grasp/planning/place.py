@@ -12,16 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.evidence import SQUARE_WITHIN
 from openarm_grasp.evidence.observation import Detection
 from openarm_grasp.planning.candidates import UP, GraspCandidate, hold_of
-
-Array = NDArray[np.float64]
 
 #: Spots nearer to each other than this are one, m.
 _SAME_SPOT = 0.02

@@ -10,18 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_grasp.evidence.observation import Detection
 from openarm_grasp.planning.candidates import GraspCandidate, held_box, obstacle_boxes, propose, target_box
 from openarm_grasp.planning.place import PlaceTarget, other_grasps, place_targets
 from openarm_grasp.strategy.effects import PlanGrasp, Planned, PlanPlace
 from openarm_grasp.strategy.link import Link
 from openarm_grasp.strategy.memory import Surroundings
-
-Array = NDArray[np.float64]
 
 #: A plan that fails with one of these says that it cannot be done; with any other it was not found out.
 NO_WAY = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN, Code.TOO_WIDE)

@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 from control_msgs.action import GripperCommand, ParallelGripperCommand
 from geometry_msgs.msg import Point
-from numpy.typing import NDArray
 from openarm_interfaces.action import MoveArm, Pick, PickTwo, PlanApproach
 from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspOption, GraspStatus, PickAnswer, PickRequest
 from openarm_interfaces.srv import ComputeIK, Grasp
@@ -22,6 +21,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, point, pose_to_matrix, stamp_to_ns, vector, xyz
 from openarm_common.ros.node import BASE_FRAME
+from openarm_common.types import Array
 from openarm_grasp.evidence.evidence import Verdict
 from openarm_grasp.evidence.observation import Detection, Frame
 from openarm_grasp.planning.candidates import Box, GraspCandidate
@@ -38,8 +38,6 @@ from openarm_grasp.strategy.effects import (
 )
 from openarm_grasp.strategy.machine import GraspMachine
 from openarm_grasp.strategy.pair import PairOutcome
-
-Array = NDArray[np.float64]
 
 _CHOSEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 _REFUSED = ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.35)

@@ -7,9 +7,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from copy import copy
 from typing import Any
 
-import numpy as np
 from control_msgs.action import GripperCommand, ParallelGripperCommand
-from numpy.typing import NDArray
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
 from openarm_interfaces.srv import ComputeIK
 from rclpy.action import ActionClient
@@ -19,6 +17,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.node import BASE_FRAME, BaseNode
+from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.routing import ARMS
 from openarm_grasp.ros import convert
@@ -26,8 +25,6 @@ from openarm_grasp.ros.graph_clients import DETECTIONS, OtherNodes
 from openarm_grasp.strategy import effects
 from openarm_grasp.strategy.effects import Frames, Planned, Trajectory
 from openarm_grasp.strategy.link import check_deadline
-
-Array = NDArray[np.float64]
 
 
 class GraphLink:

@@ -13,18 +13,17 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription, Side
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.routing import ARMS
 from openarm_grasp.strategy import effects
 from openarm_grasp.strategy.effects import Frames, GoHome, Planned, Trajectory
 from openarm_grasp.strategy.link import Link
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 #: An arm that has turned a joint so far has gone on, rad.

@@ -12,17 +12,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TypeAlias, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from openarm_common.errors import Code
+from openarm_common.types import Array
 from openarm_grasp.evidence.evidence import Evidence, Verdict
 from openarm_grasp.evidence.observation import Frame
 from openarm_grasp.planning.candidates import Box, GraspCandidate
 from openarm_grasp.planning.options import Option
 from openarm_grasp.planning.place import PlaceTarget
 
-Array = NDArray[np.float64]
 Trajectory: TypeAlias = object
 
 

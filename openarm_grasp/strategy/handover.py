@@ -13,17 +13,15 @@ from dataclasses import dataclass
 from math import radians
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_grasp.config import HandOverConfig
 from openarm_grasp.evidence.observation import Detection, Sighting
 from openarm_grasp.planning.place import PlaceTarget, grid
 from openarm_grasp.planning.rehearsal import NO_WAY, Rehearsal, standing_at
 from openarm_grasp.planning.routing import ARMS
 from openarm_grasp.strategy.memory import Surroundings
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

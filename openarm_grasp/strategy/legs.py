@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_grasp.planning.rehearsal import NO_WAY, Rehearsal
 from openarm_grasp.planning.routing import ARMS
 from openarm_grasp.strategy.effects import GraspOutcome, GraspRequest
@@ -23,8 +23,6 @@ from openarm_grasp.strategy.machine import GraspMachine
 from openarm_grasp.strategy.memory import Known
 from openarm_grasp.strategy.performer import Performer, run_request
 from openarm_grasp.strategy.push import Pusher
-
-Array = NDArray[np.float64]
 
 #: These end whatever is under way; no other way is tried.
 STOPS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)

@@ -9,16 +9,12 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.types import Array
 from openarm_grasp.strategy import effects
 from openarm_grasp.strategy.effects import Frames, GoHome, Planned, Trajectory
-
-Array = NDArray[np.float64]
 
 
 class Link(Protocol):

@@ -9,9 +9,6 @@ from __future__ import annotations
 import traceback
 from collections.abc import Awaitable, Callable, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
@@ -33,8 +30,6 @@ from openarm_grasp.strategy.effects import (
 )
 from openarm_grasp.strategy.link import Link
 from openarm_grasp.strategy.machine import GraspMachine
-
-Array = NDArray[np.float64]
 
 
 class Performer:

@@ -15,11 +15,11 @@ from itertools import product
 from math import cos, hypot, inf, pi, radians, sin
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription, Side
+from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.evidence import Evidence
 from openarm_grasp.evidence.observation import Detection, Sighting, find
@@ -38,8 +38,6 @@ from openarm_grasp.strategy.effects import (
 )
 from openarm_grasp.strategy.memory import Surroundings
 from openarm_grasp.strategy.performer import Performer
-
-Array = NDArray[np.float64]
 
 #: Between two points of a hand's shape, m.
 _GRAIN = 0.005

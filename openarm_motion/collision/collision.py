@@ -18,6 +18,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.collision_robot import CollisionRobot
 from openarm_motion.collision.looks import spread
 from openarm_motion.collision.seen import MAP, DistanceMap
@@ -26,7 +27,6 @@ from openarm_motion.collision.surroundings import Clearance, Contact, Surroundin
 
 __all__ = ["Box", "Clearance", "CollisionScene", "Contact", "Solid", "Surroundings", "box_from", "spread"]
 
-Array = NDArray[np.float64]
 
 #: A pair that may stay as near as it is may come nearer by this, m.
 _LESS = 1e-3

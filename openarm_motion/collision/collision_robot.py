@@ -12,15 +12,14 @@ from dataclasses import replace
 import coal
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Primitive, RobotDescription
+from openarm_common.types import Array
 from openarm_motion.collision.solids import Box
 from openarm_motion.kinematics.arm_links import ArmLinks
 from openarm_motion.kinematics.kinematics import ArmKinematics
-
-Array = NDArray[np.float64]
 
 
 class CollisionRobot:

@@ -13,12 +13,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.types import Array
 from openarm_motion.collision.fast_model import Model, Work, workspace
 from openarm_motion.collision.map_kernels import map_distance, map_room, put_shape
 from openarm_motion.collision.shape_kernels import BOX, separation
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: More room than this is looked for between the balls of clusters only, not between the shapes in them, m.
 _CLOSE = 0.03

@@ -13,8 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from openarm_common.types import Array, Ints
 
 #: Numbers that a list of groups or intervals of a line has room for.
 _ROOM = 1 << 15

@@ -12,11 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from openarm_common.types import Array, Ints
 from openarm_motion.collision.fast_model import Model, Work
 from openarm_motion.collision.shape_kernels import separation
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -13,13 +13,11 @@ from pathlib import Path
 
 import coal
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: A cut must make the boxes smaller by this share in all, and there are so many cuts in a row at most.
 _SAVED = 0.12

@@ -21,10 +21,8 @@ from openarm_common.octree import distance_kernels as kernels
 from openarm_common.octree.distance_field import DistanceField
 from openarm_common.octree.lattice import Lattice
 from openarm_common.robot.description import Primitive, RobotDescription
+from openarm_common.types import Array, Floats
 from openarm_motion.collision.solids import Box, Solid
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 
 #: Distances are cut here: more than the largest sphere of a link with its clearance needs, m.
 _REACH = 0.2

@@ -9,12 +9,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from openarm_common.types import Array, Ints
 
 BOX, CYLINDER, SPHERE = 0, 1, 2
 

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from openarm_common.errors import Code, OpenArmError
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 
 @dataclass(frozen=True, eq=False)

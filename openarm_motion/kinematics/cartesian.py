@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.collision import CollisionScene, Contact
 from openarm_motion.kinematics.chain_kernels import ROTATION_LENGTH
 from openarm_motion.kinematics.inverse import InverseKinematics, Solution
-
-Array = NDArray[np.float64]
 
 #: Distance and turn of the tool between two points of a line.
 STEP_M = 0.005

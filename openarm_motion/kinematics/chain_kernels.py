@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: Turns a rotation error (rad) into a length (m) so that both can be minimised together: about the size of a hand.
 ROTATION_LENGTH = 0.2

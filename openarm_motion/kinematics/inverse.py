@@ -11,13 +11,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from openarm_common.errors import OpenArmError
+from openarm_common.types import Array
 from openarm_motion.kinematics.kinematics import ArmKinematics, IkResult
 from openarm_motion.kinematics.srs import SrsArm, SrsMiss
-
-Array = NDArray[np.float64]
 
 #: Numeric solutions nearer to each other than this in every joint count as one.
 _SAME = 0.05

@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.types import Array
 from openarm_motion.kinematics import chain_kernels as kernels
-
-Array = NDArray[np.float64]
 
 #: Continuous joints have no limits; a seed and a search still need a range.
 _CONTINUOUS = np.pi

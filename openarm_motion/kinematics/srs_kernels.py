@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: Why no configuration exists; 0 when one does.
 TOO_FAR, TOO_NEAR = 1, 2

@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.collision import CollisionScene
 from openarm_motion.planning import moves
 from openarm_motion.planning.approach import ApproachFailedError, ApproachPlan, ApproachRequest
@@ -17,8 +17,6 @@ from openarm_motion.planning.arm import Arm, Situation
 from openarm_motion.planning.failure import Alternative, PlanFailedError
 from openarm_motion.planning.moves import Around
 from openarm_motion.timing.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 #: Distances from the pose that was asked for that are tried, m.
 _RINGS = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22)

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.collision import Box, CollisionScene
 from openarm_motion.kinematics.cartesian import Line, line_contact, solve_line
 from openarm_motion.kinematics.inverse import Solution
@@ -28,7 +28,6 @@ from openarm_motion.timing.trajectory import Trajectory
 
 __all__ = ["ApproachFailedError", "ApproachPlan", "ApproachRequest", "Refused", "Target", "plan_approach"]
 
-Array = NDArray[np.float64]
 
 #: A configuration nearer to a joint limit than this is thought less of, rad.
 _COMFORT = 0.3

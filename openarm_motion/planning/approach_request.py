@@ -7,13 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.collision import Box, Contact
 from openarm_motion.planning.failure import PlanFailedError, Stage
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

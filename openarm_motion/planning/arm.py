@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.types import Array
 from openarm_motion.collision.collision import Box, CollisionScene, Contact, Surroundings
 from openarm_motion.collision.collision_robot import CollisionRobot
 from openarm_motion.collision.fast import FastScene
@@ -30,8 +30,6 @@ from openarm_motion.planning.planners import make_planner
 from openarm_motion.timing.blending import timings
 from openarm_motion.timing.certificate import Certificate, certify
 from openarm_motion.timing.trajectory import JointLimits, Trajectory, profile, time_path
-
-Array = NDArray[np.float64]
 
 #: A joint this far outside its limits is a wrong reading, not sag; rad.
 _SAG = 0.05

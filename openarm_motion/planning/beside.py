@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.collision import Clearance, CollisionScene, Contact, Surroundings
 from openarm_motion.collision.solids import Box
 from openarm_motion.planning.arm import Arm
@@ -21,8 +21,6 @@ from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.planner import never
 from openarm_motion.timing.certificate import ends_first, subdivided
 from openarm_motion.timing.checks import Motion
-
-Array = NDArray[np.float64]
 
 #: Distance of two arms under way that is proven, m.
 APART = 0.020

@@ -8,8 +8,9 @@ from contextlib import contextmanager
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from openarm_common.types import Array
 from openarm_motion.collision.collision import Box, Clearance, CollisionScene, Contact, Surroundings
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.looks import spread
@@ -17,8 +18,6 @@ from openarm_motion.collision.seen import NOTHING, Known
 from openarm_motion.planning.arm import Arm, segment_time
 from openarm_motion.planning.planner import PlanQuery, never
 from openarm_motion.timing.trajectory import JointLimits
-
-Array = NDArray[np.float64]
 
 #: Two arms that move at once plan to stay this far apart, m: 20 mm remain when each lags behind its plan a little.
 SEPARATION = 0.025

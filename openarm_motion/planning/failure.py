@@ -6,13 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.surroundings import Contact
-
-Array = NDArray[np.float64]
 
 #: How far planning got: the request itself, the start, the goal, the straight line, the search, the dense look at the
 #: timed plan, the planning scene, beside another arm under way.

@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.fast_model import workspace
 from openarm_motion.planning import search_kernels as kernels
 from openarm_motion.planning.planner import OmplPlanner, PlannedPath, Planner, PlanQuery
-
-Array = NDArray[np.float64]
 
 #: Two configurations nearer than this in every joint are one, rad.
 _SAME = 1e-6

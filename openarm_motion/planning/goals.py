@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from openarm_common.types import Array
 from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm, Situation, segment_time
-
-Array = NDArray[np.float64]
 
 #: Configurations of one arm that a search of both gets.
 _MOST = 24

@@ -10,14 +10,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from openarm_common.types import Array
 from openarm_motion.collision.fast_kernels import look, near, place, sift
 from openarm_motion.collision.fast_model import Model, Work
-
-Array = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)

@@ -7,17 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.collision import Box, CollisionScene
 from openarm_motion.kinematics.cartesian import line_contact, solve_line
 from openarm_motion.planning.arm import Arm, Situation, first_contact, segment_time
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.timing.certificate import certify
 from openarm_motion.timing.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 #: A joint that is told to go no further than this from its limit is taken at its word, rad.
 _ROUNDING = 1e-3

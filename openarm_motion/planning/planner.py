@@ -15,15 +15,13 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from ompl import base as ob
 from ompl import geometric as og
 from ompl import util as ou
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.fast import FastScene
-
-Array = NDArray[np.float64]
 
 #: Two configurations nearer than this in every joint are one, rad.
 _SAME = 1e-6

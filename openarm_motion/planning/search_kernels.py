@@ -7,14 +7,11 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from openarm_common.types import Array, Ints
 from openarm_motion.collision.fast_kernels import near
 from openarm_motion.collision.fast_model import Model, Work
 from openarm_motion.planning.line_kernels import between_free, line_free
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 #: Two configurations nearer than this are one, rad.
 _SAME = 1e-6

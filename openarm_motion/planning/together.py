@@ -13,9 +13,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.collision import Box
 from openarm_motion.planning.arm import Situation
 from openarm_motion.planning.beside import Course, least_wait
@@ -26,8 +26,6 @@ from openarm_motion.timing.blending import timings
 from openarm_motion.timing.certificate import certify, dense_times
 from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 #: Pairs of goals that one search gets.
 _GOALS = 24

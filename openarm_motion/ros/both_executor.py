@@ -6,8 +6,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
 from openarm_interfaces.action import MoveArms
 from openarm_interfaces.msg import ArmTarget
 from rclpy.action.server import ServerGoalHandle
@@ -16,6 +14,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import ns_to_stamp, trajectory_from_msg
+from openarm_common.types import Array
 from openarm_motion.collision.solids import Box
 from openarm_motion.planning.arm import Arm, Situation
 from openarm_motion.planning.both import BothArms
@@ -25,8 +24,6 @@ from openarm_motion.ros import convert
 from openarm_motion.ros.follower import Robot
 from openarm_motion.ros.situation import Situations
 from openarm_motion.timing.checks import Motion, check_trajectory
-
-Array = NDArray[np.float64]
 
 #: Both controllers begin this long after the newest joint state, so that none begins earlier than the other, s.
 _HEAD_START = 0.1

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms
 from openarm_interfaces.msg import ArmTarget, PlanFailure
 from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
@@ -17,11 +17,10 @@ from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
 from openarm_common.errors import Answer, Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
 from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix, trajectory_from_msg
+from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid
 from openarm_motion.ros import convert
 from openarm_motion.timing.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 #: Longest wait for a motion, s of wall clock.
 _LONG = 120.0

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from geometry_msgs.msg import Point, PoseStamped
-from numpy.typing import NDArray
 from openarm_interfaces.action import PlanApproach
 from openarm_interfaces.msg import ApproachTarget, CollisionBox, CollisionObject, PlanFailure, Refusal
 from trajectory_msgs.msg import JointTrajectory
@@ -15,12 +14,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix, trajectory_to_msg, vector, xyz
+from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Cylinder, Mesh, Solid, Sphere
 from openarm_motion.planning.approach import ApproachRequest, Refused, Target
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.timing.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 _HELD_COLOR = (0.2, 0.8, 0.4, 0.5)
 _SCENE_COLOR = (0.8, 0.3, 0.2, 0.5)

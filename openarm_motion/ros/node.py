@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
 from openarm_interfaces.srv import ComputeIK
 from rclpy.action import ActionServer, CancelResponse
@@ -43,7 +42,6 @@ from openarm_motion.scene.memory import HeldMemory
 from openarm_motion.scene.planning_scene import PlanningScene
 from openarm_motion.timing.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 Result = TypeVar("Result")
 
 #: Pace of feedback while planning, s.

@@ -9,19 +9,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from numpy.typing import NDArray
 
 from openarm_common.octree.distance_field import field_path
 from openarm_common.ros.convert import pose_to_matrix
 from openarm_common.ros.node import BASE_FRAME
+from openarm_common.types import Array
 from openarm_motion.collision.seen import Known, carried
 from openarm_motion.collision.solids import Box, Solid
 from openarm_motion.planning.arm import Arm, Situation
 from openarm_motion.ros.follower import Robot, Watch, stale
 from openarm_motion.scene.map_eye import Look, MapEye, unexplained
 from openarm_motion.scene.planning_scene import PlanningScene
-
-Array = NDArray[np.float64]
 
 #: Beside an arm under way plans keep this distance from where it will end, m: more than what is then proven.
 _BESIDE = 0.035

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from openarm_common.types import Array
 from openarm_motion.timing.trajectory import (
     SPACING,
     JointLimits,
@@ -25,8 +25,6 @@ from openarm_motion.timing.trajectory import (
     straight_profile,
     time_polyline,
 )
-
-Array = NDArray[np.float64]
 
 #: Shares of the longest overlap of two segments that are tried, and looks at each.
 _SHARES = (1.0, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1)

@@ -13,14 +13,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code
+from openarm_common.types import Array
 from openarm_motion.collision.collision import Contact
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.timing.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 #: Share of the clearance that must be left between the looks of the search.
 _SHARE = 0.5

@@ -10,15 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_motion.collision.collision import Clearance, CollisionScene, Surroundings
 from openarm_motion.planning.arm import Arm
 from openarm_motion.timing.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 #: What rounding (or another interpolation between the points) may add to a limit.
 _SLACK = 1.02

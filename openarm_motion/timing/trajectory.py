@@ -15,12 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import ruckig
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
 from openarm_common.errors import Code, OpenArmError
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: Samples of a path at which limits are looked at, and the excess over them that rounding may leave.
 _FINE = 400

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from openarm_common.types import Array
+
 Image = NDArray[np.uint8]
 
 _FILL = 114

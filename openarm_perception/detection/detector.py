@@ -19,9 +19,9 @@ from pydantic import Field, field_validator
 
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Mask
 
 Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 #: Which detection comes first: the one most certain, or the one nearest to the middle of the image.
 Policy = Literal["score", "centre"]

@@ -18,19 +18,17 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config, metres_by_name
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_perception.detection.detector import Detection2D, Mask
 from openarm_perception.geometry import footprint, plane
 from openarm_perception.geometry.depth import DepthImage, DepthLimits
 from openarm_perception.geometry.patch import Patch, cut
-
-Array = NDArray[np.float64]
 
 #: As many points of the sides as this are enough; tall objects show thousands.
 _SIDE_POINTS = 150

@@ -20,9 +20,8 @@ from scipy.spatial import KDTree
 from openarm_common.camera.flying_pixels import label_lonely
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Ints
 from openarm_perception.geometry.depth import DepthImage, Points, unit_scale
-
-Ints = NDArray[np.int64]
 
 #: Cells along an axis that a packed key can tell apart, half of them on each side of zero.
 _HALF = 1 << 20

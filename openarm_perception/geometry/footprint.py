@@ -12,11 +12,10 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 Kind = Literal["rectangle", "circle", "bound"]
 
 

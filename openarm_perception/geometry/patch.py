@@ -7,13 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.types import Array
 from openarm_perception.detection.detector import Detection2D, Mask
 from openarm_perception.geometry.depth import DepthImage, DepthLimits, check_size, unit_scale
-
-Array = NDArray[np.float64]
 
 #: Depth with less noise than this is used as it is, m; 16UC1 alone rounds by 0.3 mm (1 sigma).
 _CLEAN = 0.0006

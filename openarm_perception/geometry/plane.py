@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_perception.detection.detector import Detection2D
-
-Array = NDArray[np.float64]
 
 #: A ray this flat over a plane, as a sine, meets it nowhere that an image could tell.
 _GRAZING = 0.02

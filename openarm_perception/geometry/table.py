@@ -7,15 +7,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_perception.detection.localize import Detection3D
 from openarm_perception.geometry.depth import Deprojector, DepthImage, DepthLimits
-
-Array = NDArray[np.float64]
 
 #: How far from the expected height the table is looked for, m.
 SEARCH = 0.08

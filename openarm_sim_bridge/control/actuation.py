@@ -14,11 +14,12 @@ from enum import StrEnum
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from openarm_common.config import Config
 from openarm_common.errors import Code
+from openarm_common.types import Array
 from openarm_sim_bridge.control.tracker import Tracker
 from openarm_sim_bridge.control.trajectory import (
     JointGroup,
@@ -29,8 +30,6 @@ from openarm_sim_bridge.control.trajectory import (
     TrajectoryResult,
     checked,
 )
-
-Array = NDArray[np.float64]
 
 #: A trajectory that starts later than this has most likely a stamp of another clock.
 _MAX_DELAY_NS = 600_000_000_000

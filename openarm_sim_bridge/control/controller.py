@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_sim_bridge.control.actuation import TrajectoryConfig, TrajectoryFollower
 from openarm_sim_bridge.control.gripper import GripperConfig, GripperFollower
 from openarm_sim_bridge.control.trajectory import JointGroup
 from openarm_sim_bridge.world.world import JointReadout, World
-
-Array = NDArray[np.float64]
 
 _LIMIT_SLACK = 1e-4
 

@@ -13,11 +13,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 #: A limit that was rounded in a file or a message is still kept, rad or m.
 _LIMIT_SLACK = 1e-4

@@ -12,10 +12,10 @@ from collections.abc import Mapping
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_sim_bridge.faults.faults import (
     Fault,
     FrictionLowered,
@@ -26,8 +26,6 @@ from openarm_sim_bridge.faults.faults import (
     ObjectNudged,
 )
 from openarm_sim_bridge.world.world import World
-
-Array = NDArray[np.float64]
 
 
 class WorldFaults:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 

@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
-
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 
 class MovingEdges:

@@ -10,9 +10,8 @@ from collections.abc import Iterable
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from openarm_common.types import Array
 
 
 def hand_link(side: str) -> str:

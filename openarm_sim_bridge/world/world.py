@@ -16,14 +16,12 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_sim_bridge.world.compiled import CompiledWorld, TrackedObject, compile_world, joint_slices, start_qpos
 from openarm_sim_bridge.world.touch import contact_wrench, wrist_wrench
-
-Array = NDArray[np.float64]
 
 _DIVERGED = (
     mujoco.mjtWarning.mjWARN_BADQPOS,

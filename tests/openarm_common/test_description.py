@@ -10,14 +10,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yourdfpy
-from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import BASE_LINK, SIDES, RobotDescription, Side, mirror
+from openarm_common.types import Array
 from openarm_sim_bridge.world.model import PhysicsConfig, robot_spec
 
-Array = NDArray[np.float64]
 HALF_PI = np.pi / 2
 
 # Right arm: offset of the joint frame, its roll, axis, limits (rad), effort (N m), velocity (rad/s).

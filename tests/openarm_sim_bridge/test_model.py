@@ -9,7 +9,6 @@ import xml.etree.ElementTree as ET
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from openarm_common import se3
@@ -19,7 +18,6 @@ from openarm_common.robot.description import SIDES, RobotDescription
 from openarm_common.scene.scene import Scene, load_scene
 from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, compile_model, robot_spec
 
-Array = NDArray[np.float64]
 GEOM, BODY = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY
 
 

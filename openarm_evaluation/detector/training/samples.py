@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_evaluation.detector.yolo_text import read_classes, read_labels
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
 

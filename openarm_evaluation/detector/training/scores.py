@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from openarm_common.types import Array
 from openarm_perception.detection.boxes import Candidates, overlap
 
-Array = NDArray[np.float64]
 Truth = tuple[NDArray[np.int64], Array]
 
 #: A detection counts as shown from this score on.

@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Array types of the suite; shape, unit and frame stand in the docstring of what uses them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
