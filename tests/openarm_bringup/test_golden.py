@@ -22,8 +22,9 @@ from openarm_common.errors import Code, OpenArmError
 BAG = Path(__file__).parents[1] / "data" / "demo_pick"
 
 
+@pytest.mark.requirement("P-32")
 def test_the_bag_of_the_repository_gives_its_golden_numbers_twice() -> None:
-    """P-32: perception and map in CI, from recorded topics, without GPU, display or graph."""
+    """Perception and map in CI, from recorded topics, without GPU, display or graph."""
     assert sum(file.stat().st_size for file in BAG.iterdir()) < 5e6
     with open_bag(BAG) as bag:
         first, second = numbers_of(bag), numbers_of(bag)

@@ -44,6 +44,13 @@ def test_sets_are_the_same_for_a_seed_share_nothing_and_go_on_after_a_stop(tmp_p
     assert sheet.shape == (480, 640, 3)
 
 
+@pytest.mark.requirement("B-23")
+def test_a_data_set_is_large_enough_by_default() -> None:
+    config = DataConfig()
+    assert config.train >= 1500
+    assert min(config.select, config.report) >= 100
+
+
 @pytest.mark.requirement("P-18")
 def test_all_classes_are_drawn_and_some_pictures_are_empty() -> None:
     """Boxes lie in the picture, large enough to be seen; the same seed draws the same picture."""

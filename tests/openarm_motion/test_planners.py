@@ -53,7 +53,7 @@ def arm_with(planner: str, description: RobotDescription, table: Box) -> Arm:
     return Arm("right", description, MotionConfig(planning=PlanningConfig(planner=planner)), [table])
 
 
-@pytest.mark.requirement("A-76", "B-41")
+@pytest.mark.requirement("A-76", "B-39", "B-41")
 def test_another_planner_gets_the_same_calls_and_its_path_is_timed(
     elsewhere: str, description: RobotDescription, table: Box, home: dict[str, float]
 ) -> None:
@@ -63,7 +63,7 @@ def test_another_planner_gets_the_same_calls_and_its_path_is_timed(
     trajectory = to_joints(arm, Situation(home, start), goal.tolist(), Around())
     np.testing.assert_allclose(trajectory.q[-1], goal, atol=1e-9)
     (query,) = Foreign.asked
-    assert query.time_limit == pytest.approx(5.0, abs=0.5)  # B-39
+    assert query.time_limit == pytest.approx(5.0, abs=0.5)
     assert not query.collides(goal)
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from benchmarks.localization import Studio, errors
 from openarm_common.resources import models_dir
 from openarm_common.scene.scene import SHAPES, random_scene
+from openarm_perception.config import DetectNodeConfig
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
 from openarm_perception.detection.looking import make_pipeline
 from openarm_perception.detection.network import NetworkConfig, NetworkDetector
@@ -54,3 +56,33 @@ def test_the_shipped_network_finds_random_scenes(kind) -> None:
             assert items[place.label].shape in names_of(place)
             assert np.abs(errors(place, items[place.label], scene.table))[0] < 3.0
     studio.close()
+
+
+@pytest.mark.requirement("B-25", "B-37")
+def test_noisy_images_of_a_scene_give_the_same_centres_at_five_hertz() -> None:
+    """Centres stay within 2 px of their mean, and a frame takes at most 200 ms of the processor."""
+    studio = Studio()
+    camera = studio.cameras["overhead"]
+    joints = studio.home()
+    scene = random_scene(5001)
+    studio.load(scene, joints)
+    rgb, depth = studio.draw("overhead")
+    T_base_camera = studio.T_base_camera("overhead", joints)
+    localizer = Localizer(LocalizerConfig(), DepthLimits(near=camera.near, far=camera.far), scene.table.top_z)
+    pipeline = make_pipeline("network", studio.detector, NetworkConfig(), localizer)
+    pipeline.run(rgb, depth, camera.intrinsics, T_base_camera)  # kernels are compiled, the session is warm
+    rng = np.random.default_rng(1)
+    centres: list[list[tuple[float, float]]] = []
+    took: list[float] = []
+    for _ in range(5):
+        noisy = np.clip(rgb + rng.normal(0.0, 4.0, rgb.shape), 0, 255).astype(np.uint8)
+        began = time.process_time()
+        seen = pipeline.run(noisy, depth, camera.intrinsics, T_base_camera)
+        took.append(time.process_time() - began)
+        assert len(seen.located) == len(scene.objects)
+        centres.append(sorted(found.centre for found in seen.found))
+    studio.close()
+    spread = np.abs(np.array(centres) - np.mean(centres, axis=0)).max(axis=(0, 2))
+    assert spread.max() <= 2.0, f"{spread.round(2)} px"
+    assert np.median(took) <= 0.2
+    assert DetectNodeConfig().max_rate >= 5.0

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""docs/requirements.md against the tests: each requirement is checked by a test that carries its id as a marker."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parent
+PAGE = (TESTS.parent / "docs" / "requirements.md").read_text(encoding="utf-8")
+REQUIREMENTS, _, PITFALLS = PAGE.partition("## Pitfalls")
+#: Id to the text of the row and the mark after it.
+ROWS = {
+    id_: (text, mark.strip())
+    for id_, text, mark in re.findall(r"^\| ([A-Z]-\d\d) \| (.*?) \|(.*)$", REQUIREMENTS, re.M)
+}
+PLANNED = {id_ for id_, (_, mark) in ROWS.items() if "planned" in mark}
+
+
+def requirements_of_tests() -> Counter[str]:
+    """Count the requirement ids that tests carry as markers, without running any test."""
+    return Counter(
+        argument.value
+        for path in TESTS.rglob("test_*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "pytest.mark.requirement"
+        for argument in node.args
+        if isinstance(argument, ast.Constant) and isinstance(argument.value, str)
+    )
+
+
+@pytest.fixture(scope="module")
+def tested() -> set[str]:
+    return set(requirements_of_tests())
+
+
+def test_the_page_lists_each_id_once_and_in_order() -> None:
+    listed = re.findall(r"^\| ([A-Z]-\d\d) \|", REQUIREMENTS, re.M)
+    last = {"A": 78, "B": 72, "P": 34, "N": 24, "R": 32}
+    assert listed == [f"{area}-{n:02}" for area in last for n in range(1, last[area] + 1)]
+    assert listed == list(ROWS)
+
+
+@pytest.mark.parametrize("area", ["A", "B", "P", "N", "R"])
+def test_each_requirement_has_a_test(tested: set[str], area: str) -> None:
+    missing = [f"{id_}: {text}" for id_, (text, _) in ROWS.items() if id_[0] == area and id_ not in tested | PLANNED]
+    assert missing == []
+
+
+def test_no_test_carries_an_unknown_id(tested: set[str]) -> None:
+    assert tested - ROWS.keys() == set()
+
+
+def test_what_is_planned_is_of_area_r_and_not_tested_yet(tested: set[str]) -> None:
+    assert {id_[0] for id_ in PLANNED} <= {"R"}
+    assert PLANNED & tested == set(), "these have tests: remove the mark `planned` in docs/requirements.md"
+
+
+@pytest.mark.requirement("N-22")
+def test_each_pitfall_has_a_regression_test(tested: set[str]) -> None:
+    pitfalls = re.findall(r"^\| ([A-Z]-\d\d) \|", PITFALLS, re.M)
+    assert len(pitfalls) >= 28
+    assert set(pitfalls) - tested == set()
