@@ -13,6 +13,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 from openarm_common.errors import Code
 from openarm_sim_bridge.faults.faults import FAULTS
@@ -124,3 +125,39 @@ def test_the_readme_is_short_and_links_every_guide() -> None:
     assert len(text.splitlines()) <= 200
     guides = {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")}
     assert guides <= set(re.findall(r"\]\(([^)#]+)", text))
+
+
+@pytest.mark.requirement("P-32")
+def test_the_workflow_runs_lint_and_the_tests_of_ci_without_gpu_or_display() -> None:
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8"))
+    jobs = workflow["jobs"]
+    assert {job["runs-on"] for job in jobs.values()} == {"ubuntu-24.04"}
+    commands = {step["run"] for job in jobs.values() for step in job["steps"] if "run" in step}
+    assert commands == {"./openarm lint", "./.ci/run"}
+    assert os.access(ROOT / ".ci" / "run", os.X_OK)
+
+
+def test_pre_commit_hooks_use_the_tools_of_the_environment() -> None:
+    (local,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"]
+    assert local["repo"] == "local"
+    for hook in local["hooks"]:
+        program = ROOT / hook["entry"].split()[0]
+        assert program.is_file(), hook["id"]
+
+
+@pytest.mark.parametrize(
+    "form", sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")), ids=lambda path: path.stem
+)
+def test_an_issue_form_is_what_github_reads(form: Path) -> None:
+    data = yaml.safe_load(form.read_text(encoding="utf-8"))
+    assert {"name", "description", "body"} <= data.keys()
+    for field in data["body"]:
+        assert {"type", "id", "attributes"} <= field.keys()
+        assert field["attributes"]["label"]
+
+
+def test_the_changelog_has_the_version_of_the_project() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    releases = re.findall(r"^## \[(.+?)\]", text, re.MULTILINE)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["version"] in releases[:2]
