@@ -29,7 +29,7 @@ from openarm_motion.planning import moves
 from openarm_motion.planning.approach import ApproachFailedError, Refused, plan_approach
 from openarm_motion.planning.arm import Arm, Situation
 from openarm_motion.scene.memory import HeldMemory
-from openarm_motion.timing.checks import check_trajectory
+from openarm_motion.timing.checks import Motion, check_trajectory
 from openarm_motion.timing.trajectory import Trajectory
 from openarm_sim_bridge.control.actuation import End, TrajectoryOutcome
 from openarm_sim_bridge.control.gripper import GripperGoal, GripperOutcome
@@ -264,7 +264,7 @@ class DirectLink:
 
     async def _follow(self, arm: Arm, plan: Trajectory, what: str, guard: Callable[[], None] | None) -> None:
         robot, state = self.robot, self.robot.states.latest()[1]
-        motion = check_trajectory(arm, plan.names, plan.t, plan.q, plan.v, state, plan.a)
+        motion = check_trajectory(arm, Motion.of(plan), state)
         expected, known = self._held.expected(arm.name, motion), self._held.held
         boxes = {**known, arm.name: known.get(arm.name, ()) if expected is None else expected}
         wait = self._traffic.room(arm, motion, robot.t_ns, state, boxes, self.max_wait)

@@ -118,7 +118,7 @@ class Arm:
     def situation(
         self,
         state: Mapping[str, float],
-        start: Sequence[float] = (),
+        start: Sequence[float] | Array = (),
         scale: float = 0.0,
         stopped: Callable[[], bool] = never,
         known: Known = NOTHING,
@@ -136,7 +136,7 @@ class Arm:
         self.scale(scale)
         return Situation(dict(state), q, scale, stopped, known)
 
-    def configuration(self, values: Sequence[float], what: str, tolerance: float = 1e-4) -> Array:
+    def configuration(self, values: Sequence[float] | Array, what: str, tolerance: float = 1e-4) -> Array:
         """Check joint positions and move them into the limits where they are out by no more than `tolerance`.
 
         Raises:

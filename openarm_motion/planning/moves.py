@@ -33,7 +33,9 @@ class Around:
     attached: Sequence[Box] = ()
 
 
-def to_joints(arm: Arm, now: Situation, goal: Sequence[float], around: Around, what: str = "goal") -> Trajectory:
+def to_joints(
+    arm: Arm, now: Situation, goal: Sequence[float] | Array, around: Around, what: str = "goal"
+) -> Trajectory:
     """Free path to a configuration.
 
     Raises:

@@ -6,23 +6,59 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from geometry_msgs.msg import Point, PoseStamped
-from openarm_interfaces.action import PlanApproach
-from openarm_interfaces.msg import ApproachTarget, CollisionBox, CollisionObject, PlanFailure, Refusal
+from geometry_msgs.msg import Point
+from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
+from openarm_interfaces.msg import (
+    ApproachTarget,
+    ArmTarget,
+    CollisionBox,
+    CollisionObject,
+    PlanFailure,
+    Refusal,
+)
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix, trajectory_to_msg, vector, xyz
+from openarm_common.ros.convert import (
+    matrix_to_pose,
+    pose_to_matrix,
+    trajectory_from_msg,
+    trajectory_to_msg,
+    vector,
+    xyz,
+)
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Cylinder, Mesh, Solid, Sphere
 from openarm_motion.planning.approach import ApproachRequest, Refused, Target
 from openarm_motion.planning.failure import PlanFailedError
+from openarm_motion.service.requests import (
+    ArmGoal,
+    DualGoal,
+    ExecuteRequest,
+    Goal,
+    JointGoal,
+    LineGoal,
+    MoveArmsRequest,
+    MoveRequest,
+    NamedGoal,
+    PlanApproachRequest,
+    PoseGoal,
+    Strategy,
+    YieldGoal,
+)
+from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import Trajectory
 
 _HELD_COLOR = (0.2, 0.8, 0.4, 0.5)
 _SCENE_COLOR = (0.8, 0.3, 0.2, 0.5)
 _PREVIEW_COLOR = (0.2, 0.5, 0.9, 0.9)
+
+_STRATEGIES: dict[int, Strategy] = {
+    MoveArms.Goal.ANY: "any",
+    MoveArms.Goal.TOGETHER: "together",
+    MoveArms.Goal.STAGGERED: "staggered",
+}
 
 
 def boxes_from_msg(messages: Sequence[CollisionBox]) -> tuple[Box, ...]:
@@ -39,13 +75,14 @@ def box_msg(box: Box) -> CollisionBox:
     return CollisionBox(id=box.id, pose=matrix_to_pose(box.T), size=vector(box.size))
 
 
-def solid_from_msg(message: CollisionObject, pose: Callable[[PoseStamped], Array]) -> Solid:
-    """A body of the planning scene; `pose` brings its pose to the base frame.
+def solid_from_msg(message: CollisionObject, in_base: Callable[[Array, str], Array]) -> Solid:
+    """A body of the planning scene; `in_base` brings a pose in a frame to the base frame.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the body and what is wrong with it; NO_TRANSFORM, for an unknown frame.
     """
-    T, size = pose(message.pose), xyz(message.size)
+    T = in_base(pose_to_matrix(message.pose.pose), message.pose.header.frame_id)
+    size = xyz(message.size)
     if message.shape == "box":
         return Box(message.id, T, size)
     if message.shape == "cylinder":
@@ -123,13 +160,13 @@ def preview_markers(ways: Mapping[str, Array], frame: str) -> MarkerArray:
     return array
 
 
-def request_from_msg(goal: PlanApproach.Goal) -> ApproachRequest:
+def approach_request(goal: PlanApproach.Goal) -> PlanApproachRequest:
     """What a goal of /motion/plan_approach asks.
 
     Raises:
-        OpenArmError: INVALID_ARGUMENT, for a pose or a box that is none.
+        OpenArmError: INVALID_ARGUMENT, for a pose or a box that is none; so do the others.
     """
-    return ApproachRequest(
+    approach = ApproachRequest(
         targets=tuple(_target(target) for target in goal.targets),
         obstacles=boxes_from_msg(goal.obstacles),
         attached=boxes_from_msg(goal.attached),
@@ -137,6 +174,76 @@ def request_from_msg(goal: PlanApproach.Goal) -> ApproachRequest:
         attached_after=goal.attached_after_approach,
         detached_after=goal.detached_after_approach,
     )
+    return PlanApproachRequest(
+        goal.arm,
+        approach,
+        np.array(goal.start, np.float64),
+        goal.velocity_scale,
+        boxes_from_msg(goal.gone),
+        goal.expected_scene_version,
+    )
+
+
+def move_request(goal: MoveArm.Goal) -> MoveRequest:
+    """What a goal of /motion/move asks."""
+    return MoveRequest(
+        goal.arm,
+        _goal(goal),
+        boxes_from_msg(goal.obstacles),
+        boxes_from_msg(goal.attached),
+        goal.hand_empty,
+        goal.velocity_scale,
+        goal.plan_only,
+        goal.max_wait,
+        goal.expected_scene_version,
+    )
+
+
+def move_arms_request(goal: MoveArms.Goal) -> MoveArmsRequest:
+    """What a goal of /motion/move_arms asks."""
+    if goal.strategy not in _STRATEGIES:
+        text = f"strategy is {goal.strategy}; valid: ANY 0, TOGETHER 1, STAGGERED 2"
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
+    return MoveArmsRequest(
+        tuple(ArmGoal(t.arm, _dual_goal(t), boxes_from_msg(t.attached), t.hand_empty) for t in goal.targets),
+        _STRATEGIES[goal.strategy],
+        boxes_from_msg(goal.obstacles),
+        goal.velocity_scale,
+        goal.plan_only,
+        goal.expected_scene_version,
+    )
+
+
+def execute_request(goal: ExecuteTrajectory.Goal) -> ExecuteRequest:
+    """What a goal of /motion/execute asks."""
+    names, t, q, v, a = trajectory_from_msg(goal.trajectory)
+    return ExecuteRequest(goal.arm, Motion(tuple(names), t, q, v, a), goal.max_wait, goal.scene_version)
+
+
+def _goal(goal: MoveArm.Goal) -> Goal:
+    kind, frame = goal.kind, goal.pose.header.frame_id
+    if kind == goal.JOINTS:
+        return JointGoal(np.array(goal.joint_positions, np.float64))
+    if kind == goal.NAMED:
+        return NamedGoal(goal.named)
+    if kind == goal.POSE:
+        return PoseGoal(pose_to_matrix(goal.pose.pose), frame, goal.free_orientation)
+    if kind == goal.LINEAR:
+        return LineGoal(pose_to_matrix(goal.pose.pose), frame)
+    raise OpenArmError(Code.INVALID_ARGUMENT, f"kind is {kind}; valid: JOINTS 0, POSE 1, LINEAR 2, NAMED 3")
+
+
+def _dual_goal(target: ArmTarget) -> DualGoal:
+    kind = target.kind
+    if kind == ArmTarget.JOINTS:
+        return JointGoal(np.array(target.joint_positions, np.float64))
+    if kind == ArmTarget.NAMED:
+        return NamedGoal(target.named)
+    if kind == ArmTarget.YIELD:
+        return YieldGoal(target.named or "home")
+    if kind == ArmTarget.POSE:
+        return PoseGoal(pose_to_matrix(target.pose.pose), target.pose.header.frame_id, target.free_orientation)
+    raise OpenArmError(Code.INVALID_ARGUMENT, f"kind is {kind}; valid: JOINTS 0, POSE 1, NAMED 3, YIELD 4")
 
 
 def trajectory_msg(trajectory: Trajectory) -> JointTrajectory:
@@ -149,7 +256,7 @@ def refusals_msg(refusals: Sequence[Refused]) -> list[Refusal]:
     return [Refusal(id=refused.id, code=refused.code.value, message=refused.message) for refused in refusals]
 
 
-def markers_msg(held: Mapping[str, tuple[str, Sequence[Box]]]) -> MarkerArray:
+def held_markers(held: Mapping[str, tuple[str, Sequence[Box]]]) -> MarkerArray:
     """Everything that is held: by arm, the tool frame and the boxes in it; replaces what was shown before."""
     array = MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
     for arm, (frame, boxes) in held.items():

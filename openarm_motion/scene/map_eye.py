@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map from shared memory, if it is there and fresh, without the cells that something known explains."""
+"""The map, if it is there and fresh, without the cells that something known explains."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Protocol
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.octree.distance_field import DistanceField, DistanceFieldReader
+from openarm_common.octree.distance_field import DistanceField
 from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision.seen import SeenMap, robot_bodies
 from openarm_motion.collision.solids import Solid
@@ -29,25 +29,37 @@ class Look:
     why: str = ""
 
 
+class FieldSource(Protocol):
+    """Where the map comes from: shared memory (`DistanceFieldReader`), or a mapper in this process."""
+
+    def latest(self) -> DistanceField:
+        """Return the newest field; NOT_READY when there is none."""
+        ...
+
+    def intact(self, field: DistanceField) -> bool:
+        """Whether a field is still as it was: ask after using it."""
+        ...
+
+
 class MapEye:
     """Looks at the map.
 
     Args:
         config: Whether it is needed, and how old it may be.
-        path: Of the shared distance field.
+        source: Of its distance fields.
         frames: Names of the base frame; the map must be in it.
     """
 
-    def __init__(self, config: MapConfig, path: Path, frames: Sequence[str]) -> None:
+    def __init__(self, config: MapConfig, source: FieldSource, frames: Sequence[str]) -> None:
         self._config, self._frames = config, tuple(frames)
-        self._reader = DistanceFieldReader(path)
+        self._reader = source
         self._cells: SeenMap | None = None
 
     def look(self, now_ns: int) -> Look:
         """The present map.
 
         Args:
-            now_ns: The machine's monotonic clock.
+            now_ns: Monotonic time, on the clock of the fields.
 
         Raises:
             PlanFailedError: NOT_READY or STALE_DATA, with what is missing or how old, when the map is required.

@@ -69,25 +69,13 @@ class Motion:
         return replace(self, t=self.t + seconds)
 
 
-def check_trajectory(
-    arm: Arm,
-    names: Sequence[str],
-    t: Array,
-    q: Array,
-    v: Array | None,
-    state: Mapping[str, float],
-    a: Array | None = None,
-) -> Motion:
+def check_trajectory(arm: Arm, motion: Motion, state: Mapping[str, float]) -> Motion:
     """Refuse a trajectory that the arm should not be told to follow.
 
     Args:
         arm: The arm.
-        names: Joints, in the order of the columns; all joints of the arm and no others.
-        t: (m,) times from the start.
-        q: (m, n) positions.
-        v: (m, n) velocities, or None.
+        motion: The trajectory, its columns in any order: all joints of the arm and no others.
         state: Present positions by joint name.
-        a: (m, n) accelerations, or None.
 
     Returns:
         The motion, columns in the arm's order.
@@ -95,6 +83,7 @@ def check_trajectory(
     Raises:
         OpenArmError: INVALID_ARGUMENT or LIMITS, with the joint, the point and the value.
     """
+    names, t, q, v, a = motion.names, motion.t, motion.q, motion.v, motion.a
     unknown = [name for name in names if name not in arm.names]
     missing = [name for name in arm.names if name not in names]
     if unknown or missing or len(names) != len(arm.names):

@@ -26,20 +26,20 @@ def plan(right: Arm, home: dict[str, float]) -> Trajectory:
 def fault(arm: Arm, state: dict[str, float], plan: Trajectory, code: Code, **change) -> str:
     values = {"names": plan.names, "t": plan.t, "q": plan.q.copy(), "v": plan.v.copy(), **change}
     with pytest.raises(OpenArmError) as caught:
-        check_trajectory(arm, values["names"], values["t"], values["q"], values["v"], state)
+        check_trajectory(arm, Motion(**values), state)
     assert caught.value.code == code
     return caught.value.message
 
 
 def test_what_was_planned_passes(right: Arm, home: dict[str, float], plan: Trajectory) -> None:
-    motion = check_trajectory(right, plan.names, plan.t, plan.q, plan.v, home)
+    motion = check_trajectory(right, Motion(plan.names, plan.t, plan.q, plan.v), home)
     assert motion.duration == plan.duration
     # columns in another order are put right
     order = [3, 1, 2, 0, 6, 5, 4]
     names = tuple(plan.names[i] for i in order)
-    again = check_trajectory(right, names, plan.t, plan.q[:, order], plan.v[:, order], home)
+    again = check_trajectory(right, Motion(names, plan.t, plan.q[:, order], plan.v[:, order]), home)
     np.testing.assert_array_equal(again.q, plan.q)
-    assert check_trajectory(right, plan.names, plan.t, plan.q, None, home).names == right.names
+    assert check_trajectory(right, Motion(plan.names, plan.t, plan.q), home).names == right.names
 
 
 def test_joints_numbers_and_limits_are_refused_by_name(right: Arm, home: dict[str, float], plan: Trajectory) -> None:

@@ -139,10 +139,10 @@ class Bench:
 
     def _add_motion(self, node: MotionNode) -> None:
         self.node, ros = node, self.ros
-        ros.spin_until(lambda: node._states.age_s() < 0.5, 10.0, "joint states")
-        ros.spin_until(lambda: "table" in node._states.buffer._static, 10.0, "the table's frame")
-        for follower in node._followers.values():
-            ros.spin_until(follower._client.server_is_ready, 10.0, "controllers")
+        ros.spin_until(lambda: node.robot.state_age() < 0.5, 10.0, "joint states")
+        ros.spin_until(lambda: "table" in node.robot.states._static, 10.0, "the table's frame")
+        for arm in node.service.arms:
+            ros.spin_until(node.robot.controller(arm).ready, 10.0, "controllers")
 
     def start(self, client: ActionClient, goal, **kwargs) -> tuple[ClientGoalHandle, Future]:
         handle, future = self.ros.send_goal(client, goal, **kwargs)

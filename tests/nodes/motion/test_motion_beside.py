@@ -26,7 +26,7 @@ def execute(arm: str, trajectory, max_wait: float = 30.0) -> ExecuteTrajectory.G
 
 def nearest(bench, futures, limit: float = 30.0) -> float:
     """Wait for results; the least distance of the arms in the states meanwhile."""
-    arms = bench.node._arms
+    arms = bench.node.service.arms
     both = BothArms(arms["left"], arms["right"])
     seen: list[dict[str, float]] = []
     done = lambda: seen.append(dict(bench.robot.state)) or all(f.done() for f in futures)  # noqa: E731
@@ -66,7 +66,7 @@ def test_an_arm_rests_until_the_one_under_way_leaves_room(bench) -> None:
     assert first.waited == 0.0
     assert 0.1 < second.waited < slow.points[-1].time_from_start.sec + 1.0
     assert gap >= 0.020
-    tip = bench.node._arms["right"].kinematics.fk(bench.q("right"))[:3, 3]
+    tip = bench.node.service.arms["right"].kinematics.fk(bench.q("right"))[:3, 3]
     np.testing.assert_allclose(tip, MIDDLE, atol=2e-3)
 
 
@@ -171,7 +171,7 @@ def test_two_grasps_are_carried_out_at_once(bench) -> None:
     bench.ros.spin_until(step, 40.0, "both grasps")
     assert ends == dict.fromkeys(sides, ["OK"] * 3)
     assert max(together) == 2
-    both = BothArms(bench.node._arms["left"], bench.node._arms["right"])
+    both = BothArms(bench.node.service.arms["left"], bench.node.service.arms["right"])
     scene = both.scene(seen[0])
     assert min(scene.separation(np.array([state[n] for n in both.names])) for state in seen[::3]) >= 0.020
 

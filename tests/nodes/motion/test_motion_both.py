@@ -28,7 +28,7 @@ def both_goal(*targets: ArmTarget, **kwargs) -> MoveArms.Goal:
 
 def watched(bench, goal: MoveArms.Goal) -> tuple[MoveArms.Result, float]:
     """Run a goal; its result, and the least distance of the arms in the joint states meanwhile."""
-    arms = bench.node._arms
+    arms = bench.node.service.arms
     both = BothArms(arms["left"], arms["right"])
     _, future = bench.start(bench.both_client, goal)
     seen: list[dict[str, float]] = []
@@ -51,7 +51,7 @@ def test_arms_take_each_others_place_at_once(bench, strategy: int) -> None:
     assert len(result.delays) == 2
     # both controllers are told the same moment
     assert len({stamp_to_ns(t.header.stamp) for t in result.trajectories}) == 1
-    tip = bench.node._arms["right"].kinematics.fk(bench.q("right"))[:3, 3]
+    tip = bench.node.service.arms["right"].kinematics.fk(bench.q("right"))[:3, 3]
     np.testing.assert_allclose(tip, [0.30, 0.0, 0.62], atol=2e-3)
 
 

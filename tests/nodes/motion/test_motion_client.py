@@ -51,14 +51,14 @@ def test_a_program_plans_agrees_and_moves(bench) -> None:
         motion.move_on_line("right", T, scale=1.0).raise_for_code()
 
     asked(bench, work)
-    tip = bench.node._arms["right"].kinematics.fk(bench.q("right"))
+    tip = bench.node.service.arms["right"].kinematics.fk(bench.q("right"))
     np.testing.assert_allclose(tip[:3, 3], (0.26, -0.24, 0.50), atol=2e-3)
     assert told[0][0] == "planning"
     assert told[-1][0] == "executing"
 
 
 def test_a_program_changes_the_scene_and_reads_why_there_is_no_plan(bench) -> None:
-    tip = bench.node._arms["right"].kinematics.fk([0, 0, 0, 1.5708, 0, 0, 0])
+    tip = bench.node.service.arms["right"].kinematics.fk([0, 0, 0, 1.5708, 0, 0, 0])
 
     def work(motion: MotionClient) -> None:
         assert motion.apply_scene([Sphere("ball", se3.make(None, tip[:3, 3]), 0.05)]) == 2

@@ -82,7 +82,7 @@ def test_a_controller_that_says_success_is_not_evidence(bench) -> None:
 
 @pytest.mark.requirement("B-40")
 def test_the_tool_must_end_within_its_tolerance(bench) -> None:
-    arm, goal = bench.node._arms["right"], bench.description.group_state("right_arm", "official_home")
+    arm, goal = bench.node.service.arms["right"], bench.description.group_state("right_arm", "official_home")
     q = np.array([goal[name] for name in arm.names])
     ways = [0.019 * np.array(signs) for signs in itertools.product((-1, 1), repeat=7)]  # within each joint's tolerance
     far = [np.linalg.norm(arm.kinematics.fk(q + way)[:3, 3] - arm.kinematics.fk(q)[:3, 3]) for way in ways]
@@ -104,7 +104,7 @@ def test_a_silent_robot_ends_a_motion_within_two_seconds(bench) -> None:
     assert (result.success, result.code) == (False, "ROBOT_LOST")
     assert "no /joint_states" in result.message
     # and nothing new is begun
-    bench.ros.spin_until(lambda: bench.node._states.age_s() > 0.6, 5.0)
+    bench.ros.spin_until(lambda: bench.node.robot.state_age() > 0.6, 5.0)
     result = bench.run(bench.move_client, bench.named("left"))
     assert result.code == "NOT_READY"
     assert "no fresh /joint_states" in result.message

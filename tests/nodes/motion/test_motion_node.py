@@ -80,7 +80,7 @@ def test_plan_only_moves_nothing(bench) -> None:
 
 
 def test_every_kind_of_move(bench) -> None:
-    arm = bench.node._arms["left"]
+    arm = bench.node.service.arms["left"]
     T = arm.kinematics.fk(bench.q("left"))
     below = T.copy()
     below[2, 3] -= 0.08
@@ -160,7 +160,7 @@ def test_both_arms_move_at_once_and_one_arm_only_once(bench) -> None:
 def test_the_executor_answers_while_a_plan_is_searched(bench) -> None:
     for name in bench.description.arm_joints("right"):
         bench.robot.state[name] = 0.0
-    bench.ros.spin_until(lambda: abs(bench.node._states.buffer.latest()[1]["openarm_right_joint2"]) < 1e-9)
+    bench.ros.spin_until(lambda: abs(bench.node.robot.states.latest()[1]["openarm_right_joint2"]) < 1e-9)
     future = bench.start(bench.move_client, bench.named("right", "home", plan_only=True))[1]
     begin = time.monotonic()
     answer = bench.ros.call(bench.ik_client, ComputeIK.Request(arm="left", pose=bench.stamped(np.eye(4))))
@@ -196,7 +196,7 @@ def test_a_grasp_is_planned_executed_and_shown_as_attached_b47(bench) -> None:
     marker = bench.markers[-1].markers[-1]
     assert marker.header.frame_id == "openarm_right_hand_tcp"
     assert marker.scale.x == pytest.approx(0.05)
-    arm = bench.node._arms["right"]
+    arm = bench.node.service.arms["right"]
     np.testing.assert_allclose(arm.kinematics.fk(bench.q("right"))[:3, 3], [0.26, -0.24, 0.545], atol=1e-3)
 
 
@@ -223,7 +223,7 @@ def test_table_comes_from_the_scene_description() -> None:
 @pytest.mark.requirement("B-50")
 def test_obstacles_travel_with_the_request(bench) -> None:
     # no planning scene that could lack them: the same goal is refused with the box and planned without it
-    arm = bench.node._arms["right"]
+    arm = bench.node.service.arms["right"]
     goal = bench.named("right", "official_home", plan_only=True)
     tip = arm.kinematics.fk([0, 0, 0, 1.5708, 0, 0, 0])
     goal.obstacles = [CollisionBox(id="box", pose=matrix_to_pose(tip), size=Vector3(x=0.05, y=0.05, z=0.05))]
@@ -249,7 +249,7 @@ class WaitingPlanner:
 
 
 def test_a_search_ends_by_cancel(bench) -> None:
-    planner = bench.node._arms["right"]._planner = WaitingPlanner()
+    planner = bench.node.service.arms["right"]._planner = WaitingPlanner()
     for client, goal in ((bench.move_client, bench.named()), (bench.plan_client, approach_goal(bench))):
         planner.searching.clear()
         handle, future = bench.start(client, goal)
@@ -261,7 +261,7 @@ def test_a_search_ends_by_cancel(bench) -> None:
 
 
 def test_a_search_ends_with_the_node(bench) -> None:
-    planner = bench.node._arms["right"]._planner = WaitingPlanner()
+    planner = bench.node.service.arms["right"]._planner = WaitingPlanner()
     bench.start(bench.move_client, bench.named())
     bench.ros.spin_until(planner.searching.is_set, 5.0, "the search")
     begin = time.monotonic()

@@ -32,7 +32,7 @@ def body(bench, id: str, p, size=(0.05, 0.05, 0.05), shape: str = "box", frame: 
 
 def goal_tip(bench) -> np.ndarray:
     """Where the right tool is in the posture `official_home`."""
-    return bench.node._arms["right"].kinematics.fk([0, 0, 0, 1.5708, 0, 0, 0])[:3, 3]
+    return bench.node.service.arms["right"].kinematics.fk([0, 0, 0, 1.5708, 0, 0, 0])[:3, 3]
 
 
 @pytest.mark.requirement("B-50")
@@ -136,7 +136,7 @@ def test_a_plan_is_shown_and_carried_out_when_a_human_agrees(bench) -> None:
     bench.ros.spin_until(lambda: shown, 5.0, "the preview")
     markers = {m.ns: m for m in shown[-1].markers if m.action == Marker.ADD}
     assert set(markers) == {"right/way", "right/start", "right/end"}
-    arm = bench.node._arms["right"]
+    arm = bench.node.service.arms["right"]
     end = markers["right/way"].points[-1]
     np.testing.assert_allclose([end.x, end.y, end.z], goal_tip(bench), atol=1e-3)
     start = markers["right/start"].pose.position
@@ -256,7 +256,7 @@ def test_a_map_that_is_off_is_not_looked_at(make_bench, writer) -> None:
 
 def test_octree_cells_at_the_gripper_do_not_hold_the_arm(make_bench, writer) -> None:
     bench = make_bench()
-    arm = bench.node._arms["right"]
+    arm = bench.node.service.arms["right"]
     T = arm.kinematics.fk(bench.q("right"))
     write(writer, [T[:3, 3] + T[:3, 0] * x + T[:3, 1] * y for x in (-0.02, 0.0, 0.02) for y in (-0.05, 0.0, 0.05)])
     assert bench.run(bench.move_client, bench.named(plan_only=True)).success

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot of the node graph as the motion service sees it: joint states, controllers, wall clock, worker threads."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, TypeVar
+
+from control_msgs.action import FollowJointTrajectory
+from rclpy.action import ActionClient
+from rclpy.task import Future, Task
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.ros.convert import ns_to_stamp, trajectory_to_msg
+from openarm_common.ros.node import BaseNode
+from openarm_common.ros.tf import RobotStateListener
+from openarm_motion.config import MotionConfig
+from openarm_motion.service.robot import Outcome
+from openarm_motion.timing.checks import Motion
+
+T = TypeVar("T")
+
+#: From one wake of the coroutines that wait to the next, s of wall clock.
+_PERIOD = 0.05
+
+_RESULT = FollowJointTrajectory.Result
+_FAULTS = {
+    _RESULT.INVALID_GOAL: "INVALID_GOAL",
+    _RESULT.INVALID_JOINTS: "INVALID_JOINTS",
+    _RESULT.OLD_HEADER_TIMESTAMP: "OLD_HEADER_TIMESTAMP",
+    _RESULT.PATH_TOLERANCE_VIOLATED: "PATH_TOLERANCE_VIOLATED",
+    _RESULT.GOAL_TOLERANCE_VIOLATED: "GOAL_TOLERANCE_VIOLATED",
+}
+
+
+class NodeRobot:
+    """Implements `openarm_motion.service.robot.RobotInterface`.
+
+    Args:
+        node: Owns clients, timer, executor and threads.
+        config: Parameters.
+    """
+
+    def __init__(self, node: BaseNode[Any], config: MotionConfig) -> None:
+        self._node = node
+        self.listener = RobotStateListener(node, node.description)
+        self._controllers = {arm: Controller(node, config.controller.format(arm=arm)) for arm in config.arms}
+        self._waiting, self._wake = 0, Future(executor=node.executor)
+        self._timer = node.create_timer(_PERIOD, self._on_timer, clock=node.steady_clock)
+        self._timer.cancel()
+
+    @property
+    def states(self) -> RobotStateBuffer:
+        """Joint states and frames."""
+        return self.listener.buffer
+
+    def state_age(self) -> float:
+        """Time since the newest joint state arrived, s of wall clock."""
+        return self.listener.age_s()
+
+    def now(self) -> float:
+        """Monotonic wall clock, s."""
+        return time.monotonic()
+
+    def controller(self, arm: str) -> Controller:
+        """The controller of an arm."""
+        return self._controllers[arm]
+
+    async def pause(self) -> None:
+        """Sleep until the next tick of a timer that runs while anybody waits."""
+        if not self._waiting and self._timer.is_canceled():
+            self._wake = Future(executor=self._node.executor)
+            self._timer.reset()
+        self._waiting += 1
+        await self._wake
+
+    async def compute(self, work: Callable[[], T], nominal: float = 0.0) -> T:
+        """Run work in a worker thread."""
+        result: T = await self._node.in_thread(work)
+        return result
+
+    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
+        """Run coroutines as tasks of the node's executor."""
+        executor = self._node.executor
+        if executor is None:
+            raise OpenArmError(Code.INTERNAL, "the node is in no executor")
+        tasks: list[Task] = [executor.create_task(part) for part in parts]
+        for task in tasks:
+            await task
+
+    def _on_timer(self) -> None:
+        if not self._waiting:
+            self._timer.cancel()
+            return
+        self._waiting = 0
+        wake, self._wake = self._wake, Future(executor=self._node.executor)
+        wake.set_result(None)
+
+
+class Controller:
+    """A FollowJointTrajectory controller; implements `openarm_motion.service.robot.ArmController`.
+
+    Args:
+        node: Owns the client.
+        name: Of the action.
+    """
+
+    def __init__(self, node: BaseNode[Any], name: str) -> None:
+        self.name = name
+        self._client = ActionClient(node, FollowJointTrajectory, name)
+
+    def ready(self) -> bool:
+        """Whether its action is in the graph."""
+        return self._client.server_is_ready()
+
+    def start(self, motion: Motion, begin_ns: int) -> _Goal:
+        """Send a trajectory; its stamp is where it begins."""
+        message = trajectory_to_msg(motion.names, motion.t, motion.q, motion.v, motion.a)
+        message.header.stamp = ns_to_stamp(begin_ns)
+        return _Goal(self._client.send_goal_async(FollowJointTrajectory.Goal(trajectory=message)))
+
+
+class _Goal:
+    """A goal that was sent; one that is withdrawn before it is accepted is cancelled when it is."""
+
+    def __init__(self, sent: Future) -> None:
+        self._handle: Any = None
+        self._ended: Future | None = None
+        self._withdrawn = False
+        sent.add_done_callback(self._on_answer)
+
+    @property
+    def accepted(self) -> bool | None:
+        return None if self._handle is None else bool(self._handle.accepted)
+
+    @property
+    def outcome(self) -> Outcome | None:
+        if self._ended is None or not self._ended.done():
+            return None
+        answer: Any = self._ended.result()
+        result = answer.result
+        fault = _FAULTS.get(result.error_code, str(result.error_code))
+        reason = f": {result.error_string}" if result.error_string else ""
+        return Outcome(result.error_code == _RESULT.SUCCESSFUL, fault + reason)
+
+    def cancel(self) -> None:
+        self._withdrawn = True
+        if self.accepted:
+            self._handle.cancel_goal_async()
+
+    def _on_answer(self, sent: Future) -> None:
+        self._handle = sent.result()
+        if self.accepted:
+            self._ended = self._handle.get_result_async()
+            if self._withdrawn:
+                self._handle.cancel_goal_async()

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a plan starts from: joints, planning scene, map, and what the hands hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from openarm_common.types import Array
+from openarm_motion.collision.seen import Known, carried
+from openarm_motion.collision.solids import Box, Solid
+from openarm_motion.config import MotionConfig
+from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.scene.map_eye import Look, MapEye, unexplained
+from openarm_motion.scene.memory import HeldMemory
+from openarm_motion.scene.planning_scene import PlanningScene
+from openarm_motion.service.coordination import ArmCoordination
+from openarm_motion.service.robot import RobotInterface, Watch, stale
+
+#: Next to an arm under way plans keep this distance from where it will end, m: more than what is then proven.
+_NEXT_TO = 0.035
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A start without the map yet, the scene's version, and what the answer says of the map.
+
+    `complete` adds the map; it takes some ms and is for `RobotInterface.compute`.
+    """
+
+    now: Situation
+    version: int
+    note: str
+    complete: Callable[[], Situation]
+
+
+class PlanningContext:
+    """Collects what plans start from.
+
+    Args:
+        robot: The robot.
+        arms: By name.
+        scene: Bodies to keep clear of.
+        held: What the hands hold.
+        coordination: Which arms are under way.
+        map_view: The map.
+        config: Parameters.
+    """
+
+    def __init__(
+        self,
+        robot: RobotInterface,
+        arms: Mapping[str, Arm],
+        scene: PlanningScene,
+        held: HeldMemory,
+        coordination: ArmCoordination,
+        map_view: MapEye,
+        config: MotionConfig,
+    ) -> None:
+        self._robot, self._arms, self._scene, self._held = robot, arms, scene, held
+        self._coordination, self._map, self._config = coordination, map_view, config
+
+    def look(self) -> Look:
+        """Return the map as it is now; what is required and missing is an error, see `MapEye.look`."""
+        return self._map.look(round(self._robot.now() * 1e9))
+
+    def prepare(
+        self,
+        arm: Arm,
+        start: Sequence[float] | Array,
+        scale: float,
+        stopped: Callable[[], bool],
+        estimates: Sequence[Box] = (),
+        attached: Sequence[Box] = (),
+        expected: int = 0,
+    ) -> Prepared:
+        """Take the robot as it is now; a given start is enough where the joint states are missing.
+
+        Another arm under way is taken to be where it will end.
+
+        Args:
+            arm: The arm that is asked.
+            start: Its joints, or empty for the present ones.
+            scale: Velocity scale.
+            stopped: Whether the request was cancelled.
+            estimates: Boxes of the request: what the map shows of them is theirs.
+            attached: What the arm holds, tool frame.
+            expected: Version that the scene must have; 0 is any.
+
+        Raises:
+            OpenArmError: from `Arm.situation`, `PlanningScene.require` and `MapEye.look`; NOT_READY without joints.
+        """
+        self._scene.require(expected)
+        now = self.start(arm, start, scale, stopped)
+        ends = self._coordination.ends(arm)
+        later = {**now.state, **ends}
+        solids = (*self._scene.solids, *self._others_hold(arm, later))
+        held = carried(attached, arm.kinematics.fk(now.start))
+        return self._prepared(now, solids, [*estimates, *held], later, _NEXT_TO if ends else 0.0)
+
+    def prepare_both(
+        self,
+        arms: Sequence[Arm],
+        scale: float,
+        stopped: Callable[[], bool],
+        estimates: Sequence[Box],
+        attached: Sequence[Sequence[Box]],
+        expected: int,
+    ) -> Prepared:
+        """As `prepare`, for two arms: `start` is the joints of both."""
+        self._scene.require(expected)
+        parts = [self.start(arm, (), scale, stopped) for arm in arms]
+        known = list(estimates)
+        for arm, part, boxes in zip(arms, parts, attached, strict=True):
+            known += carried(boxes, arm.kinematics.fk(part.start))
+        now = replace(parts[0], start=np.concatenate([part.start for part in parts]))
+        return self._prepared(now, self._scene.solids, known, now.state)
+
+    def start(self, arm: Arm, start: Sequence[float] | Array, scale: float, stopped: Callable[[], bool]) -> Situation:
+        """Take the joints alone, without scene and map; arguments as `prepare`."""
+        state: dict[str, float] = {}
+        age = self._robot.state_age()
+        if age <= self._config.execution.stale_after:
+            state = self._robot.states.latest()[1]
+        elif len(start) == 0:
+            raise stale(age)
+        return arm.situation(state, start, scale, stopped)
+
+    async def fresh(self) -> None:
+        """Wait a moment for a fresh joint state; see `Watch.fresh`."""
+        if self._robot.state_age() > self._config.execution.stale_after:
+            await Watch(self._robot).fresh()
+
+    def _prepared(
+        self,
+        now: Situation,
+        solids: tuple[Solid, ...],
+        estimates: Sequence[Box],
+        later: Mapping[str, float],
+        apart: float = 0.0,
+    ) -> Prepared:
+        look, config = self.look(), self._config.map
+        certain = (*self._scene.fixed, *solids)
+        robot = next(iter(self._arms.values())).description  # with what is mounted on it
+
+        def complete() -> Situation:
+            seen = look.seen
+            if seen is not None:
+                seen = unexplained(seen, config, robot, now.state, certain, estimates)
+            return replace(now, state=later, known=Known(solids, seen, apart))
+
+        # a graph without a map is as it should be; one with an old map is not
+        note = f" without the map: {look.why}" if look.why and look.version else ""
+        return Prepared(now, self._scene.version, note, complete)
+
+    def _others_hold(self, arm: Arm, state: Mapping[str, float]) -> list[Box]:
+        """What the other arms hold, where they hold it in a state."""
+        boxes: list[Box] = []
+        for name, held in self._held.held.items():
+            other = self._arms[name]
+            if other is arm or any(joint not in state for joint in other.names):
+                continue
+            T = other.kinematics.fk(np.array([state[joint] for joint in other.names]))
+            boxes += [replace(box, id=f"{box.id} in the {name} hand") for box in carried(held, T)]
+        return boxes

@@ -1,0 +1,428 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion service: plans and executes motions of each arm, and of two arms at once, for whatever robot.
+
+It owns arms, planning scene, held boxes and the map, and decides when an arm may move. The motion node serves it over
+ROS; a campaign calls it in process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.housings import with_housings
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.scene.scene import Table
+from openarm_common.types import Array
+from openarm_motion.collision.solids import Box, Solid, box_from
+from openarm_motion.config import MotionConfig
+from openarm_motion.planning import moves
+from openarm_motion.planning.alternative import explained, explained_approach, near_joints, near_pose
+from openarm_motion.planning.approach import ApproachFailedError, ApproachPlan, plan_approach
+from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.planning.both import BothArms
+from openarm_motion.planning.goals import goal_configurations, posture, yielding
+from openarm_motion.planning.planner import never
+from openarm_motion.planning.together import BothGoals, BothPlan, plan_any, plan_staggered, plan_together
+from openarm_motion.scene.map_eye import FieldSource, MapEye
+from openarm_motion.scene.memory import HeldMemory
+from openarm_motion.scene.planning_scene import PlanningScene
+from openarm_motion.service.context import PlanningContext
+from openarm_motion.service.coordination import ArmCoordination
+from openarm_motion.service.requests import (
+    ApproachAnswer,
+    ArmGoal,
+    ExecuteRequest,
+    Goal,
+    IkAnswer,
+    JointGoal,
+    MotionAnswer,
+    MoveAnswer,
+    MoveArmsAnswer,
+    MoveArmsRequest,
+    MoveRequest,
+    NamedGoal,
+    PlanApproachRequest,
+    PoseGoal,
+    SceneState,
+    Strategy,
+    YieldGoal,
+)
+from openarm_motion.service.robot import RobotInterface, Watch
+from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import Trajectory
+
+#: Called with a stage ("planning", "executing", ...) and its progress: 0 to 1, or the targets that were checked.
+Report = Callable[[str, float], None]
+
+#: Points of a trajectory in a preview.
+_PREVIEW_POINTS = 50
+
+_STRATEGIES: dict[Strategy, Callable[[BothArms, Situation, BothGoals, float], BothPlan]] = {
+    "any": plan_any,
+    "together": plan_together,
+    "staggered": plan_staggered,
+}
+
+
+def silent(stage: str, progress: float) -> None:
+    """Report to nobody."""
+
+
+def table_box(table: Table) -> Box:
+    """Return the table top of a scene as an obstacle."""
+    x, y = table.centre
+    return box_from("table", (x, y, table.top_z - 0.5 * table.thickness), table.extents)
+
+
+def make_arms(config: MotionConfig, description: RobotDescription, fixed: Sequence[Box]) -> dict[str, Arm]:
+    """Make the arms of a robot with its cameras mounted.
+
+    Args:
+        config: Parameters.
+        description: The robot.
+        fixed: Boxes that are always there (the table), base frame.
+    """
+    body = with_housings(description, load_cameras().values())
+    return {name: Arm(name, body, config, fixed) for name in config.arms}
+
+
+class MotionService:
+    """Plans and executes motions; one event loop, several requests at once.
+
+    Args:
+        robot: The robot and its clock.
+        config: Parameters.
+        arms: From `make_arms`.
+        field: Where the map comes from.
+        frames: Names of the base frame.
+    """
+
+    def __init__(
+        self,
+        robot: RobotInterface,
+        config: MotionConfig,
+        arms: Mapping[str, Arm],
+        field: FieldSource,
+        frames: Sequence[str],
+    ) -> None:
+        self.robot, self.config, self.arms, self._frames = robot, config, arms, tuple(frames)
+        #: No new motion is begun, and those under way hold.
+        self.closing = False
+        #: Called with each plan, by arm, before it is executed.
+        self.on_plan: Callable[[Mapping[str, Sequence[Trajectory]]], None] = lambda plans: None
+        #: Called when what a hand holds has changed.
+        self.on_held: Callable[[], None] = lambda: None
+        self.scene = PlanningScene(next(iter(arms.values())).static)
+        self.memory = HeldMemory()
+        self.coordination = ArmCoordination(robot, arms, self.memory, lambda: self.on_held())
+        view = MapEye(config.map, field, frames)
+        self._context = PlanningContext(robot, arms, self.scene, self.memory, self.coordination, view, config)
+        self._claimed: set[str] = set()
+
+    # --- plans and motions
+    async def plan_approach(
+        self, request: PlanApproachRequest, cancelled: Callable[[], bool] = never, report: Report = silent
+    ) -> ApproachAnswer:
+        """Choose and plan one of several approaches of an arm.
+
+        Args:
+            request: What is asked.
+            cancelled: Whether to stop.
+            report: Called with the stage and the number of targets checked, also from a worker thread.
+        """
+        answer, begin = ApproachAnswer(), self.robot.now()
+        try:
+            arm, stopped, wanted = self._arm(request.arm), self._stopped(cancelled), request.approach
+            if not len(request.start):
+                await self._context.fresh()
+            estimates = (*wanted.obstacles, *request.ignore_regions)
+            prepared = self._context.prepare(
+                arm, request.start, request.scale, stopped, estimates, wanted.attached, request.scene_version
+            )
+            answer = replace(answer, scene_version=prepared.version)
+
+            def work() -> ApproachPlan:
+                now = prepared.complete()
+                return explained_approach(lambda: plan_approach(arm, now, wanted, report), arm, now, wanted)
+
+            plan = await self.robot.compute(work)
+            delay = await self.coordination.start_delay(arm, Motion.of(plan.transfer), wanted.attached, stopped)
+            parts = (plan.transfer, plan.approach, plan.retreat)
+            self.on_plan({arm.name: parts})
+            self.memory.expect(arm.name, parts[:2], wanted.attached)
+            self.memory.expect(arm.name, parts[2:], plan.held_after)
+            answer = replace(
+                answer,
+                message=f"planned{prepared.note}",
+                start_delay=delay,
+                chosen=plan.chosen,
+                parts=parts,
+                refusals=plan.refusals,
+                limit_margins=plan.limit_margins,
+            )
+        except OpenArmError as error:
+            refusals = error.refusals if isinstance(error, ApproachFailedError) else ()
+            answer = replace(answer, error=error, message=error.message, refusals=refusals)
+        return replace(answer, planning_time=self.robot.now() - begin)
+
+    async def move(
+        self, request: MoveRequest, cancelled: Callable[[], bool] = never, report: Report = silent
+    ) -> MoveAnswer:
+        """Plan, and unless it is `plan_only` execute, a motion of one arm; arguments as `plan_approach`."""
+        answer, begin, holding = MoveAnswer(), self.robot.now(), ""
+        try:
+            arm, stopped = self._arm(request.arm), self._stopped(cancelled)
+            with self._claim(arm.name, wanted=not request.plan_only):
+                report("planning", 0.0)
+                held, holding = self.memory.on_request(arm.name, request.attached, request.hand_empty)
+                around = moves.Around(request.obstacles, held)
+                await self._context.fresh()
+                prepared = self._context.prepare(
+                    arm, (), request.scale, stopped, request.obstacles, held, request.scene_version
+                )
+                answer = replace(answer, scene_version=prepared.version)
+                planner = self._planner(arm, request.goal, around)
+                trajectory = await self.robot.compute(lambda: planner(prepared.complete()))
+                message = f"planned, {trajectory.duration:.2f} s{prepared.note}{holding}"
+                answer = replace(answer, trajectory=trajectory, planning_time=self.robot.now() - begin, message=message)
+                self.on_plan({arm.name: (trajectory,)})
+                if not request.plan_only:
+                    self.scene.require(prepared.version)
+                    self.coordination.hold(arm.name, held)
+                    delay = await self._follow(arm, Motion.of(trajectory), stopped, report, request.max_start_delay)
+                    answer = replace(answer, start_delay=delay, message=f"arrived{prepared.note}{holding}")
+        except OpenArmError as error:
+            return replace(answer, error=error, message=error.message + holding)
+        return answer
+
+    async def move_arms(
+        self, request: MoveArmsRequest, cancelled: Callable[[], bool] = never, report: Report = silent
+    ) -> MoveArmsAnswer:
+        """Plan, and unless it is `plan_only` execute, a dual-arm motion; arguments as `plan_approach`."""
+        answer = MoveArmsAnswer()
+        try:
+            arms, stopped = self._two_arms(request.targets), self._stopped(cancelled)
+            with self._claim(*(arm.name for arm in arms), wanted=not request.plan_only):
+                report("planning", 0.0)
+                begin = self.robot.now()
+                held = [self.memory.on_request(t.arm, t.attached, t.hand_empty)[0] for t in request.targets]
+                await self._context.fresh()
+                prepared = self._context.prepare_both(
+                    arms, request.scale, stopped, request.obstacles, held, request.scene_version
+                )
+                answer = replace(answer, scene_version=prepared.version)
+                both = BothArms(*arms)
+                starts = both.parts(prepared.now.start)
+                find = [self._goals(a, q, t) for a, q, t in zip(arms, starts, request.targets, strict=True)]
+                limit = self.config.planning.time_limit
+
+                def work() -> BothPlan:
+                    now = prepared.complete()
+                    wanted = BothGoals((find[0](now), find[1](now)), request.obstacles, (held[0], held[1]))
+                    return _STRATEGIES[request.strategy](both, now, wanted, limit)
+
+                plan = await self.robot.compute(work)
+                seconds = max(part.duration for part in plan.trajectories)
+                apart = f"{plan.separation * 1e3:.0f} mm apart"
+                answer = replace(
+                    answer,
+                    trajectories=plan.trajectories,
+                    delays=plan.delays,
+                    separation=plan.separation,
+                    planning_time=self.robot.now() - begin,
+                    message=f"planned, {seconds:.2f} s, {apart}{prepared.note}",
+                )
+                plans = dict(zip((arm.name for arm in arms), plan.trajectories, strict=True))
+                self.on_plan({name: (part,) for name, part in plans.items()})
+                if not request.plan_only:
+                    self.scene.require(prepared.version)
+                    for arm, boxes in zip(arms, held, strict=True):
+                        self.coordination.hold(arm.name, boxes)
+                    motions = [Motion.of(part) for part in plan.trajectories]
+                    await self.coordination.follow_together(
+                        arms, motions, stopped, lambda share: report("executing", share)
+                    )
+                    answer = replace(answer, message=f"arrived, {apart} on the way")
+        except OpenArmError as error:
+            return replace(answer, error=error, message=error.message)
+        return answer
+
+    async def execute(
+        self, request: ExecuteRequest, cancelled: Callable[[], bool] = never, report: Report = silent
+    ) -> MotionAnswer:
+        """Execute a trajectory of one arm; arguments as `plan_approach`."""
+        try:
+            arm = self._arm(request.arm)
+            self.scene.require(request.scene_version)
+            with self._claim(arm.name, wanted=True):
+                await self._context.fresh()
+                stopped = self._stopped(cancelled)
+                delay = await self._follow(arm, request.motion, stopped, report, request.max_start_delay)
+        except OpenArmError as error:
+            return MotionAnswer(error, error.message)
+        return MotionAnswer(message="arrived", start_delay=delay)
+
+    async def hold(self, limit: float) -> None:
+        """End all plans and motions; the arms hold where they are, within `limit` s."""
+        self.closing = True
+        followers = self.coordination.followers.values()
+        await Watch(self.robot).until(lambda: not any(f.active for f in followers), limit=limit)
+
+    @property
+    def moving(self) -> list[str]:
+        """Names of the arms under way."""
+        return [name for name, follower in self.coordination.followers.items() if follower.active is not None]
+
+    def held_on_links(self) -> dict[str, tuple[str, tuple[Box, ...]]]:
+        """Return what each hand holds: by arm, the tool link and the boxes in its frame."""
+        return {name: (self.arms[name].kinematics.tool_link, boxes) for name, boxes in self.memory.held.items()}
+
+    # --- questions
+    def compute_ik(self, arm_name: str, pose: Array, seed: Sequence[float], *, free_orientation: bool) -> IkAnswer:
+        """Solve the inverse kinematics of an arm's tool.
+
+        Args:
+            arm_name: Name of the arm.
+            pose: (4, 4) base frame.
+            seed: (n,) joints to stay near to; empty: the present ones.
+            free_orientation: Position alone counts.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT; LIMITS; NOT_READY, without seed and joint states.
+        """
+        arm = self._arm(arm_name)
+        start = self._context.start(arm, seed, 0.0, never).start
+        best = arm.inverse.nearest(pose, start, position_only=free_orientation)
+        error = None
+        if not best.success:
+            error = moves.unreachable(arm, pose, free_orientation=free_orientation, margin=0.0, near=start)
+        fk = arm.kinematics.fk(best.q)
+        return IkAnswer(best.q, fk, best.position_error, best.orientation_error, error)
+
+    def in_base(self, pose: Array, frame: str = "") -> Array:
+        """Bring a pose (4, 4) in any known frame to the base frame.
+
+        Raises:
+            OpenArmError: NO_TRANSFORM, listing the frames there are.
+        """
+        if frame in ("", *self._frames):
+            return pose
+        states = self.robot.states
+        stamp_ns = states.latest()[0] if self.robot.state_age() < float("inf") else 0
+        return states.lookup(self._frames[-1], frame, stamp_ns) @ pose
+
+    def scene_state(self) -> SceneState:
+        """Return the planning scene, and whether plans use the map."""
+        scene = self.scene
+        used, version, age, why = False, 0, -1.0, ""
+        try:
+            look = self._context.look()
+            used, version, age, why = look.seen is not None, look.version, look.age_s, look.why
+        except OpenArmError as error:
+            why = error.message
+        solids = (*scene.fixed, *scene.solids)
+        return SceneState(scene.version, solids, tuple(box.id for box in scene.fixed), used, version, age, why)
+
+    def apply_scene(self, *, clear: bool, remove: Sequence[str], add: Sequence[Solid], expected: int = 0) -> str:
+        """Change the planning scene, all as asked or nothing; see `PlanningScene.apply`. Return it in a sentence."""
+        self.scene.apply(clear=clear, remove=remove, add=add, expected=expected)
+        names = ", ".join(solid.id for solid in self.scene.solids) or "nothing beside what is fixed"
+        return f"version {self.scene.version}: {names}"
+
+    def check_map(self) -> str:
+        """Return how old the map is, or why it is not used.
+
+        Raises:
+            OpenArmError: NOT_READY or STALE_DATA, when it is required.
+        """
+        look = self._context.look()
+        return look.why or f"version {look.version}, {look.age_s:.1f} s old"
+
+    def tool_paths(self, plans: Mapping[str, Sequence[Trajectory]]) -> dict[str, Array]:
+        """Return the paths (n, 3) of the tools on the trajectories of each arm, one after the other, base frame, m."""
+        paths: dict[str, Array] = {}
+        for name, parts in plans.items():
+            q = np.concatenate([part.at(np.linspace(0.0, part.duration, _PREVIEW_POINTS))[0] for part in parts])
+            paths[name] = self.arms[name].kinematics.fk_many(q)[:, :3, 3]
+        return paths
+
+    # --- parts of these
+    async def _follow(
+        self, arm: Arm, motion: Motion, cancelled: Callable[[], bool], report: Report, max_delay: float
+    ) -> float:
+        progress = lambda share: report("executing", share)  # noqa: E731
+        return await self.coordination.follow(arm, motion, cancelled, progress, max_delay)
+
+    def _planner(self, arm: Arm, goal: Goal, around: moves.Around) -> Callable[[Situation], Trajectory]:
+        """The plan that a goal asks for; poses are looked up now, the rest is for `RobotInterface.compute`."""
+        if isinstance(goal, JointGoal):
+            return lambda now: explained(
+                lambda: moves.to_joints(arm, now, goal.q, around), lambda: near_joints(arm, now, around, goal.q)
+            )
+        if isinstance(goal, NamedGoal):
+            return lambda now: explained(
+                lambda: moves.to_named(arm, now, goal.name, around),
+                lambda: near_joints(arm, now, around, posture(arm, goal.name, now.start)),
+            )
+        pose = self.in_base(goal.pose, goal.frame)
+        if isinstance(goal, PoseGoal):
+            free = goal.free_orientation
+            return lambda now: explained(
+                lambda: moves.to_pose(arm, now, pose, around, free_orientation=free),
+                lambda: near_pose(arm, now, around, pose, free_orientation=free),
+            )
+        return lambda now: moves.to_pose_on_line(arm, now, pose, around)
+
+    def _goals(self, arm: Arm, start: Array, target: ArmGoal) -> Callable[[Situation], Array]:
+        """Configurations (k, n) that a goal of a dual-arm motion stands for; as `_planner`."""
+        goal = target.goal
+        if isinstance(goal, JointGoal):
+            q = arm.configuration(goal.q, f"goal of the {arm.name} arm", 1e-3)
+            return lambda _: q[None]
+        if isinstance(goal, NamedGoal):
+            return lambda _: posture(arm, goal.name, start)[None]
+        if isinstance(goal, YieldGoal):
+            return lambda _: yielding(arm, start, goal.name)
+        pose, free = self.in_base(goal.pose, goal.frame), goal.free_orientation
+        return lambda now: goal_configurations(arm, now, start, pose, free_orientation=free)
+
+    def _two_arms(self, targets: Sequence[ArmGoal]) -> tuple[Arm, Arm]:
+        names = [target.arm for target in targets]
+        if len(names) != 2 or len(set(names)) != 2 or any(name not in self.arms for name in names):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"targets are for {', '.join(repr(n) for n in names) or 'no arm'}; expected two different ones of"
+                f" {', '.join(self.arms)}",
+            )
+        return self.arms[names[0]], self.arms[names[1]]
+
+    def _arm(self, name: str) -> Arm:
+        if name not in self.arms:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"arm is {name!r}; arms: {', '.join(self.arms)}")
+        return self.arms[name]
+
+    def _stopped(self, cancelled: Callable[[], bool]) -> Callable[[], bool]:
+        return lambda: self.closing or cancelled()
+
+    @contextmanager
+    def _claim(self, *names: str, wanted: bool) -> Generator[None, None, None]:
+        """Take arms for as long as this is open.
+
+        Raises:
+            OpenArmError: BUSY, when one of them is taken.
+        """
+        taken = [name for name in names if name in self._claimed]
+        if wanted and taken:
+            raise OpenArmError(Code.BUSY, f"the {taken[0]} arm is moving already; wait for the end, or cancel it first")
+        claimed = names if wanted else ()
+        self._claimed.update(claimed)
+        try:
+            yield
+        finally:
+            self._claimed.difference_update(claimed)

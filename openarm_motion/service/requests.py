@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Requests to the motion service and its answers. Poses (4, 4) of the tool; m, rad, s."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, Self, TypeAlias
+
+import numpy as np
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
+from openarm_motion.collision.solids import Box, Solid
+from openarm_motion.planning.approach_request import ApproachRequest, Refused
+from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import Trajectory
+
+
+# --- goals of one arm
+@dataclass(frozen=True, eq=False)
+class JointGoal:
+    """Joint positions (n,), on a free path."""
+
+    q: Array
+
+
+@dataclass(frozen=True, eq=False)
+class NamedGoal:
+    """A posture of the SRDF, on a free path."""
+
+    name: str
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGoal:
+    """A tool pose in a frame ("" is the base frame), on a free path; `free_orientation`: position alone counts."""
+
+    pose: Array
+    frame: str = ""
+    free_orientation: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class LineGoal:
+    """A tool pose in a frame, on a straight line."""
+
+    pose: Array
+    frame: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class YieldGoal:
+    """Stay, or go to a posture where the arm is in the way of the other one."""
+
+    name: str = "home"
+
+
+Goal: TypeAlias = JointGoal | NamedGoal | PoseGoal | LineGoal
+DualGoal: TypeAlias = JointGoal | NamedGoal | PoseGoal | YieldGoal
+Strategy = Literal["any", "together", "staggered"]
+
+
+# --- requests
+@dataclass(frozen=True, eq=False)
+class PlanApproachRequest:
+    """Choose and plan one of several approaches.
+
+    Attributes:
+        arm: Name of the arm.
+        approach: Targets, obstacles and what is held.
+        start: (n,) joints that it starts from; empty: the present ones.
+        scale: Velocity scale; 0: the default.
+        ignore_regions: Boxes, base frame; what the map still shows there is left out.
+        scene_version: That the planning scene must have; 0: any.
+    """
+
+    arm: str
+    approach: ApproachRequest
+    start: Array = field(default_factory=lambda: np.zeros(0))
+    scale: float = 0.0
+    ignore_regions: tuple[Box, ...] = ()
+    scene_version: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class MoveRequest:
+    """Plan, and unless `plan_only` execute, a motion of one arm.
+
+    Attributes:
+        arm: Name of the arm.
+        goal: Where to.
+        obstacles: Boxes, base frame.
+        attached: Boxes held by the arm, tool frame; empty: what it is known to hold.
+        hand_empty: It holds nothing: what it was known to hold is forgotten.
+        scale: Velocity scale; 0: the default.
+        plan_only: Do not move.
+        max_start_delay: Longest wait for clearance next to an arm under way, s.
+        scene_version: That the planning scene must have; 0: any.
+    """
+
+    arm: str
+    goal: Goal
+    obstacles: tuple[Box, ...] = ()
+    attached: tuple[Box, ...] = ()
+    hand_empty: bool = False
+    scale: float = 0.0
+    plan_only: bool = False
+    max_start_delay: float = 0.0
+    scene_version: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ArmGoal:
+    """Goal of one arm of a dual-arm motion; `attached` and `hand_empty` as in `MoveRequest`."""
+
+    arm: str
+    goal: DualGoal
+    attached: tuple[Box, ...] = ()
+    hand_empty: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class MoveArmsRequest:
+    """Plan, and unless `plan_only` execute, a dual-arm motion; attributes as in `MoveRequest`."""
+
+    targets: tuple[ArmGoal, ...]
+    strategy: Strategy = "any"
+    obstacles: tuple[Box, ...] = ()
+    scale: float = 0.0
+    plan_only: bool = False
+    scene_version: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ExecuteRequest:
+    """Execute a trajectory; attributes as in `MoveRequest`."""
+
+    arm: str
+    motion: Motion
+    max_start_delay: float = 0.0
+    scene_version: int = 0
+
+
+# --- answers
+@dataclass(frozen=True, eq=False)
+class MotionAnswer:
+    """What came of a request: `error` is None after a success.
+
+    Attributes:
+        error: Why it failed.
+        message: In a sentence.
+        scene_version: Of the planning scene that it was planned in.
+        planning_time: s.
+        start_delay: How long the arm rested first for another arm under way, s.
+    """
+
+    error: OpenArmError | None = None
+    message: str = ""
+    scene_version: int = 0
+    planning_time: float = 0.0
+    start_delay: float = 0.0
+
+    @property
+    def code(self) -> Code:
+        """OK, or the error's."""
+        return Code.OK if self.error is None else self.error.code
+
+    def require(self) -> Self:
+        """Return this after a success, else raise the error."""
+        if self.error is not None:
+            raise self.error
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class ApproachAnswer(MotionAnswer):
+    """A planned approach; see `openarm_motion.planning.approach.ApproachPlan`."""
+
+    chosen: int = -1
+    parts: tuple[Trajectory, ...] = ()
+    refusals: tuple[Refused, ...] = ()
+    limit_margins: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class MoveAnswer(MotionAnswer):
+    """A planned, and maybe executed, motion of one arm."""
+
+    trajectory: Trajectory | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MoveArmsAnswer(MotionAnswer):
+    """A dual-arm motion: trajectories, the delay contained in each (s), and the least clearance of the arms (m)."""
+
+    trajectories: tuple[Trajectory, ...] = ()
+    delays: tuple[float, ...] = ()
+    separation: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class IkAnswer:
+    """Nearest configuration to a pose, its errors (m, rad) and tool pose; `error` is None when it solves the pose."""
+
+    q: Array
+    pose: Array
+    position_error: float
+    orientation_error: float
+    error: OpenArmError | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneState:
+    """The planning scene, and whether plans use the map: `map_message` says why not; age -1: there is none."""
+
+    version: int
+    solids: tuple[Solid, ...]
+    fixed: tuple[str, ...]
+    map_used: bool
+    map_version: int
+    map_age: float
+    map_message: str
