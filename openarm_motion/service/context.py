@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,8 +17,10 @@ from openarm_motion.planning.arm import Arm, Situation
 from openarm_motion.scene.map_eye import Look, MapEye, unexplained
 from openarm_motion.scene.memory import HeldMemory
 from openarm_motion.scene.planning_scene import PlanningScene
-from openarm_motion.service.coordination import ArmCoordination
 from openarm_motion.service.robot import RobotInterface, Watch, stale
+
+if TYPE_CHECKING:
+    from openarm_motion.service.coordination import ArmCoordination
 
 #: Next to an arm under way plans keep this distance from where it will end, m: more than what is then proven.
 _NEXT_TO = 0.035

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.planning.arm import Arm
 from openarm_motion.service.robot import ArmController, RobotInterface, TrajectoryGoal, Watch
-from openarm_motion.timing.checks import Motion
+
+if TYPE_CHECKING:
+    from openarm_motion.planning.arm import Arm
+    from openarm_motion.timing.checks import Motion
 
 #: A controller has this long to accept, to refuse, or to end a cancelled motion, s.
 _ANSWER = 2.0

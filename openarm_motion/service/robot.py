@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.robot_state import RobotStateBuffer
-from openarm_motion.timing.checks import Motion
+
+if TYPE_CHECKING:
+    from openarm_motion.timing.checks import Motion
 
 T = TypeVar("T")
 
