@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One image of a camera with the joint states around its stamp, listened to only while it is waited for."""
+"""One image of a camera with the joint states around its stamp, subscribed to only while it is waited for."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -15,21 +14,15 @@ from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, Image
 
 from openarm_calibration.config import CalibrationConfig
+from openarm_common.camera.stream import Frame
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.convert import image_to_array, stamp_to_ns
-from openarm_common.ros.node import QOS_NEWEST, BaseNode
+from openarm_common.ros.camera_stream import CameraStream
+from openarm_common.ros.convert import image_to_array, rgb_image
+from openarm_common.ros.node import BASE_FRAME, BaseNode
 from openarm_common.ros.tf import RobotStateListener
 
 #: Between looks at a condition that is waited for, s of wall clock.
 _POLL = 0.02
-
-
-@dataclass
-class _Camera:
-    """What arrived from the camera while it is listened to."""
-
-    image: Image | None = None
-    info: CameraInfo | None = None
 
 
 class Photographer:
@@ -37,16 +30,25 @@ class Photographer:
 
     Args:
         node: That subscribes.
-        states: Of the robot; listened to only while an image is waited for.
+        states: Of the robot; subscribed to only while an image is waited for.
         name: Of the camera.
         config: Timeouts and the gate's window.
     """
 
     def __init__(self, node: BaseNode[Any], states: RobotStateListener, name: str, config: CalibrationConfig) -> None:
         self._node, self._states, self._name, self._config = node, states, name, config
+        self._refusal: OpenArmError | None = None
+        topics = {
+            "image": (Image, f"/{name}/color/image_raw"),
+            "camera_info": (CameraInfo, f"/{name}/color/camera_info"),
+        }
+        # the mount of the camera is not known yet: the pose of the base alone is looked up
+        self._stream = CameraStream(
+            node, states, topics, joints="required", pose_of=BASE_FRAME, on_refusal=self._refuse
+        )
 
     async def state(self) -> dict[str, float]:
-        """The newest joint state, rad or m.
+        """Wait for the newest joint state, rad or m.
 
         Raises:
             OpenArmError: NOT_READY, when none comes in time.
@@ -58,57 +60,44 @@ class Photographer:
         finally:
             self._states.enable(False)
 
-    async def take(self, after: float = 0.0) -> tuple[Image, CameraInfo]:
-        """The first image whose stamp has joint states before it, and its info.
+    async def take(self, after: float = 0.0) -> Frame[Any]:
+        """Wait for the first frame with joint states before its stamp; its items are `image` and `camera_info`.
 
         Args:
             after: How long after the image joint states are waited for, s.
 
         Raises:
-            OpenArmError: NOT_READY, when none comes in time.
+            OpenArmError: NOT_READY, when no image comes in time; STALE_DATA, when no joint state comes at its stamp.
         """
-        seen = _Camera()
-        name, config, node = self._name, self._config, self._node
+        config, buffer = self._config, self._states.buffer
         window_ns = round(config.gate.window * 0.5e9)
-        buffer = self._states.buffer
+        taken: list[Frame[Any]] = []
+        self._refusal = None
 
-        def pair() -> bool:
-            if seen.image is None or seen.info is None:
-                return False
-            t = stamp_to_ns(seen.image.header.stamp)
-            return bool(buffer.between(0, t - window_ns))
+        def arrived() -> bool:
+            frame = self._stream.take()
+            if frame is not None and buffer.between(0, frame.t_ns - window_ns):
+                taken.append(frame)
+            return bool(taken) or self._refusal is not None
 
-        def bracketed() -> bool:
-            if seen.image is None:
-                return False
-            return bool(buffer.between(stamp_to_ns(seen.image.header.stamp) + round(after * 1e9), 2**62))
-
-        self._states.enable(True)
-        subscriptions = [
-            node.create_subscription(
-                Image, f"/{name}/color/image_raw", lambda m: setattr(seen, "image", m), QOS_NEWEST
-            ),
-            node.create_subscription(
-                CameraInfo, f"/{name}/color/camera_info", lambda m: setattr(seen, "info", m), QOS_NEWEST
-            ),
-        ]
+        self._stream.listen(True)
         try:
-            await wait_until(node, pair, config.image_timeout + config.state_timeout)
-            if seen.image is None or seen.info is None:
-                what = "image" if seen.image is None else "camera_info"
-                raise OpenArmError(
-                    Code.NOT_READY,
-                    f"no {what} of {name!r} within {config.image_timeout + config.state_timeout:g} s; is"
-                    f" /{name}/color/image_raw published?",
-                )
-            image, info = seen.image, seen.info
-            node.destroy_subscription(subscriptions.pop(0))  # this image is the one
-            await wait_until(node, bracketed, config.state_timeout)
-            return image, info
+            await wait_until(self._node, arrived, config.image_timeout + config.state_timeout)
+            if taken:
+                end_ns = taken[0].t_ns + round(after * 1e9)
+                await wait_until(self._node, lambda: buffer.settled(end_ns), config.state_timeout)
+                return taken[0]
+            silent = self._stream.frames.silent or ["image with a joint state at its stamp"]
+            raise self._refusal or OpenArmError(
+                Code.NOT_READY,
+                f"no {' and no '.join(silent)} of {self._name!r} within"
+                f" {config.image_timeout + config.state_timeout:g} s; is /{self._name}/color/image_raw published?",
+            )
         finally:
-            for subscription in subscriptions:
-                node.destroy_subscription(subscription)
-            self._states.enable(False)
+            self._stream.listen(False)
+
+    def _refuse(self, error: OpenArmError) -> None:
+        self._refusal = error
 
 
 async def wait_until(node: BaseNode[Any], condition: Callable[[], bool], timeout: float) -> bool:
@@ -135,10 +124,6 @@ def grey(message: Image) -> NDArray[np.uint8]:
     Raises:
         OpenArmError: BAD_IMAGE, for an encoding that is no colour or grey picture of 8 bits.
     """
-    pixels = image_to_array(message)
     if message.encoding == "mono8":
-        return np.ascontiguousarray(pixels).astype(np.uint8)
-    if message.encoding not in ("rgb8", "bgr8"):
-        raise OpenArmError(Code.BAD_IMAGE, f"image encoding {message.encoding!r}; valid: rgb8, bgr8, mono8")
-    turn = cv2.COLOR_RGB2GRAY if message.encoding == "rgb8" else cv2.COLOR_BGR2GRAY
-    return cv2.cvtColor(np.ascontiguousarray(pixels).astype(np.uint8), turn).astype(np.uint8)
+        return np.ascontiguousarray(image_to_array(message)).astype(np.uint8)
+    return cv2.cvtColor(rgb_image(message), cv2.COLOR_RGB2GRAY).astype(np.uint8)

@@ -21,7 +21,7 @@ from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead,
 from openarm_calibration.store.store import CalibrationStore, default_folder
 from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.convert import intrinsics_from_info, stamp_to_ns
+from openarm_common.ros.convert import intrinsics_from_info
 from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
 
@@ -43,7 +43,9 @@ class SessionNode(BaseNode[CalibrationConfig]):
         super().__init__("calibration", CalibrationConfig, **kwargs)
         self._cameras = load_cameras(Path(self.config.cameras) if self.config.cameras else None)
         self._store = CalibrationStore(Path(self.config.store) if self.config.store else default_folder())
-        self._states = RobotStateListener(self, self.description, joints=False)
+        self._states = RobotStateListener(
+            self, self.description, joints=False, depth=100, wait=self.config.state_timeout
+        )
         self._busy = ""
         self.algorithm = self.config.algorithm
         self.use(self.config.camera)
@@ -85,10 +87,9 @@ class SessionNode(BaseNode[CalibrationConfig]):
         Raises:
             OpenArmError: NOT_READY, STALE_DATA, MOVING, NOTHING_DETECTED, BAD_IMAGE.
         """
-        image, info = await self.photographer.take(self.config.gate.track if moving else 0.0)
-        pixels, intrinsics = grey(image), intrinsics_from_info(info)
-        self._check_optics(intrinsics)
-        t_ns = stamp_to_ns(image.header.stamp)
+        frame = await self.photographer.take(self.config.gate.track if moving else 0.0)
+        pixels, t_ns = grey(frame.items["image"]), frame.t_ns
+        self._check_optics(intrinsics_from_info(frame.items["camera_info"]))
         matched = match(self._states.buffer, t_ns, self._samples.joint_names, self.config.gate, moving=moving)
         return View(t_ns, matched, await self.in_thread(detect, self._samples.board, pixels), pixels)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import array
 import sys
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
@@ -165,6 +166,29 @@ def byte_array(data: NDArray[np.generic]) -> array.array[int]:
     return out
 
 
+def rgb_image(message: Image) -> NDArray[np.uint8]:
+    """Return a colour image as (height, width, 3), red first; a view where the message has that order.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, for another encoding, or from `image_to_array`.
+    """
+    pixels = cast("NDArray[np.uint8]", image_to_array(message))
+    if message.encoding not in ("rgb8", "bgr8"):
+        raise OpenArmError(Code.BAD_IMAGE, f"colour image is {message.encoding!r}; valid: rgb8, bgr8")
+    return pixels if message.encoding == "rgb8" else np.ascontiguousarray(pixels[..., ::-1])
+
+
+def depth_image(message: Image) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Return a depth image as (height, width) in counts of its encoding: uint16 mm or float32 m; a view.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, for another encoding, or from `image_to_array`.
+    """
+    if message.encoding not in ("16UC1", "32FC1"):
+        raise OpenArmError(Code.BAD_IMAGE, f"depth encoding {message.encoding!r} is not supported; valid: 16UC1, 32FC1")
+    return cast("NDArray[np.uint16]", image_to_array(message))
+
+
 def depth_to_metres(message: Image) -> NDArray[np.float32]:
     """Depth (height, width) in metres, NaN where invalid (REP-118).
 
@@ -173,13 +197,7 @@ def depth_to_metres(message: Image) -> NDArray[np.float32]:
     Raises:
         OpenArmError: BAD_IMAGE, for another encoding.
     """
-    pixels = image_to_array(message)
-    if message.encoding == "16UC1":
-        depth = pixels.astype(np.float32) * np.float32(0.001)
-    elif message.encoding == "32FC1":
-        depth = pixels.astype(np.float32)
-    else:
-        raise OpenArmError(Code.BAD_IMAGE, f"depth encoding {message.encoding!r} is not supported; valid: 16UC1, 32FC1")
+    depth = depth_image(message).astype(np.float32) * np.float32(0.001 if message.encoding == "16UC1" else 1.0)
     depth[~((depth > 0.0) & np.isfinite(depth))] = np.nan
     return depth
 

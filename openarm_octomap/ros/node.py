@@ -11,22 +11,20 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sensor_msgs.msg import Image, PointCloud2
-
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.distance_field import CameraMoment, DistanceFieldWriter, field_path
 from openarm_common.robot.held import HeldBox
-from openarm_common.ros.held_listener import HeldListener
+from openarm_common.robot.posture import JointNeed
 from openarm_common.ros.lifecycle_node import ManagedNode
 from openarm_common.ros.node import BASE_FRAME, run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_octomap.config import OctomapNodeConfig
 from openarm_octomap.mapper import Frame, Mapper, Report
-from openarm_octomap.ros.camera_client import CloudSource, DepthSource, Source
 from openarm_octomap.ros.map_publisher import MapPublisher
 from openarm_octomap.ros.map_server import MapServices
+from openarm_octomap.ros.sources import Source, cloud_source, depth_source
 
 
 class OctomapNode(ManagedNode[OctomapNodeConfig]):
@@ -39,12 +37,15 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         self._mapper = Mapper(body, config.grid, config.filter, config.field)
         if config.map_file:
             self._mapper.load(Path(config.map_file).expanduser())
-        self._cameras = [DepthSource(self, c, config.depth_topic, config.info_topic) for c in _cameras(config.cameras)]
-        self._sources: list[Source[Image] | Source[PointCloud2]] = [*self._cameras]
+        self._states = RobotStateListener(
+            self, self.description, joints=False, depth=100, wait=config.transform_wait, held_topic=config.held_topic
+        )
+        need: JointNeed = "required" if config.filter.enabled else "none"
+        topics = {"depth": config.depth_topic, "info": config.info_topic}
+        self._cameras = [depth_source(self, self._states, c, topics, need) for c in _cameras(config.cameras)]
+        self._sources: list[Source] = [*self._cameras]
         if config.cloud_topic:
-            self._sources.append(CloudSource(self, config.cloud_topic))
-        self._states = RobotStateListener(self, self.description, joints=False, depth=100, wait=config.transform_wait)
-        self._held = HeldListener(self, config.held_topic)
+            self._sources.append(cloud_source(self, self._states, config.cloud_topic, need))
         self._t_ns = 0
         self._busy = False
         self._edition = 0
@@ -99,13 +100,15 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         if self._busy:
             self._overruns += 1
             return
-        found = [source.take(self._states, filtering=self.config.filter.enabled) for source in self._sources]
+        found = [source.take() for source in self._sources]
         frames = [frame for frame in found if frame is not None]
         if not frames:
             return
         self._busy, edition = True, self._edition
         try:
-            report: Report = await self.in_thread(self._update, frames, self._held.boxes, self._publisher.wanted())
+            report: Report = await self.in_thread(
+                self._update, frames, self._states.tracker.held, self._publisher.wanted()
+            )
         except OpenArmError as error:
             self._fault = error.message
             return
@@ -156,7 +159,8 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
             age = source.age_s()
             if camera and age > limit:
                 since = "never used" if age == float("inf") else f"not used for {age:.1f} s"
-                faults.append(f"{source.name} {since}" + (f" ({source.fault})" if source.fault else ""))
+                fault = source.fault or source.missing()
+                faults.append(f"{source.name} {since}" + (f" ({fault})" if fault else ""))
             elif source.fault:
                 faults.append(source.fault)
             values |= {f"{source.name}_used": source.used, f"{source.name}_refused": source.refused}
@@ -169,7 +173,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
             values |= {f"{source_name}_flying": n for source_name, n in self._last.flying.items()}
         values |= {
             "update_ms": f"{self._elapsed_ms:.1f}",
-            "held": ", ".join(b.name for b in self._held.boxes) or "nothing",
+            "held": ", ".join(b.name for b in self._states.tracker.held) or "nothing",
         }
         self.diagnose(not faults, "; ".join(faults) or f"map of {', '.join(self.config.cameras)}", **values)
 

@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from geometry_msgs.msg import Pose, PoseWithCovariance
 from numpy.typing import NDArray
 from rclpy.duration import Duration
-from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import ColorRGBA, Header
 from vision_msgs.msg import (
     BoundingBox2D,
@@ -23,7 +22,6 @@ from vision_msgs.msg import Detection2D as Detection2DMsg
 from vision_msgs.msg import Detection3D as Detection3DMsg
 from visualization_msgs.msg import Marker, MarkerArray
 
-from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, vector
 from openarm_perception.detection.attributes import kind_of
 from openarm_perception.detection.detector import Detection2D
@@ -37,21 +35,6 @@ MARKER_LIFETIME = 2.0
 def header(frame_id: str, t_ns: int) -> Header:
     """Header of a frame and a stamp."""
     return Header(frame_id=frame_id, stamp=ns_to_stamp(t_ns))
-
-
-def check_frames(messages: Mapping[str, Image | CameraInfo], optical_frame: str) -> None:
-    """Refuse messages of another frame: a link frame (x forward), or depth that is not aligned with colour.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, naming the stream and both frames.
-    """
-    for stream, message in messages.items():
-        if message.header.frame_id != optical_frame:
-            raise OpenArmError(
-                Code.BAD_IMAGE,
-                f"{stream} is in frame {message.header.frame_id!r}, expected the optical frame {optical_frame!r}"
-                " (z forward, x right), shared by colour, depth and CameraInfo",
-            )
 
 
 def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Detection2DArray:

@@ -83,7 +83,9 @@ class Bench:
             state = JointState(name=list(JOINTS), position=[0.0] * len(JOINTS))
             state.header.stamp = ns_to_stamp(self.t_ns)
             self.joints.publish(state)
-        self.info.publish(info or info_from_intrinsics(K, FRAME, self.t_ns))
+        info = info or info_from_intrinsics(K, FRAME, self.t_ns)
+        info.header.stamp = ns_to_stamp(self.t_ns)
+        self.info.publish(info)
         self.depth.publish(image)
 
     def show(self, pixels: np.ndarray, condition, what: str, encoding: str = "16UC1", **kwargs) -> None:

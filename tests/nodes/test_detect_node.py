@@ -171,7 +171,7 @@ def test_old_frames_are_dropped_not_queued(ros, bench) -> None:
         ),
         ("colour image is 320x240", "color", lambda cam, t: array_to_image(cam.rgb[::2, ::2], "rgb8", cam.frame, t)),
         (
-            "expected (h, w) of uint16",
+            "depth encoding 'mono8' is not supported; valid: 16UC1, 32FC1",
             "depth",
             lambda cam, t: array_to_image(np.zeros((480, 640), np.uint8), "mono8", cam.frame, t),
         ),

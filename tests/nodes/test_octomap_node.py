@@ -257,7 +257,7 @@ def test_pictures_of_the_map_while_somebody_looks(bench) -> None:
         (np.zeros((240, 320), np.uint16), "16UC1", FRAME, K, "320x240"),
         (np.zeros((1, 1), np.float32), "32FC1", FRAME, K, "1x1"),
         (np.zeros((480, 640), np.uint16), "16UC1", "overhead_link", K, "expected the optical frame"),
-        (np.zeros((480, 640), np.uint16), "16UC1", "nowhere", K, "'nowhere' is not connected"),
+        (np.zeros((480, 640), np.uint16), "16UC1", "nowhere", K, "depth is in frame 'nowhere'"),
     ],
 )
 @pytest.mark.requirement("B-28", "B-30", "B-34", "B-60")

@@ -140,7 +140,7 @@ def test_without_joint_states_objects_are_seen_and_the_lack_is_named(ros) -> Non
     bench = detector(ros, transform_wait=0.2)
     bench.hold()
     bench.pump(lambda: bench.got and bench.got[-1].detections, "a detection", joints=False)
-    bench.pump(lambda: "taken for surroundings" in bench.said.get("message", ""), "the reason", joints=False)
+    bench.pump(lambda: "taken for an object" in bench.said.get("message", ""), "the reason", joints=False)
     assert "no /joint_states yet" in bench.said["message"]
     bench.pump(lambda: not bench.got[-1].detections, "joint states come")
 
