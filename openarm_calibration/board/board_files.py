@@ -3,22 +3,22 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
+import io
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from openarm_calibration.board.board import Board, CircleGrid
-from openarm_common import pdf as pdf_page
+from openarm_calibration.board.board import Board, Charuco, CircleGrid
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.figures import METRE, render_figure, sheet
+from openarm_common.types import Array
 
 SUFFIXES = (".png", ".pdf", ".xml")
-_POINT = 72.0 / 0.0254  # PDF points in a metre
 _A4 = (0.210, 0.297)
 _MARGIN = 0.008  # that printers can't reach, m
 _THICKNESS = 0.003
+_OVERLAP = 1e-5  # of neighbouring modules, so that no viewer shows a seam, m
 #: Edge of a simulated board's texture, pixels. A power of two: half of an odd edge is no whole number of pixels, so
 #: that the smaller copies that a renderer makes of it do not quite lie on it, and the board seems 0.06 % too large.
 TEXTURE_EDGE = 2048
@@ -58,60 +58,55 @@ def write_board(board: Board, path: Path, dpi: int = 300) -> str:
 
 def png(board: Board, dpi: int) -> bytes:
     """PNG that carries its resolution, so that it prints true to scale."""
-    data = cv2.imencode(".png", board.draw(dpi / 0.0254))[1].tobytes()
-    per_metre = round(dpi / 0.0254)
-    body = b"pHYs" + struct.pack(">IIB", per_metre, per_metre, 1)
-    chunk = struct.pack(">I", 9) + body + struct.pack(">I", zlib.crc32(body))
-    head = 8 + 25  # signature and IHDR
-    return data[:head] + chunk + data[head:]
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray(board.draw(dpi / 0.0254)).save(data, "png", dpi=(dpi, dpi))
+    return data.getvalue()
 
 
 def pdf(board: Board) -> bytes:
-    """PDF of one page: the board in curves, its name, and a bar of 100 mm to measure; A4 where it fits."""
+    """PDF of one page: the board as vectors, its name, and a bar of 100 mm to measure; A4 where it fits."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.patches import Circle
+
     width, height = board.size
     tall = height + 0.022  # for name and bar
     pages = [
         page for page in (_A4, (_A4[1], _A4[0])) if width + 2 * _MARGIN <= page[0] and tall + 2 * _MARGIN <= page[1]
     ]
     page = pages[0] if pages else (max(width, 0.12) + 2 * _MARGIN, tall + 2 * _MARGIN)
-    left, top = (page[0] - width) / 2.0, page[1] - _MARGIN - (page[1] - 2 * _MARGIN - tall) / 2.0
-    # board coordinates are y down, a page's are y up
-    origin = (left + width / 2.0, top - height / 2.0)
-    lines = ["0 g"]
+    axes = sheet(*page, unit=METRE)
+    centre = np.array([page[0] / 2.0, (page[1] - tall + height) / 2.0])
     if isinstance(board, CircleGrid):
-        for x, y in board.points[:, :2]:
-            centre = (origin[0] + float(x)) * _POINT, (origin[1] - float(y)) * _POINT
-            lines.append(f"{pdf_page.circle(*centre, board.radius * _POINT)} f")
+        for mark in board.points[:, :2] + centre:
+            axes.add_patch(Circle((mark[0], mark[1]), board.radius, color="black", lw=0.0))
     else:
-        lines += _squares(board, origin)
-    base = top - height - 0.010
-    start = (page[0] - 0.1) / 2.0
-    lines.append(f"{_pt(start)} {_pt(base)} {_pt(0.1)} {_pt(0.001)} re f")
-    for x in (start, start + 0.1):
-        lines.append(f"{_pt(x - 0.0001)} {_pt(base - 0.002)} {_pt(0.0002)} {_pt(0.005)} re f")
-    words = f"{board.label}. The bar is 100 mm."
-    lines.append(pdf_page.text(start * _POINT, (base - 0.006) * _POINT, 8, words))
-    return pdf_page.document("\n".join(lines), page[0] * _POINT, page[1] * _POINT)
+        axes.add_collection(PolyCollection(_squares(board) + centre, color="black", lw=0.0))
+    start, base = (page[0] - 0.1) / 2.0, centre[1] + height / 2.0 + 0.010
+    axes.broken_barh([(start, 0.1)], (base - 0.001, 0.001), color="black", lw=0.0)
+    axes.broken_barh([(x - 0.0001, 0.0002) for x in (start, start + 0.1)], (base - 0.003, 0.005), color="black", lw=0.0)
+    axes.text(start, base + 0.006, f"{board.label}. The bar is 100 mm.", fontsize=8.0)
+    return render_figure(axes, "pdf")
 
 
-def _pt(metres: float) -> str:
-    return f"{metres * _POINT:.4f}"
-
-
-def _squares(board: Board, origin: tuple[float, float]) -> list[str]:
-    """Black modules as rectangles, one run of a row each."""
-    width, height = board.size
-    scale = 10.0 / board.spacing * 7.0  # a marker's modules fall on whole pixels for usual proportions
-    image = board.draw(scale) < 128
-    out: list[str] = []
-    pixel_w, pixel_h = width / image.shape[1], height / image.shape[0]
-    for row, line in enumerate(image):
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(np.int8), [0]])))
-        for begin, end in edges.reshape(-1, 2):
-            x = origin[0] - width / 2.0 + begin * pixel_w
-            y = origin[1] + height / 2.0 - (row + 1) * pixel_h
-            out.append(f"{_pt(x)} {_pt(y)} {_pt((end - begin) * pixel_w)} {_pt(pixel_h * 1.02)} re f")
-    return out
+def _squares(board: Charuco) -> Array:
+    """Return the corners (n, 4, 2) of black squares and marker modules, m from the middle of the board."""
+    drawn, dictionary = board.board, board.board.getDictionary()
+    markers = np.array(drawn.getObjPoints(), dtype=np.float64)[
+        :, :, :2
+    ]  # from the upper left corner of each, clockwise
+    white = (markers.mean(axis=1) // board.spacing).astype(int).tolist()
+    cells = [[column, row] for row in range(board.rows) for column in range(board.columns)]
+    boxes = [(*np.multiply(cell, board.spacing), board.spacing) for cell in cells if cell not in white]
+    modules = dictionary.markerSize + 2
+    edge = board.diameter / modules
+    for number, corner in zip(np.ravel(drawn.getIds()), markers[:, 0], strict=True):
+        black = np.argwhere(cv2.aruco.generateImageMarker(dictionary, int(number), modules) == 0)
+        boxes += [(*(corner + place * edge), edge + _OVERLAP) for place in black[:, ::-1]]
+    corners = np.array(boxes)[:, None]
+    square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+    return corners[..., :2] + corners[..., 2:] * square - np.array([board.columns, board.rows]) * board.spacing / 2.0
 
 
 def mesh(board: Board) -> tuple[list[float], list[float], list[int]]:

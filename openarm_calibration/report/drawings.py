@@ -1,179 +1,121 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a calibration as SVG: where the marks were, what the fit leaves of them, where camera and board stood.
+"""Figures of a calibration as SVG: marks in the image, residuals of the fit, poses of camera and board.
 
 A sample has the same colour in all of them. Pixels as in the image; poses in the frame of the board, m.
 """
 
 from __future__ import annotations
 
-import base64
-import html
+import colorsys
 import math
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from openarm_calibration.handeye.offline import Result
 from openarm_calibration.handeye.problem import chain
 from openarm_calibration.handeye.projection import project
-from openarm_calibration.handeye.verdict import Check
-from openarm_calibration.sampling.samples import Sample, SampleSet
+from openarm_calibration.sampling.samples import SampleSet
+from openarm_common import se3
+from openarm_common.figures import data_uri, render_figure, sheet
 from openarm_common.types import Array
 
-#: From where the poses are looked at: turned about the board's normal, and tilted, rad.
-_AZIMUTH, _ELEVATION = math.radians(35.0), math.radians(22.0)
-#: How far in front of the lens the drawn image plane of a camera is, m.
-_FRUSTUM = 0.04
-#: Of the picture of the poses, px.
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: From the board's axes to right, down and ahead in the figure of the poses.
+_VIEW = se3.rot_x(math.radians(-68.0)) @ se3.rot_z(math.radians(-35.0))
+#: Width of the figure of the poses, px.
 _WIDE = 912.0
-#: px that the residuals' rms is drawn as.
+#: Distance of the drawn image plane from a camera, m.
+_FRUSTUM = 0.04
+#: Length that the rms of the residuals is drawn with, px.
 _DRAWN_RMS = 12.0
-GOOD, FAIR, BAD = "#1a7f37", "#b26a00", "#b3261e"
 
 
-def frame(width: float, height: float, body: str, caption: str, shown: int = 448) -> str:
-    """A figure whose drawing is so many pixels wide."""
-    return (
-        f'<figure><svg viewBox="0 0 {width:g} {height:g}" width="{shown}" height="{shown * height / width:.0f}">{body}'
-        f"</svg><figcaption>{html.escape(caption)}</figcaption></figure>"
-    )
+class Drawing(NamedTuple):
+    """An SVG as a data URI, with its caption."""
+
+    uri: str
+    caption: str
 
 
 def hue(k: int, n: int) -> str:
-    """Colour of a sample."""
-    return f"hsl({360.0 * k / max(n, 1):.0f} 65% 48%)"
+    """Return the colour of sample `k` of `n` as `#rrggbb`."""
+    return "#" + "".join(f"{round(255 * part):02x}" for part in colorsys.hls_to_rgb(k / max(n, 1), 0.48, 0.65))
 
 
-def coverage(samples: SampleSet) -> str:
-    """All marks in one image."""
-    width, height = samples.head.intrinsics[:2]
-    dots: list[str] = []
-    cells = np.zeros((6, 8), dtype=bool)
+def coverage(samples: SampleSet) -> Drawing:
+    """Draw all marks in one image."""
+    size = np.array(samples.head.intrinsics[:2])
+    axes = sheet(*size)
+    cells = np.zeros((8, 6), dtype=bool)
     for k, sample in enumerate(samples.samples):
-        colour = hue(k, len(samples))
-        for u, v in sample.detection.pixels:
-            dots.append(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="3" fill="{colour}" fill-opacity=".7"/>')
-            cells[min(max(int(v / height * 6), 0), 5), min(max(int(u / width * 8), 0), 7)] = True
-    told = f"where the marks were in the image; {cells.mean() * 100:.0f} % of it was covered"
-    return frame(width, height, "".join(dots), told)
+        pixels = sample.detection.pixels
+        axes.plot(*pixels.T, "o", ms=6.0, mew=0.0, color=hue(k, len(samples)), alpha=0.7)
+        cells[tuple(np.clip(pixels / size * cells.shape, 0, np.subtract(cells.shape, 1)).astype(int).T)] = True
+    return _drawing(axes, f"marks in the image; they cover {cells.mean() * 100:.0f} % of it")
 
 
-def residuals(result: Result) -> str:
-    """What is left of each mark after the fit, enlarged."""
+def residuals(result: Result) -> Drawing:
+    """Draw the residual of each mark, enlarged."""
+    from matplotlib.collections import LineCollection
+
     problem, estimate = result.solution.problem, result.solution.estimate
     T, _ = chain(problem, estimate.X, estimate.Z, np.zeros((len(problem), 6)))
     rows = problem.camera_rows()
-    away = [view.pixels - project(view.points, view.radius, T[k], rows[k]) for k, view in enumerate(problem.views)]
-    used = [a for k, a in enumerate(away) if result.solution.used[k]]
-    rms = float(np.sqrt(np.mean(np.concatenate(used) ** 2)))
+    away = {
+        k: view.pixels - project(view.points, view.radius, T[k], rows[k])
+        for k, view in enumerate(problem.views)
+        if result.solution.used[k]
+    }
+    rms = float(np.sqrt(np.mean(np.concatenate(list(away.values())) ** 2)))
     zoom = _DRAWN_RMS / max(rms, 1e-6)
-    width, height = problem.intrinsics[0].width, problem.intrinsics[0].height
-    lines: list[str] = []
-    for k, view in enumerate(problem.views):
-        if not result.solution.used[k]:
-            continue
-        colour = hue(k, len(problem))
-        for (u, v), (du, dv) in zip(view.pixels, away[k] * zoom, strict=True):
-            lines.append(f'<path d="M{u:.1f} {v:.1f}l{du:.1f} {dv:.1f}" stroke="{colour}" stroke-width="1.5"/>')
-            lines.append(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="1.5" fill="{colour}"/>')
-    told = f"what the fit leaves of them, {zoom:.0f} times enlarged; rms {rms:.3f} px by axis"
-    return frame(width, height, "".join(lines), told)
+    axes = sheet(problem.intrinsics[0].width, problem.intrinsics[0].height)
+    for k, residual in away.items():
+        pixels, colour = problem.views[k].pixels, hue(k, len(problem))
+        axes.add_collection(LineCollection(np.stack([pixels, pixels + zoom * residual], axis=1), color=colour, lw=1.5))
+        axes.plot(*pixels.T, "o", ms=3.0, mew=0.0, color=colour)
+    return _drawing(axes, f"residuals of the fit, {zoom:.0f} times enlarged; rms {rms:.3f} px per axis")
 
 
-def poses(samples: SampleSet, result: Result) -> str:
-    """The board, and the camera as the board saw it at each sample; those that were left out are dashed."""
+def poses(samples: SampleSet, result: Result) -> Drawing:
+    """Draw the board and the camera's pose against it at each sample; samples that were left out are dashed."""
     problem = result.solution.problem
     optics = problem.intrinsics[0]
-    corners = _FRUSTUM * np.array(
-        [
-            [(u - optics.cx) / optics.fx, (v - optics.cy) / optics.fy, 1.0]
-            for u, v in ((0, 0), (optics.width, 0), (optics.width, optics.height), (0, optics.height))
-        ]
-    )
+    pixels = np.array([(0, 0), (optics.width, 0), (optics.width, optics.height), (0, optics.height)])
+    corners = _FRUSTUM * np.column_stack([(pixels - (optics.cx, optics.cy)) / (optics.fx, optics.fy), np.ones(4)])
     eyes = np.array([-T[:3, :3].T @ T[:3, 3] for T in problem.free])
-    planes = np.array([eyes[k] + corners @ T[:3, :3] for k, T in enumerate(problem.free)])
-    w, h = (edge / 2.0 for edge in samples.board.size)
-    outline = np.array([[-w, -h, 0.0], [w, -h, 0.0], [w, h, 0.0], [-w, h, 0.0]])
-    every = _flat(np.concatenate([eyes, planes.reshape(-1, 3), outline]))
-    low, high = every.min(axis=0), every.max(axis=0)
-    scale = min((_WIDE - 60.0) / max(high[0] - low[0], 0.05), 560.0 / max(high[1] - low[1], 0.05))
-    corner = np.array([(_WIDE - scale * (high[0] - low[0])) / 2.0, 30.0])
+    planes = np.array([eye + corners @ T[:3, :3] for eye, T in zip(eyes, problem.free, strict=True)])
+    plate = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * (*samples.board.size, 0.0) / 2.0
+    turn = np.linspace(0.0, 2.0 * np.pi, 17)
+    rim = np.stack([np.cos(turn), np.sin(turn), np.zeros(17)], axis=1) * max(samples.board.radius, 0.003)
+
+    every = (np.concatenate([eyes, *planes, plate]) @ _VIEW.T)[:, :2]
+    low, extent = every.min(axis=0), np.maximum(np.ptp(every, axis=0), 0.05)
+    scale = min((_WIDE - 60.0) / extent[0], 560.0 / extent[1])
+    axes = sheet(_WIDE, scale * extent[1] + 60.0)
+    corner = np.array([(_WIDE - scale * extent[0]) / 2.0, 30.0])
 
     def at(points: Array) -> Array:
-        return (_flat(points) - low) * scale + corner
+        return ((points @ _VIEW.T)[..., :2] - low) * scale + corner
 
-    body = [f'<path d="{_closed(at(outline))}" fill="#fff" stroke="#888"/>']
-    turn = np.linspace(0.0, math.tau, 17)[:-1]
-    rim = np.stack([np.cos(turn), np.sin(turn), np.zeros(16)], axis=1) * max(samples.board.radius, 0.003)
-    body += [f'<path d="{_closed(at(point + rim))}" fill="#444"/>' for point in samples.board.points]
-    (mx, my), n = at(np.zeros((1, 3)))[0], len(eyes)
-    for k in np.argsort(-_depth(eyes)):  # the farthest first
-        colour = hue(int(k), n)
-        dash = "" if result.solution.used[k] else ' stroke-dasharray="5 4"'
-        (x, y), plane = at(eyes[k : k + 1])[0], at(planes[k])
-        body.append(f'<path d="M{x:.1f} {y:.1f}L{mx:.1f} {my:.1f}" stroke="{colour}" stroke-opacity=".25"/>')
-        edges = "".join(f"M{x:.1f} {y:.1f}L{u:.1f} {v:.1f}" for u, v in plane)
-        body.append(
-            f'<path d="{_closed(plane)}{edges}" fill="{colour}" fill-opacity=".18" stroke="{colour}"'
-            f' stroke-width="1.8"{dash}/>'
-        )
-        name = html.escape(problem.views[k].name.removeprefix("s").lstrip("0"))
-        body.append(f'<text x="{x + 7:.1f}" y="{y - 5:.1f}" fill="{colour}" font-size="15">{name}</text>')
-    far = float(np.linalg.norm(eyes, axis=1).max()), float(np.linalg.norm(eyes, axis=1).min())
-    told = f"the camera as the board saw it, {far[1] * 1e3:.0f} to {far[0] * 1e3:.0f} mm away"
-    return frame(_WIDE, float(scale * (high[1] - low[1])) + 60.0, "".join(body), told, shown=round(_WIDE))
+    axes.fill(*at(plate).T, fc="white", ec="#888888")
+    for point in samples.board.points:
+        axes.fill(*at(point + rim).T, fc="#444444")
+    for k in np.argsort(-(eyes @ _VIEW.T)[:, 2]):  # the farthest first
+        colour, style = hue(int(k), len(eyes)), "-" if result.solution.used[k] else "--"
+        axes.plot(*at(np.array([eyes[k], np.zeros(3)])).T, color=colour, alpha=0.25, lw=1.0)
+        axes.fill(*at(planes[k]).T, fc=f"{colour}2e", ec=colour, lw=1.8, ls=style)
+        for end in planes[k]:
+            axes.plot(*at(np.array([eyes[k], end])).T, color=colour, lw=1.8, ls=style)
+        x, y = at(eyes[k])
+        name = problem.views[k].name.removeprefix("s").lstrip("0")
+        axes.text(x + 7.0, y - 5.0, name, color=colour, fontsize=15.0, parse_math=False)
+    away = np.linalg.norm(eyes, axis=1) * 1e3
+    return _drawing(axes, f"poses of the camera over the board, {away.min():.0f} to {away.max():.0f} mm away")
 
 
-def _turned(points: Array) -> Array:
-    """(n, 3) right, into the picture, up; the board lies flat, its front upwards."""
-    x, y, up = points[:, 0], -points[:, 1], -points[:, 2]
-    c, s = math.cos(_AZIMUTH), math.sin(_AZIMUTH)
-    right, ahead = c * x - s * y, s * x + c * y
-    c, s = math.cos(_ELEVATION), math.sin(_ELEVATION)
-    return np.stack([right, c * ahead - s * up, s * ahead + c * up], axis=1)
-
-
-def _flat(points: Array) -> Array:
-    """(n, 2) on the picture, down positive."""
-    turned = _turned(points)
-    return np.stack([turned[:, 0], -turned[:, 2]], axis=1)
-
-
-def _depth(points: Array) -> Array:
-    return _turned(points)[:, 1]
-
-
-def _closed(points: Array) -> str:
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points) + "Z"
-
-
-def picture(sample: Sample, k: int, samples: SampleSet) -> str:
-    """The image of a sample with the marks that were found in it."""
-    width, height = samples.head.intrinsics[:2]
-    colour = hue(k, len(samples))
-    data = base64.b64encode(sample.png).decode()
-    body = f'<image width="{width}" height="{height}" href="data:image/png;base64,{data}"/>'
-    body += "".join(
-        f'<circle cx="{u:.1f}" cy="{v:.1f}" r="5" fill="none" stroke="{colour}" stroke-width="2.5"/>'
-        for u, v in sample.detection.pixels
-    )
-    return frame(width, height, body, f"{sample.name}, {len(sample.detection.ids)} marks", shown=224)
-
-
-def gauge(check: Check) -> str:
-    """How near a figure is to its limit: the bar is full at twice the limit, the tick is the limit."""
-    colour = GOOD if check.ratio <= 1.0 else FAIR if check.ratio <= 3.0 else BAD
-    filled = 160.0 * min(max(check.ratio, 0.0), 2.0) / 2.0
-    return (
-        '<svg class="bare" viewBox="0 0 160 12" width="160" height="12"><rect width="160" height="12" rx="3"'
-        f' fill="#8883"/><rect width="{max(filled, 2.0):.1f}" height="12" rx="3" fill="{colour}"/>'
-        '<path d="M80 -1V13" stroke="currentColor"/></svg>'
-    )
-
-
-def bar(value: float, most: float, colour: str) -> str:
-    """A bar beside a number of a table."""
-    length = 90.0 * value / most if most > 0.0 else 0.0
-    return (
-        '<svg class="bare" viewBox="0 0 90 9" width="90" height="9">'
-        f'<rect width="{max(length, 1.0):.1f}" height="9" rx="2" fill="{colour}"/></svg>'
-    )
+def _drawing(axes: Axes, caption: str) -> Drawing:
+    axes.figure.patch.set_alpha(0.0)  # the page has a background, light or dark
+    return Drawing(data_uri(render_figure(axes, "svg"), "image/svg+xml"), caption)

@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import csv
-import html
 import statistics
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from openarm_common.figures import render_page
 from openarm_evaluation.judging.provenance import wilson_low
 
 Row = Mapping[str, Any]
@@ -156,79 +156,20 @@ def _rate(v: Mapping[str, Any]) -> str:
     return f"{v['count']} of {v['n']} = {100 * v['rate']:.1f} % (95 %: {100 * v['low']:.1f} to {100 * v['high']:.1f} %)"
 
 
-_STYLE = """body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:70rem;padding:0 1rem;color:#222}
-h1,h2{font-weight:600}table{border-collapse:collapse;width:100%;margin:1rem 0}
-td,th{padding:.25rem .6rem;border-bottom:1px solid #ddd;text-align:left;vertical-align:top}
-tr.bad td{background:#fdecea}code{background:#f3f3f3;padding:0 .25rem}
-code,p{overflow-wrap:anywhere}img{width:16rem;margin-right:.5rem}
-.bar{background:#4c78a8;height:.8rem}.wide{width:50%}"""
-
-
 def write_html(path: Path, data: Mapping[str, Any]) -> None:
-    """Write one page that needs nothing beside it."""
-    s = data["summary"]
-    body = ["<h1>Grasp campaign</h1>", _table((), figures(data))]
-    if s["attempts"]:
-        body += ["<h2>Attempts</h2>", _bars({f"{k}": v for k, v in s["attempts"].items()}, "scenes")]
-    if s["causes"]:
-        body += ["<h2>What failed</h2>", _bars(s["causes"], "scenes")]
-    if s["state_s"]:
-        body += ["<h2>Time in each state</h2>", _bars(s["state_s"], "s")]
-    kinds = [
-        (kind, v["expected"], f"{v['count']} of {v['n']}", ", ".join(f"{c} {n}" for c, n in v["codes"].items()))
-        for kind, v in s["kinds"].items()
-    ]
-    arms = [(arm, _rate(v)) for arm, v in s["arms"].items()]
-    body += ["<h2>Arms</h2>", _table(("arm", "objects placed"), arms)] if arms else []
-    body += ["<h2>Kinds</h2>", _table(("kind", "expected", "as expected", "codes"), kinds)]
-    body += _failures(path.parent, data["rows"])
-    body += ["<h2>Scenes</h2>", _rows(data["rows"])]
-    settings = {**data["settings"], **data["versions"]}
-    body += ["<h2>Made with</h2>", _table((), [(k, str(v)) for k, v in settings.items()])]
-    page = f"<!doctype html><meta charset=utf-8><title>Grasp campaign</title><style>{_STYLE}</style>" + "\n".join(body)
+    """Write one page; only the pictures of failures are files next to it."""
+    failures = [(row, _pictures(path.parent / "failures" / str(row["seed"]))) for row in data["rows"]]
+    page = render_page(
+        Path(__file__).with_name("report.html"),
+        data=data,
+        summary=data["summary"],
+        figures=figures(data),
+        rate=_rate,
+        failures=[(row, pictures) for row, pictures in failures if pictures and not row["as_expected"]],
+    )
     path.write_text(page, encoding="utf-8")
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    top = "<tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in head) + "</tr>" if head else ""
-    lines = ("<tr>" + "".join(f"<td>{html.escape(str(c))}</td>" for c in row) + "</tr>" for row in rows)
-    return f"<table>{top}{''.join(lines)}</table>"
-
-
-def _bars(values: Mapping[str, float], unit: str) -> str:
-    most = max(values.values())
-    lines = (
-        f"<tr><td>{html.escape(str(k))}</td><td>{v:g} {unit}</td>"
-        f'<td class=wide><div class=bar style="width:{100 * v / most:.0f}%"></div></td></tr>'
-        for k, v in values.items()
-    )
-    return f"<table>{''.join(lines)}</table>"
-
-
-def _failures(folder: Path, rows: Sequence[Row]) -> list[str]:
-    """What the cameras saw of scenes that did not go as expected."""
-    out: list[str] = []
-    for row in rows:
-        kept = folder / "failures" / str(row["seed"])
-        pictures = [] if row["as_expected"] else sorted(kept.glob("failed*_spectator.png"))
-        pictures += [] if row["as_expected"] else kept.glob("end_spectator.png")
-        if pictures:
-            links = (f"failures/{row['seed']}/{picture.name}" for picture in pictures)
-            images = "".join(f'<a href="{link}"><img src="{link}" alt="{Path(link).stem}"></a>' for link in links)
-            out.append(f"<p>seed {row['seed']}: {html.escape(str(row['message']))}</p><p>{images}</p>")
-    return ["<h2>Not as expected: at each failure, and at the end</h2>", *out] if out else []
-
-
-def _rows(rows: Sequence[Row]) -> str:
-    head = ("seed", "scene", "kind", "outcome", "code", "attempts", "mm", "s", "message", "again")
-    lines = ["<tr>" + "".join(f"<th>{h}</th>" for h in head) + "</tr>"]
-    for row in rows:
-        error = "" if row["place_error_mm"] is None else f"{row['place_error_mm']:.1f}"
-        seed = str(row["seed"]) if row["as_expected"] else f'<a href="failures/{row["seed"]}">{row["seed"]}</a>'
-        message = "" if row["placed"] else html.escape(row["message"])
-        again = f"<code>{html.escape(row['again'])}</code>"
-        cells = (seed, row["scene_hash"], html.escape(row["kind"]), row["outcome"], row["code"], str(row["attempts"]))
-        cells = (*cells, error, f"{row['sim_s']:.1f}", message, again)
-        mark = "" if row["as_expected"] else " class=bad"
-        lines.append(f"<tr{mark}>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
-    return f"<table>{''.join(lines)}</table>"
+def _pictures(folder: Path) -> list[str]:
+    """Return the names of the spectator's pictures at each failure and at the end."""
+    return [path.name for pattern in ("failed*", "end") for path in sorted(folder.glob(f"{pattern}_spectator.png"))]

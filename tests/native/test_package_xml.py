@@ -15,7 +15,10 @@ PACKAGES = sorted(path.parent for path in ROOT.glob("openarm_*/package.xml"))
 #: rosdep keys of what Ubuntu packages.
 KEYS = {
     "aiohttp": "python3-aiohttp",
+    "PIL": "python3-pil",
     "cv2": "python3-opencv",
+    "jinja2": "python3-jinja2",
+    "matplotlib": "python3-matplotlib",
     "numba": "python3-numba",
     "numpy": "python3-numpy",
     "psutil": "python3-psutil",

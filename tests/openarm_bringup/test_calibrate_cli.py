@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import json
 import re
+from base64 import b64decode
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -59,8 +61,11 @@ def test_solve_check_save_report_list_rollback(capsys, session_file: Path, tmp_p
     assert run(capsys, "report", str(session_file), str(page))[0] == 0
     text = page.read_text()
     drawn = re.findall(r"<figcaption>(\S+ \S+ \S+)", text)
-    assert drawn == ["the camera as", "where the marks", "what the fit"]
-    assert text.count('<svg class="bare"') == 8 + 2 * 12
+    assert drawn == ["poses of the", "marks in the", "residuals of the"]
+    figures = [b64decode(data) for data in re.findall(r"data:image/svg\+xml;base64,([^\"]+)", text)]
+    assert [ElementTree.fromstring(figure).tag for figure in figures] == ["{http://www.w3.org/2000/svg}svg"] * 3
+    assert text.count('class="gauge"') == 8
+    assert text.count('class="bar"') == 2 * 12
     assert "http" not in text.replace("http-equiv", "")
     code, out, _ = run(capsys, "check", str(session_file), "--json")
     data = json.loads(out)

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import re
-import zlib
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -16,9 +14,10 @@ from tf2_msgs.msg import TFMessage
 
 from openarm_bringup.commands import tf
 from openarm_bringup.ros.peer import Frames
-from openarm_bringup.view.tree_picture import Row, lay_out, write
+from openarm_bringup.view.tree_picture import Row, write
 from openarm_common.errors import OpenArmError
 
+SVG = "{http://www.w3.org/2000/svg}"
 ROWS = (Row(0, "world", True), Row(1, "base", True), Row(2, "arm", False), Row(1, "table <1>", True))
 
 
@@ -57,22 +56,23 @@ def test_a_second_publisher_of_a_frame_is_named(second: TFMessage, number: int, 
 
 
 def test_every_frame_is_drawn_below_and_right_of_its_parent(tmp_path: Path) -> None:
-    layout = lay_out(ROWS)
-    at = {text: (x, y) for x, y, text, _ in layout.words}
-    assert at["world"][0] < at["base"][0] == at["table <1>"][0] < at["arm"][0]
-    assert at["world"][1] < at["base"][1] < at["arm"][1] < at["table <1>"][1]
-    assert all(0.0 < x < layout.width and 0.0 < y < layout.height for x, y, *_ in (*layout.words, *layout.dots))
     for suffix in (".png", ".svg", ".pdf"):
         write(ROWS, tmp_path / f"tree{suffix}")
-    picture = cv2.imread(str(tmp_path / "tree.png"))
-    assert picture.shape[:2] == (round(2 * layout.height), round(2 * layout.width))
-    x, y = layout.dots[4][:2]  # after the two of the legend: world, base, arm
-    np.testing.assert_array_equal(picture[round(2 * y), round(2 * x)], (178, 92, 20))  # blue, as OpenCV orders it
     drawn = ElementTree.parse(tmp_path / "tree.svg").getroot()
-    assert {text.text for text in drawn.iter("{http://www.w3.org/2000/svg}text")} >= {row.name for row in ROWS}
-    stream = re.search(rb"stream\n(.*)\nendstream", (tmp_path / "tree.pdf").read_bytes(), re.DOTALL)
-    assert stream is not None
-    assert b"(table <1>) Tj" in zlib.decompress(stream.group(1))
+    at = {text.text: (float(text.get("x")), float(text.get("y"))) for text in drawn.iter(f"{SVG}text")}
+    assert set(at) == {row.name for row in ROWS} | {"moves with the joints: /tf", "fixed: /tf_static"}
+    assert at["world"][0] < at["base"][0] == at["table <1>"][0] < at["arm"][0]
+    assert at["world"][1] < at["base"][1] < at["arm"][1] < at["table <1>"][1]
+    width, height = (float(drawn.get(key).removesuffix("pt")) for key in ("width", "height"))
+    assert all(0.0 < x < width and 0.0 < y < height for x, y in at.values())
+    picture = cv2.imread(str(tmp_path / "tree.png"))
+    assert picture.shape[:2] == pytest.approx((2.0 * height, 2.0 * width), abs=2.0)
+    left, base = 2.0 * np.array(at["arm"])
+    disc = picture[round(base) - 20 : round(base), round(left) - 26 : round(left) - 4]
+    assert (disc == (178, 92, 20)).all(axis=2).sum() > 100  # blue, as OpenCV orders it
+    page = (tmp_path / "tree.pdf").read_bytes()
+    assert page.startswith(b"%PDF-1.4")
+    assert b"/Subtype /Image" not in page
 
 
 def test_a_picture_that_cannot_be_written_says_why(tmp_path: Path) -> None:

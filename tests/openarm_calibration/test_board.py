@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import re
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 
 from openarm_calibration.board.board import Board, Charuco, CircleGrid, parse_board
-from openarm_calibration.board.board_files import png, write_board
+from openarm_calibration.board.board_files import pdf, png, write_board
 from openarm_calibration.board.centroids import refined
 from openarm_calibration.board.detect import detect, guess_pose
 from openarm_calibration.handeye.projection import project
@@ -152,8 +154,47 @@ def test_png_and_pdf_are_true_to_scale(board: Board, tmp_path: Path) -> None:
     page = (tmp_path / "board.pdf").read_bytes()
     assert page.startswith(b"%PDF-1.4")
     assert page.rstrip().endswith(b"%%EOF")
+    assert b"/Subtype /Image" not in page
     box = page[page.index(b"/MediaBox [") + 11 :].split(b"]")[0].split()
     assert float(box[2]) / 72 * 0.0254 >= board.size[0]
+    assert float(box[3]) / 72 * 0.0254 >= board.size[1] + 0.022
+
+
+@pytest.mark.requirement("A-43")
+def test_marks_in_the_pdf_are_at_their_places(tmp_path: Path) -> None:
+    """The outlines of the page's paths: circles around the board's points, black squares from edge to edge."""
+    circles, charuco = CircleGrid(), Charuco()
+    outlines = [shape for shape in pdf_outlines(circles) if len(shape) > 8]
+    middles = np.array([(shape.min(axis=0) + shape.max(axis=0)) / 2.0 for shape in outlines])
+    wanted = circles.points[:, :2] * (1.0, -1.0)
+    middles -= middles.mean(axis=0) - wanted.mean(axis=0)
+    assert np.abs(middles[np.lexsort(middles.T.round(6))] - wanted[np.lexsort(wanted.T.round(6))]).max() < 1e-6
+    assert np.array([np.ptp(shape, axis=0) for shape in outlines]) == pytest.approx(circles.diameter, abs=1e-6)
+
+    boxes = [shape for shape in pdf_outlines(charuco) if len(shape) == 4][:-3]  # without the bar
+    pattern = np.array([charuco.columns, charuco.rows]) * charuco.spacing
+    assert np.ptp(np.concatenate(boxes), axis=0) == pytest.approx(pattern, abs=1e-6)
+    scale = 8000.0
+    drawn = np.full((round(pattern[1] * scale), round(pattern[0] * scale)), 255, np.uint8)
+    low, high = np.concatenate(boxes).min(axis=0), np.concatenate(boxes).max(axis=0)
+    for box in boxes:
+        (left, bottom), (right, top) = box.min(axis=0) - low, box.max(axis=0) - low
+        rows = [round(((high - low)[1] - y) * scale) for y in (top, bottom)]
+        drawn[rows[0] : rows[1], round(left * scale) : round(right * scale)] = 0
+    whole = np.pad(drawn, round(charuco.border * scale), constant_values=255)
+    away = whole.astype(int) - charuco.draw(scale)
+    assert np.mean(np.abs(away) > 128) < 0.005  # but for edges of a pixel
+
+
+def pdf_outlines(board: Board) -> list[np.ndarray]:
+    """Points (n, 2) in metres of each closed path of the board's PDF; y up."""
+    stream = re.search(rb"stream\r?\n(.*?)\r?\nendstream", pdf(board), re.DOTALL)
+    assert stream is not None
+    outlines = []
+    for path in re.split(r"\nh\n", zlib.decompress(stream.group(1)).decode())[:-1]:
+        ends = [line.split()[-3:-1] for line in path.splitlines() if line.endswith((" m", " l", " c"))]
+        outlines.append(np.array(ends, np.float64) / 72.0 * 0.0254)
+    return outlines[1:]  # after the white of the page
 
 
 @pytest.mark.requirement("A-43")

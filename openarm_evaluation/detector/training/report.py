@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -15,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from openarm_common.figures import data_uri, render_figure, render_page, sheet
 from openarm_evaluation.detector.training.samples import Sample, Samples
 from openarm_evaluation.detector.training.scores import SHOWN, Scores, score
 from openarm_perception.detection.boxes import Candidates, overlap
@@ -75,28 +74,22 @@ def write_page(
     figures = {name: as_json(result.scores, names) for name, result in results.items()}
     path.with_suffix(".json").write_text(json.dumps({**facts, "models": figures}, indent=1), encoding="utf-8")
     last = list(results.values())[-1]
-    parts = [_HEAD, "<h1>Network detector</h1>", _table(["", ""], [[k, v] for k, v in facts.items()])]
-    columns = ("map50", "map", "any50", "centre_median_px", "centre_p95_px", "precision", "recall")
-    rows = [
-        [name, *(f"{data[c]:.3f}" for c in columns), *(f"{data['ap50'][n]:.3f}" for n in names)]
-        for name, data in figures.items()
-    ]
-    parts += ["<h2>Figures</h2>", _table(["model", *columns, *(f"AP50 {n}" for n in names)], rows)]
-    confusion = last.scores.confusion.tolist()
-    header = ["is, called", *names, "missed"]
-    lines = [[name, *map(str, row)] for name, row in zip((*names, "nothing"), confusion, strict=True)]
-    parts += [f"<h2>Confusion at a score of {SHOWN}</h2>", _table(header, lines)]
-    if curve:
-        parts += ["<h2>Training</h2>", _curves(curve)]
-    faults = sorted(((_fault(samples[i], last.found[i]), i) for i in range(len(last.found))), reverse=True)[:_WORST]
-    parts.append("<h2>Failures to look at</h2><p>Thick: what is there; thin: what was found, with its score.</p>")
-    for fault, i in faults:
-        if fault > 0.0:
-            title = html.escape(samples.paths[i].name)
-            parts.append(
-                f"<figure>{_image(_drawn(samples[i], last.found[i], names))}<figcaption>{title}</figcaption></figure>"
-            )
-    path.write_text("\n".join(parts), encoding="utf-8")
+    faults = sorted(
+        ((fault, i) for i, found in enumerate(last.found) if (fault := _fault(samples[i], found))), reverse=True
+    )
+    page = render_page(
+        Path(__file__).with_name("report.html"),
+        facts=facts,
+        columns=("map50", "map", "any50", "centre_median_px", "centre_p95_px", "precision", "recall"),
+        names=names,
+        models=figures,
+        confusion=list(zip((*names, "nothing"), last.scores.confusion.tolist(), strict=True)),
+        shown=SHOWN,
+        curves=_curves(curve) if curve else None,
+        batches=int(curve[-1]["step"]) if curve else 0,
+        failures=[(samples.paths[i].name, _jpeg(_drawn(samples[i], last.found[i], names))) for _, i in faults[:_WORST]],
+    )
+    path.write_text(page, encoding="utf-8")
 
 
 def _fault(sample: Sample, found: Candidates) -> float:
@@ -126,35 +119,20 @@ def _drawn(sample: Sample, found: Candidates, names: Sequence[str]) -> NDArray[n
     return picture
 
 
-def _image(rgb: NDArray[np.uint8]) -> str:
+def _jpeg(rgb: NDArray[np.uint8]) -> str:
     _, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])
-    return f'<img src="data:image/jpeg;base64,{base64.b64encode(data.tobytes()).decode()}" width="420">'
+    return data_uri(data.tobytes(), "image/jpeg")
 
 
 def _curves(curve: Sequence[dict[str, float]]) -> str:
-    """Losses and figures of the selection set over the steps, as SVG lines each scaled to its own largest value."""
-    steps = np.array([row["step"] for row in curve], np.float64)
-    lines: list[str] = []
+    """Plot losses and figures of the selection set over the steps, each scaled to its own largest value."""
+    steps = np.array([row["step"] for row in curve])
+    axes = sheet(960.0, 240.0)
+    axes.plot([60.0, 620.0], [220.0, 220.0], color="#888888", lw=1.0)
     for i, key in enumerate(k for k in curve[0] if k not in ("step", "cpu_s")):
-        values = np.nan_to_num(np.array([row[key] for row in curve], np.float64))
+        values = np.nan_to_num(np.array([row[key] for row in curve]))
         top = float(values.max()) or 1.0
-        points = " ".join(
-            f"{60 + 560 * s / steps[-1]:.1f},{220 - 200 * v / top:.1f}" for s, v in zip(steps, values, strict=True)
-        )
-        color = "rgb" + str(_COLORS[i % len(_COLORS)])
-        lines.append(f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="2"/>')
-        text = f"{key}: last {values[-1]:.4g}, top {top:.4g}"
-        lines.append(f'<text x="640" y="{30 + 22 * i}" fill="{color}" font-size="14">{text}</text>')
-    axis = '<line x1="60" y1="220" x2="620" y2="220" stroke="#888"/>'
-    return f'<svg width="960" height="240">{axis}{"".join(lines)}</svg><p>{int(steps[-1])} batches.</p>'
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    head = "".join(f"<th>{html.escape(str(cell))}</th>" for cell in header)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><tr>{head}</tr>{body}</table>"
-
-
-_HEAD = """<!doctype html><meta charset="utf-8"><title>Network detector</title><style>
-body{font:15px sans-serif;margin:2em;max-width:1320px}table{border-collapse:collapse}td,th{border:1px solid #bbb;
-padding:3px 8px;text-align:left}figure{display:inline-block;margin:6px}figcaption{color:#555;font-size:12px}</style>"""
+        color = "#{:02x}{:02x}{:02x}".format(*_COLORS[i % len(_COLORS)])
+        axes.plot(60.0 + 560.0 * steps / steps[-1], 220.0 - 200.0 * values / top, color=color, lw=2.0)
+        axes.text(640.0, 30.0 + 22.0 * i, f"{key}: last {values[-1]:.4g}, top {top:.4g}", color=color, fontsize=14.0)
+    return data_uri(render_figure(axes, "svg"), "image/svg+xml")
