@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 #: Inches in a unit of length.
 POINT, METRE = 1.0 / 72.0, 1.0 / 0.0254
 #: Text stays text that a reader can search; the same drawing gives the same file.
-_STYLE = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "openarm"}
+_STYLE: Any = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "openarm"}
 _METADATA: dict[str, dict[str, Any]] = {
     "svg": dict.fromkeys(("Creator", "Date", "Format", "Type")),
     "pdf": {"CreationDate": None},
@@ -54,10 +54,11 @@ def render_figure(axes: Axes, form: Literal["png", "svg", "pdf"], *, dpi: float 
     """
     from matplotlib import rc_context
 
-    data = io.BytesIO()
+    data, figure = io.BytesIO(), axes.get_figure(root=True)
+    assert figure is not None
     tight: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": margin * POINT} if margin >= 0.0 else {}
     with rc_context(_STYLE):
-        axes.figure.savefig(data, format=form, dpi=dpi, metadata=_METADATA[form], **tight)
+        figure.savefig(data, format=form, dpi=dpi, metadata=_METADATA[form], **tight)
     return data.getvalue()
 
 

@@ -82,7 +82,7 @@ def pdf(board: Board) -> bytes:
         for mark in board.points[:, :2] + centre:
             axes.add_patch(Circle((mark[0], mark[1]), board.radius, color="black", lw=0.0))
     else:
-        axes.add_collection(PolyCollection(_squares(board) + centre, color="black", lw=0.0))
+        axes.add_collection(PolyCollection([*(_squares(board) + centre)], color="black", lw=0.0))
     start, base = (page[0] - 0.1) / 2.0, centre[1] + height / 2.0 + 0.010
     axes.broken_barh([(start, 0.1)], (base - 0.001, 0.001), color="black", lw=0.0)
     axes.broken_barh([(x - 0.0001, 0.0002) for x in (start, start + 0.1)], (base - 0.003, 0.005), color="black", lw=0.0)

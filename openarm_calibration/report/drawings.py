@@ -74,7 +74,8 @@ def residuals(result: Result) -> Drawing:
     axes = sheet(problem.intrinsics[0].width, problem.intrinsics[0].height)
     for k, residual in away.items():
         pixels, colour = problem.views[k].pixels, hue(k, len(problem))
-        axes.add_collection(LineCollection(np.stack([pixels, pixels + zoom * residual], axis=1), color=colour, lw=1.5))
+        segments = np.stack([pixels, pixels + zoom * residual], axis=1)
+        axes.add_collection(LineCollection([*segments], color=colour, lw=1.5))
         axes.plot(*pixels.T, "o", ms=3.0, mew=0.0, color=colour)
     return _drawing(axes, f"residuals of the fit, {zoom:.0f} times enlarged; rms {rms:.3f} px per axis")
 
