@@ -14,7 +14,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_motion.collision.collision import Box
 from openarm_motion.timing.trajectory import Trajectory
-from openarm_sim_bridge.control.actuation import TrajectoryConfig, TrajectoryOutcome
+from openarm_sim_bridge.control.arm import TrajectoryConfig, TrajectoryOutcome
 from openarm_sim_bridge.control.controller import RobotController
 from openarm_sim_bridge.control.gripper import GripperConfig
 from openarm_sim_bridge.control.trajectory import Trajectory as Commanded

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 
 from openarm_common.config import Config
 from openarm_sim_bridge.cameras.noise import ColourNoiseConfig, DepthNoiseConfig
-from openarm_sim_bridge.control.actuation import TrajectoryConfig
+from openarm_sim_bridge.control.arm import TrajectoryConfig
 from openarm_sim_bridge.control.gripper import GripperConfig
 from openarm_sim_bridge.world.model import PhysicsConfig
 

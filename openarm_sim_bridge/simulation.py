@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The thread that steps the world: commands, physics, and telling those who publish, at a steady rate.
+"""The thread that steps the simulated robot in real time and reports every tick to those who publish it.
 
-Everything that touches the world or the controller happens in this thread. Others hand it functions (`call`), which it
+Everything that touches the world or the controllers happens in this thread. Others hand it functions (`call`), which it
 runs between two ticks; they never wait for physics, and physics never waits for them.
 """
 
@@ -16,26 +16,17 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_sim_bridge.control.controller import RobotController
-from openarm_sim_bridge.faults.world_faults import WorldFaults
 from openarm_sim_bridge.pacing import Pacer, PeriodMeter, RealTimeFactor
-from openarm_sim_bridge.world.world import JointReadout, World
+from openarm_sim_bridge.robot import SimulatedRobot
+from openarm_sim_bridge.world.world import JointReadout
 
 T = TypeVar("T")
-
-
-class Observer(Protocol):
-    """Who is told of every tick, in the thread of the simulation."""
-
-    def __call__(self, state: JointReadout) -> None:
-        """Take the state at the end of a tick."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -48,47 +39,46 @@ class _Call:
             return
         try:
             result = self.fn()
-        except BaseException as error:  # handed to whoever asked, never dropped
+        except BaseException as error:  # handed to the caller, never dropped
             self.future.set_exception(error)
         else:
             self.future.set_result(result)
 
 
 class Simulation:
-    """Steps a world in real time.
+    """Steps a simulated robot in real time.
 
     Args:
-        world: The world; not to be touched by anyone else while the thread runs, but through `call`.
-        controller: Makes the targets.
-        observe: Called at the end of every tick that is told of.
-        speed: Simulated seconds a wall second; 0 is as fast as it can. Faster than real time, `observe` is still called
-            about once a period of wall time.
-        dump_folder: Gets the last second before physics diverged; None: the system's folder for temporary files.
-        crashed: Called when the thread ends by an error that nobody expected.
+        robot: The robot in its world; while the thread runs, only functions given to `call` may touch it.
+        observe: Called with the joint states at the end of a tick, in the thread.
+        speed: Simulated seconds per second of wall time; 0 is as fast as possible. Faster than real time, `observe` is
+            called about once per tick period of wall time.
+        dump_folder: Receives the last second before physics diverged; None is the system's folder for temporary files.
+        crashed: Called when the thread ends by an unexpected error.
         clock: Monotonic wall clock, ns.
     """
 
-    #: How often a paused world tells its (unchanged) state, so that a pause is not taken for a death.
+    #: Period in which a paused world reports its (unchanged) state, so that a pause is not taken for a failure.
     PAUSED_PERIOD_S = 0.1
 
     def __init__(
         self,
-        world: World,
-        controller: RobotController,
-        observe: Observer,
+        robot: SimulatedRobot,
+        observe: Callable[[JointReadout], None],
         *,
         speed: float = 1.0,
         dump_folder: Path | None = None,
         crashed: Callable[[Exception], None] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.world = world
-        self.controller = controller
+        self.robot = robot
+        self.world = world = robot.world
+        self.controller = robot.controller
+        #: Injected faults; to be changed through `call` only.
+        self.faults = robot.faults
         self.real_time_factor = RealTimeFactor()
         self.periods = PeriodMeter()
         self.fault = ""
-        #: What goes wrong on purpose; to be changed through `call` only.
-        self.faults = WorldFaults(world.joint_names, world.period_ns)
         self._observe = observe
         self._dump_folder = dump_folder or Path(tempfile.gettempdir())
         self._history: deque[tuple[JointReadout, Array]] = deque(maxlen=max(1, 1_000_000_000 // world.period_ns))
@@ -96,7 +86,7 @@ class Simulation:
         self._clock = clock
         self._pacer = Pacer(world.period_ns, speed)
         self._throttled = speed == 0.0 or speed > 1.0
-        self._told_ns = 0
+        self._observed_ns = 0
         self._paused = False
         self._steps_left = 0
         self._stepped: Future[int] | None = None
@@ -160,12 +150,11 @@ class Simulation:
         return self._stepped
 
     def restart(self) -> None:
-        """Go on after the world was reset or exchanged: forget goals and faults. For `call`."""
+        """Continue after the world was reset or exchanged: forget goals and a divergence. For `call`."""
         self.fault = ""
         self._history.clear()
         self._end_stepping("the world was reset")
-        self.controller.reset(self.world.read_joints())
-        self.world.set_effort_limits(self.controller.effort_limits())
+        self.robot.restart()
 
     # --- the thread
     def _run(self) -> None:
@@ -187,7 +176,7 @@ class Simulation:
         """Do what is due: calls, and a tick; return for how long there is nothing to do, s."""
         self._run_calls()
         if self.fault or (self._paused and not self._steps_left):
-            self._stand()
+            self._idle()
             return self.PAUSED_PERIOD_S
         wait_ns = 0 if self._paused else self._pacer.wait_ns(self._clock())
         if wait_ns <= 0:
@@ -202,33 +191,29 @@ class Simulation:
         if self._wake.wait(seconds):
             self._wake.clear()
 
-    def _stand(self) -> None:
-        """Pass a moment without time going on."""
+    def _idle(self) -> None:
+        """Report the state while simulated time stands still."""
         self._pacer.restart()
         self.periods.restart()
         self._observe(self.world.read_joints())
 
     def _tick(self, now_ns: int) -> None:
-        world, controller = self.world, self.controller
+        world = self.world
         steps = min(world.steps_per_tick, self._steps_left) if self._paused else world.steps_per_tick
         self._pacer.ticked(now_ns)
-        self.faults.prepare(world)
-        state = world.read_joints()
-        targets = self.faults.targets(controller.update(state, steps * world.timestep_ns))
-        self._history.append((state, targets.copy()))
-        world.set_targets(targets)
-        world.set_effort_limits(self.faults.effort_limits(controller.effort_limits()))
         try:
-            world.step(steps)
+            self.robot.tick(steps)
         except OpenArmError as error:
+            self._history.append((self.robot.state, self.robot.targets))
             self.fault = f"{error.message} {self._dump()}"
             self._end_stepping(self.fault)
-            controller.abort(self.fault)
+            self.controller.abort(self.fault)
             return
+        self._history.append((self.robot.state, self.robot.targets))
         self.real_time_factor.add(now_ns, world.t_ns)
         last = self._paused and steps == self._steps_left
-        if last or not self._throttled or now_ns - self._told_ns >= 0.9 * world.period_ns:
-            self._told_ns = now_ns
+        if last or not self._throttled or now_ns - self._observed_ns >= 0.9 * world.period_ns:
+            self._observed_ns = now_ns
             self.periods.add(self._clock())
             self._observe(world.read_joints())
         if self._paused:
@@ -238,7 +223,7 @@ class Simulation:
                 stepped.set_result(world.t_ns)
 
     def check_able(self) -> None:
-        """Say so when nothing can be commanded.
+        """Refuse commands after a divergence.
 
         Raises:
             OpenArmError: NOT_READY, with the fault.
@@ -247,7 +232,7 @@ class Simulation:
             raise OpenArmError(Code.NOT_READY, f"no command is taken until the world is reset: {self.fault}")
 
     def _dump(self) -> str:
-        """Write the last second to a file, and say where."""
+        """Write the last second to a file; return a sentence that names it."""
         path = self._dump_folder / f"openarm_diverged_{os.getpid()}_{self.world.t_ns}.npz"
         states, targets = [state for state, _ in self._history], [target for _, target in self._history]
         try:

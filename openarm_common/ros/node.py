@@ -9,6 +9,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future as ThreadFuture
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Generic, ParamSpec, TypeVar, get_args
 
@@ -155,25 +156,30 @@ class BaseNode(Node, Generic[ConfigT]):
 
         self.add_on_set_parameters_callback(change)
 
-    def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Any:
-        """Run `fn` in a worker thread; await the returned rclpy future (which carries no type) in a coroutine callback.
+    def awaitable(self, work: ThreadFuture[Any]) -> Any:
+        """Return an rclpy future (which carries no type) that a coroutine callback awaits for the outcome of a thread.
 
-        A future completed from another thread does not wake a waiting executor, so this does.
+        A future that is completed in another thread does not wake a waiting executor; this one does. Cancelled work
+        yields None.
         """
         future = Future(executor=self.executor)
 
-        def work() -> None:
-            try:
-                result = fn(*args, **kwargs)
-            except BaseException as error:
+        def done(ended: ThreadFuture[Any]) -> None:
+            if ended.cancelled():
+                future.cancel()
+            elif (error := ended.exception()) is not None:
                 future.set_exception(error)
             else:
-                future.set_result(result)
+                future.set_result(ended.result())
             if self.executor is not None:
                 self.executor.wake()
 
-        self.__pool.submit(work)
+        work.add_done_callback(done)
         return future
+
+    def in_thread(self, fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Any:
+        """Run `fn` in a worker thread; await the returned future in a coroutine callback."""
+        return self.awaitable(self.__pool.submit(fn, *args, **kwargs))
 
     async def hold(self) -> None:
         """Bring to rest what the node moves: called when the process is to end, while the graph is still there."""

@@ -31,7 +31,7 @@ from openarm_motion.planning.arm import Arm, Situation
 from openarm_motion.scene.memory import HeldMemory
 from openarm_motion.timing.checks import Motion, check_trajectory
 from openarm_motion.timing.trajectory import Trajectory
-from openarm_sim_bridge.control.actuation import End, TrajectoryOutcome
+from openarm_sim_bridge.control.arm import End, TrajectoryOutcome
 from openarm_sim_bridge.control.gripper import GripperGoal, GripperOutcome
 from openarm_sim_bridge.control.trajectory import Trajectory as FollowedTrajectory
 from openarm_sim_bridge.world.touch import pad_links

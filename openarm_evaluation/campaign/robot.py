@@ -36,14 +36,11 @@ from openarm_perception.detection.network import NetworkConfig
 from openarm_perception.detection.pipeline import Pipeline
 from openarm_perception.detection.robot import RobotConfig, RobotFinder
 from openarm_perception.geometry.depth import DepthImage, DepthLimits
-from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
+from openarm_sim_bridge.cameras.cameras import SimulatedCameras
+from openarm_sim_bridge.cameras.noise import ColourNoiseConfig, DepthNoiseConfig
 from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
-from openarm_sim_bridge.control.actuation import TrajectoryConfig
-from openarm_sim_bridge.control.controller import RobotController
-from openarm_sim_bridge.control.gripper import GripperConfig
-from openarm_sim_bridge.faults.camera_faults import CameraFaults
 from openarm_sim_bridge.faults.faults import Fault
-from openarm_sim_bridge.faults.world_faults import WorldFaults
+from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
 
@@ -89,12 +86,14 @@ class SimRobot:
         self._senses = senses
         stage = Stage(self.description, self.cameras, mount_seed, PhysicsConfig())
         stage.home |= posture or {}
-        self.world = stage.world(scene)
-        self.controller = RobotController(
-            stage.arms(), stage.grippers(), self.world, TrajectoryConfig(), GripperConfig()
-        )
-        self.world_faults = WorldFaults(self.world.joint_names, self.world.period_ns)
-        self.camera_faults = CameraFaults()
+        self.simulated = SimulatedRobot.on(stage, scene)
+        self.world = self.simulated.world
+        self.controller = self.simulated.controller
+        self.world_faults = self.simulated.faults
+        rng = np.random.default_rng([seed, 77])
+        noise = DepthNoiseConfig(enabled=senses.depth_noise)
+        self._drawing = SimulatedCameras(shared_renderer, self.cameras, noise, ColourNoiseConfig(), rng)
+        self.camera_faults = self._drawing.faults
         self.states = RobotStateBuffer(self.description)
         self.efforts: dict[str, float] = {}
         self.tracks: dict[str, list[Sample]] = {item.name: [] for item in scene.objects}
@@ -103,7 +102,7 @@ class SimRobot:
         #: Share of the frames in which the detector misses an object, on purpose.
         self.missed = 0.0
         self._mounts = dict(mounts or {})
-        self._rng = np.random.default_rng([seed, 77])
+        self._rng = rng
         self._arriving: deque[tuple[int, Frame]] = deque()
         self.frames: deque[Frame] = deque(maxlen=64)
         #: What the hands hold, as the planner believes; the detector takes it for a part of the robot.
@@ -126,12 +125,7 @@ class SimRobot:
         Raises:
             OpenArmError: INTERNAL, when the physics diverged.
         """
-        world = self.world
-        self.world_faults.prepare(world)
-        state = world.read_joints()
-        world.set_targets(self.world_faults.targets(self.controller.update(state, world.period_ns)))
-        world.set_effort_limits(self.world_faults.effort_limits(self.controller.effort_limits()))
-        world.step_tick()
+        self.simulated.tick()
         self._note()
         self._see()
 
@@ -201,7 +195,7 @@ class SimRobot:
         self.images[name] = (self.t_ns, rgb, depth)
         try:
             T_base_camera = self.camera_pose(camera, stamp_ns)
-            optics = self.camera_faults.intrinsics(name, camera.intrinsics)
+            optics = self._drawing.intrinsics(name)
             view = DepthView(depth, optics, T_base_camera, camera.near, camera.far)
             perceived = _pipeline(name, self._table_z, self._senses.detector).run(
                 rgb, depth, optics, T_base_camera, self._robot_in(view, stamp_ns)
@@ -227,18 +221,11 @@ class SimRobot:
         camera = self.cameras[name]
         if self.camera_faults.frozen(name) and name in self.images:
             return self.images[name][1:]
-        renderer = shared_renderer()
-        snapshot = self.world.snapshot()
-        self.camera_faults.apply(snapshot.model)
-        renderer.load(snapshot)
+        self._drawing.load(self.world.snapshot())
         rgb = np.empty((camera.height, camera.width, 3), np.uint8)
         depth = np.empty((camera.height, camera.width), np.uint16)
-        renderer.draw(name, rgb, depth if camera.depth else None, self._noise if self._senses.depth_noise else None)
-        self.camera_faults.spoil_depth(name, depth)
+        self._drawing.draw(name, rgb, depth if camera.depth else None)
         return rgb, depth
-
-    def _noise(self, name: str, z: NDArray[np.float32]) -> NDArray[np.float32]:
-        return add_depth_noise(z, self.cameras[name].intrinsics.fx, DepthNoiseConfig(enabled=True), self._rng)
 
     def camera_pose(self, camera: CameraConfig, stamp_ns: int) -> Array:
         """T_base_optical (4, 4) of a camera at a stamp, as the suite believes.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_sim_bridge.control.actuation import TrajectoryConfig, TrajectoryFollower
+from openarm_sim_bridge.control.arm import TrajectoryConfig, TrajectoryFollower
 from openarm_sim_bridge.control.gripper import GripperConfig, GripperFollower
 from openarm_sim_bridge.control.trajectory import JointGroup
 from openarm_sim_bridge.world.world import JointReadout, World

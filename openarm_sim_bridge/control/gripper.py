@@ -16,7 +16,7 @@ from pydantic import Field
 
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.control.actuation import End
+from openarm_sim_bridge.control.arm import End
 from openarm_sim_bridge.control.tracker import Tracker
 from openarm_sim_bridge.control.trajectory import JointGroup
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Node `mujoco_cameras`: draws the cameras in a process of its own and publishes what they see.
+"""Node `mujoco_cameras`: draws the cameras in a process of its own and publishes their images.
 
-Started by the bridge, which hands over the states to draw (see `handover`); it ends with the bridge. It listens to
-nothing on the graph and has no executor: one thread draws and publishes.
+Started by the bridge, which hands over the states to draw (see `handover`); it ends with the bridge. It subscribes to
+nothing and has no executor: one thread draws and publishes.
 """
 
 from __future__ import annotations
@@ -20,16 +20,15 @@ from rclpy.signals import SignalHandlerOptions
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_sim_bridge.cameras.handover import CameraReport, StateReceiver, Work
-from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
 from openarm_sim_bridge.ros.camera_publisher import CameraPublisher
 
 NODE_NAME = "mujoco_cameras"
-#: How often it looks who listens and tells the bridge, s.
+#: Period in which subscribers are counted and the bridge gets a report, s.
 _REPORT_S = 0.2
 
 
 class CameraNode(Node):
-    """Draws what it is handed.
+    """Draws the states that it receives.
 
     Args:
         receiver: Where states come from.
@@ -38,10 +37,9 @@ class CameraNode(Node):
     def __init__(self, receiver: StateReceiver) -> None:
         super().__init__(NODE_NAME, start_parameter_services=False, enable_rosout=False)
         self._receiver = receiver
-        self._cameras = {camera.name: camera for camera in receiver.setup.cameras}
+        self._names = [camera.name for camera in receiver.setup.cameras]
         self._images = CameraPublisher(self, receiver.setup)
-        self._renderer: SnapshotRenderer | None = None
-        self._rendered = dict.fromkeys(self._cameras, 0)
+        self._rendered = dict.fromkeys(self._names, 0)
         self._spent_s = 0.0
         self._drawn = 0
         self._ready = False
@@ -63,7 +61,7 @@ class CameraNode(Node):
             if work is not None and not self._fault:
                 self._attempt(work)
             if time.monotonic() >= self._report_at:
-                self._tell()
+                self._report()
 
     def _attempt(self, work: Work) -> None:
         try:
@@ -73,37 +71,34 @@ class CameraNode(Node):
         except Exception as error:  # what OpenGL raises is not known beforehand, and images must not end unnoticed
             self._fault = str(OpenArmError(Code.INTERNAL, f"drawing failed: {error!r}"))
         if self._fault:
-            self._tell()
+            self._report()
 
     def _draw(self, work: Work) -> None:
-        if self._renderer is None:
-            self._renderer = SnapshotRenderer(self._cameras)
+        images = self._images
         if not self._ready:  # the first frame of a camera takes long
-            self._renderer.load(work.snapshot)
-            for name in self._cameras:
-                self._images.draw(self._renderer, name)
+            images.cameras.load(work.snapshot)
+            for name in self._names:
+                images.draw(name)
             self._ready = True
             gc.collect()
             gc.freeze()
-            self._tell()
+            self._report()
         if not work.names:
             return
         began = time.monotonic()
-        wanted = [name for name in self._cameras if name in work.names and self._images.wants_image(name)]
+        due = [name for name in self._names if name in work.names]
+        wanted = [name for name in due if images.wants_image(name)]
         if wanted:
-            self._images.faults.apply(work.snapshot.model)
-            self._renderer.load(work.snapshot)
-        for name in self._cameras:
-            if name not in work.names:
-                continue
+            images.cameras.load(work.snapshot)
+        for name in due:
             if name in wanted:
-                self._images.draw(self._renderer, name)
+                images.draw(name)
                 self._rendered[name] += 1
-            self._images.publish(name, work.snapshot.t_ns, drawn=name in wanted)
+            images.publish(name, work.snapshot.t_ns, drawn=name in wanted)
         self._spent_s += time.monotonic() - began
         self._drawn += len(wanted)
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         self._report_at = time.monotonic() + _REPORT_S
         self._receiver.report(
             CameraReport(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishing what the cameras see: colour, depth and their CameraInfo, each only while someone listens."""
+"""Publishers of the cameras: colour, depth and their CameraInfo, each only while it has subscribers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import math
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -17,20 +18,21 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, Image
 
-from openarm_common.camera.cameras import CameraConfig, Intrinsics
+from openarm_common.camera.cameras import CameraConfig
 from openarm_common.ros.convert import ENCODINGS, info_from_intrinsics, ns_to_stamp
 from openarm_common.ros.node import QOS_SENSOR
+from openarm_sim_bridge.cameras.cameras import SimulatedCameras
 from openarm_sim_bridge.cameras.handover import CameraSetup
-from openarm_sim_bridge.cameras.noise import add_colour_noise, add_depth_noise
 from openarm_sim_bridge.cameras.renderer import Colour, Depth, SnapshotRenderer
-from openarm_sim_bridge.faults.camera_faults import CameraFaults
 from openarm_sim_bridge.faults.faults import Fault
+
+_STREAMS = ("color", "depth")
 
 
 def topic_names(camera: CameraConfig) -> tuple[str, ...]:
     """Topics of a camera before any remapping."""
-    streams = ("color", "depth") if camera.depth else ("color",)
-    return tuple(f"/{camera.name}/{stream}/{kind}" for stream in streams for kind in ("image_raw", "camera_info"))
+    kinds = ("image_raw", "camera_info")
+    return tuple(f"/{camera.name}/{stream}/{kind}" for stream in _STREAMS[: 1 + camera.depth] for kind in kinds)
 
 
 @dataclass
@@ -69,7 +71,7 @@ class _Stream:
         return self.wants_image or self.wants_info
 
     def due(self, t_ns: int, *, image: bool) -> Iterator[tuple[Publisher, Image | CameraInfo]]:
-        """What is to be published now; the messages are used again for the next frame."""
+        """Yield the messages to publish now; they are reused for the next frame."""
         stamp = ns_to_stamp(t_ns)
         if image and self.wants_image:
             self.message.header.stamp = stamp
@@ -78,79 +80,64 @@ class _Stream:
             self.info_message.header.stamp = stamp
             yield self.info, self.info_message
 
-    def tell_intrinsics(self, intrinsics: Intrinsics) -> None:
-        self.info_message = info_from_intrinsics(intrinsics, self.info_message.header.frame_id, 0)
-
-
-@dataclass
-class _Camera:
-    colour: _Stream
-    depth: _Stream | None
-    streams: tuple[_Stream, ...] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.streams = (self.colour,) if self.depth is None else (self.colour, self.depth)
-
 
 class CameraPublisher:
     """Topics of all cameras.
 
     Args:
         node: Owner of the publishers.
-        setup: The cameras, how depth is told, names of the topics.
+        setup: The cameras, encoding of depth, names of the topics.
+
+    Attributes:
+        cameras: Draw the pictures.
     """
 
     def __init__(self, node: Node, setup: CameraSetup) -> None:
-        self.faults = CameraFaults()
-        self._depth_noise, self._colour_noise = setup.depth_noise, setup.colour_noise
-        self._rng = np.random.default_rng(setup.noise_seed)
+        configs = {camera.name: camera for camera in setup.cameras}
+        rng = np.random.default_rng(setup.noise_seed)
+        self.cameras = SimulatedCameras(
+            partial(SnapshotRenderer, configs), configs, setup.depth_noise, setup.colour_noise, rng
+        )
         self._late: list[tuple[float, Publisher, Image | CameraInfo]] = []
-        self._configs = {camera.name: camera for camera in setup.cameras}
-        self._cameras = {
-            camera.name: _Camera(
-                _Stream.make(node, setup, camera, "color", "rgb8"),
-                _Stream.make(node, setup, camera, "depth", setup.depth_encoding) if camera.depth else None,
-            )
+        encodings = {"color": "rgb8", "depth": setup.depth_encoding}
+        self._streams = {
+            camera.name: [
+                _Stream.make(node, setup, camera, kind, encodings[kind]) for kind in _STREAMS[: 1 + camera.depth]
+            ]
             for camera in setup.cameras
         }
 
     def poll(self) -> tuple[str, ...]:
-        """Look who listens; return the cameras that anyone listens to."""
-        watched = {name: [stream.poll() for stream in camera.streams] for name, camera in self._cameras.items()}
-        return tuple(name for name, streams in watched.items() if any(streams))
+        """Count the subscribers; return the cameras that have any."""
+        subscribed = {name: [stream.poll() for stream in streams] for name, streams in self._streams.items()}
+        return tuple(name for name, streams in subscribed.items() if any(streams))
 
     def wants_image(self, name: str) -> bool:
-        """Whether anyone listens to an image of the camera, not only to its CameraInfo."""
-        return any(stream.wants_image for stream in self._cameras[name].streams)
+        """Whether an image of the camera has a subscriber, not only its CameraInfo."""
+        return any(stream.wants_image for stream in self._streams[name])
 
-    def draw(self, renderer: SnapshotRenderer, name: str) -> None:
-        """Draw a camera's view of the loaded state into its messages."""
-        if self.faults.frozen(name):
+    def draw(self, name: str) -> None:
+        """Draw a camera's view of the loaded state into its messages; a frozen camera keeps its picture."""
+        if self.cameras.faults.frozen(name):
             return
-        camera = self._cameras[name]
-        colour = cast(Colour, camera.colour.pixels)
-        depth = camera.depth.pixels if camera.depth is not None and camera.depth.wants_image else None
-        renderer.draw(name, colour, cast(Depth | None, depth), self._noise if self._depth_noise.enabled else None)
-        add_colour_noise(colour, self._colour_noise, self._rng)
-        if depth is not None:
-            self.faults.spoil_depth(name, depth)
-
-    def _noise(self, name: str, z: NDArray[np.float32]) -> NDArray[np.float32]:
-        return add_depth_noise(z, self._configs[name].intrinsics.fx, self._depth_noise, self._rng)
+        streams = self._streams[name]
+        depth = streams[1].pixels if len(streams) > 1 and streams[1].wants_image else None
+        self.cameras.draw(name, cast(Colour, streams[0].pixels), cast(Depth | None, depth))
 
     def publish(self, name: str, t_ns: int, *, drawn: bool) -> None:
-        """Publish what listeners want of a camera.
+        """Publish the topics of a camera that have subscribers.
 
         Args:
             name: Of the camera.
             t_ns: Stamp.
             drawn: False when there is a CameraInfo only.
         """
-        if self.faults.drops(name):
+        faults = self.cameras.faults
+        if faults.drops(name):
             return
-        delay_s = self.faults.delay_s(name)
-        stamp_ns = self.faults.stamp_ns(name, t_ns)
-        for stream in self._cameras[name].streams:
+        delay_s = faults.delay_s(name)
+        stamp_ns = faults.stamp_ns(name, t_ns)
+        for stream in self._streams[name]:
             for publisher, message in stream.due(stamp_ns, image=drawn):
                 if delay_s > 0.0:
                     self._late.append((time.monotonic() + delay_s, publisher, copy.deepcopy(message)))
@@ -159,10 +146,11 @@ class CameraPublisher:
 
     def set_faults(self, faults: tuple[Fault, ...]) -> None:
         """Take the faults that are active from now on."""
-        self.faults.set(faults)
-        for name, config in self._configs.items():
-            for stream in self._cameras[name].streams:
-                stream.tell_intrinsics(self.faults.intrinsics(name, config.intrinsics))
+        self.cameras.faults.set(faults)
+        for name, streams in self._streams.items():
+            for stream in streams:
+                frame = stream.info_message.header.frame_id
+                stream.info_message = info_from_intrinsics(self.cameras.intrinsics(name), frame, 0)
 
     def publish_late(self) -> float:
         """Publish what was delayed until now; return in how many seconds the next is due."""

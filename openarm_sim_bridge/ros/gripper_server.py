@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller of a gripper on the graph, with either of the two actions that such controllers have.
+"""The action of a gripper controller, of either type that such controllers have.
 
-Both move the driving finger joint: position in m from the middle (0 closed, 0.044 open), as ros2_control's gripper
-controllers do; effort in N. A gripper's result has no text, so a goal that is refused is rejected, with the reason in
-the log.
+Both types move the driving finger joint: position in m from the middle (0 closed, 0.044 open), as the gripper
+controllers of ros2_control do; effort in N. The result of a gripper has no text, so an invalid goal is rejected and the
+reason logged.
 """
 
 from __future__ import annotations
@@ -13,15 +13,14 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from control_msgs.action import GripperCommand, ParallelGripperCommand
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action import GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from sensor_msgs.msg import JointState
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import BaseNode
-from openarm_sim_bridge.control.actuation import End
 from openarm_sim_bridge.control.gripper import GripperFollower, GripperGoal, GripperOutcome
-from openarm_sim_bridge.ros.trajectory_server import Waiting
+from openarm_sim_bridge.ros.controller_server import ControllerServer
 from openarm_sim_bridge.simulation import Simulation
 
 GripperAction = Literal["parallel", "classic"]
@@ -29,82 +28,55 @@ GripperAction = Literal["parallel", "classic"]
 
 @dataclass(frozen=True)
 class _Type:
-    """An action type, and how its goals and results read; joint by name."""
+    """An action type with the conversions of its goals and results; joint by name."""
 
     action: type
     goal_of: Callable[[Any, str], GripperGoal]
     result_of: Callable[[GripperOutcome, str], Any]
 
 
-class GripperActionServer:
+class GripperServer(ControllerServer[GripperOutcome]):
     """/{side}_gripper_controller/gripper_cmd, of one type: a name can't carry two.
 
     Args:
         node: Owner.
         side: left or right.
-        follower: Of the gripper.
-        simulation: Whose thread works the follower.
+        gripper: Its controller.
+        simulation: Whose thread runs the controller.
         action: parallel (ParallelGripperCommand) or classic (GripperCommand).
     """
 
     def __init__(
-        self, node: BaseNode[Any], side: str, follower: GripperFollower, simulation: Simulation, action: GripperAction
+        self, node: BaseNode[Any], side: str, gripper: GripperFollower, simulation: Simulation, action: GripperAction
     ) -> None:
-        self._node = node
-        self._side = side
-        self._follower = follower
-        self._simulation = simulation
+        self._gripper = gripper
         self._type = _TYPES[action]
-        self._joint = follower.group.names[0]
+        self._joint = gripper.group.names[0]
         self._column = simulation.world.joint_names.index(self._joint)
-        self._server = ActionServer(
-            node,
-            self._type.action,
-            f"/{side}_gripper_controller/gripper_cmd",
-            self._execute,
-            goal_callback=self._judge,
-            cancel_callback=self._cancel,
-        )
+        name = f"/{side}_gripper_controller/gripper_cmd"
+        super().__init__(node, simulation, f"{side} gripper", self._type.action, name, gripper.cancel)
 
-    def destroy(self) -> None:
-        """Take the action away."""
-        self._server.destroy()
-
-    def _judge(self, request: Any) -> GoalResponse:
+    def _on_goal(self, request: Any) -> GoalResponse:
         try:
             self._simulation.check_able()
-            self._follower.check(self._type.goal_of(request, self._joint))
+            self._gripper.check(self._type.goal_of(request, self._joint))
         except OpenArmError as error:
-            self._node.get_logger().error(f"{self._side} gripper goal rejected: {error}")
+            self._node.get_logger().error(f"{self._label} goal rejected: {error}")
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
-    def _cancel(self, _handle: ServerGoalHandle) -> CancelResponse:
-        self._simulation.call(self._follower.cancel)
-        return CancelResponse.ACCEPT
-
     async def _execute(self, handle: ServerGoalHandle) -> Any:
-        waiting: Waiting[GripperOutcome] = Waiting(self._node)
-        goal = self._follower.check(self._type.goal_of(handle.request, self._joint))
-        self._simulation.call(lambda: self._start(goal, waiting.done)).add_done_callback(waiting.started)
-        if handle.is_cancel_requested:
-            self._simulation.call(self._follower.cancel)
-        outcome: GripperOutcome | None = await waiting.future
-        if outcome is None:  # the simulation is shutting down
+        goal = self._gripper.check(self._type.goal_of(handle.request, self._joint))
+        outcome = await self._follow(handle, lambda done: self._start(goal, done))
+        if outcome is None:
             handle.abort()
             return self._type.action.Result()
-        if outcome.end is End.SUCCEEDED:
-            handle.succeed()
-        elif outcome.end is End.CANCELLED:
-            handle.canceled()
-        else:
-            handle.abort()
-            self._node.get_logger().warning(f"{self._side} gripper: {outcome.text}")
+        self._end(handle, outcome.end, outcome.text)
         return self._type.result_of(outcome, self._joint)
 
     def _start(self, goal: GripperGoal, done: Callable[[GripperOutcome], None]) -> None:
         state = self._simulation.world.read_joints()
-        self._follower.start(goal, float(state.position[self._column]), float(state.effort[self._column]), done)
+        self._gripper.start(goal, float(state.position[self._column]), float(state.effort[self._column]), done)
 
 
 def _parallel_goal(request: ParallelGripperCommand.Goal, joint: str) -> GripperGoal:

@@ -28,16 +28,16 @@ from openarm_common.scene.scene import Scene, load_scene
 from openarm_sim_bridge.cameras.camera_feed import CameraFeed
 from openarm_sim_bridge.cameras.handover import CameraSetup
 from openarm_sim_bridge.config import BridgeConfig
-from openarm_sim_bridge.control.controller import RobotController
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.priority import use_fifo
+from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.ros.camera_publisher import topic_names
-from openarm_sim_bridge.ros.fault_server import FaultServices
+from openarm_sim_bridge.ros.fault_server import FaultServer
 from openarm_sim_bridge.ros.force_publisher import ForcePublisher
-from openarm_sim_bridge.ros.gripper_server import GripperActionServer
-from openarm_sim_bridge.ros.simulation_server import SimulationServices
+from openarm_sim_bridge.ros.gripper_server import GripperServer
+from openarm_sim_bridge.ros.simulation_server import SimulationServer
 from openarm_sim_bridge.ros.state_publisher import StatePublisher, until_shutdown
-from openarm_sim_bridge.ros.trajectory_server import ArmActionServer
+from openarm_sim_bridge.ros.trajectory_server import TrajectoryServer
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.world.stage import Stage
 from openarm_sim_bridge.world.world import JointReadout, Snapshot
@@ -69,10 +69,10 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         cameras = load_cameras(Path(config.cameras) if config.cameras else None)
         scene = load_scene(config.scene, config.seed)
         stage = Stage(self.description, cameras, config.mount_seed if config.mount_seed >= 0 else None, config.physics)
-        world = stage.world(scene)
-        controller = RobotController(stage.arms(), stage.grippers(), world, config.trajectory, config.gripper)
+        robot = SimulatedRobot.on(stage, scene, config.trajectory, config.gripper)
+        world, controller = robot.world, robot.controller
         self._controller = controller
-        self._simulation = Simulation(world, controller, self._observe, speed=config.speed, crashed=self._on_crash)
+        self._simulation = Simulation(robot, self._observe, speed=config.speed, crashed=self._on_crash)
         self._simulation.set_paused(config.paused)
 
         self._states = StatePublisher(
@@ -83,14 +83,14 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
 
         self.create_subscription(JointState, "/joint_commands", self._on_command, QOS_COMMAND)
-        self._arms = [ArmActionServer(self, side, arm, self._simulation) for side, arm in controller.arms.items()]
+        self._arms = [TrajectoryServer(self, side, arm, self._simulation) for side, arm in controller.arms.items()]
         self._grippers = [
-            GripperActionServer(self, side, gripper, self._simulation, config.gripper_action)
+            GripperServer(self, side, gripper, self._simulation, config.gripper_action)
             for side, gripper in controller.grippers.items()
         ]
-        self._sim_services = SimulationServices(self, stage, scene, self._simulation, self._on_scene)
+        self._sim_services = SimulationServer(self, stage, scene, self._simulation, self._on_scene)
 
-        self._faults = FaultServices(
+        self._faults = FaultServer(
             self, self._simulation, cameras if self._images is not None else (), self._tell_cameras
         )
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The services of the simulation: reset and exchange the world, pause, step, add, remove and move objects.
+"""Services of the simulation: reset and exchange the world, pause, step, add, remove and move objects.
 
-What takes longer than a tick (reading a scene, compiling a model) runs in a worker thread; the world itself changes
-between two ticks, in the thread of the simulation.
+Work that takes longer than a tick (reading a scene, compiling a model) runs in a worker thread; the world itself
+changes between two ticks, in the thread of the simulation.
 """
 
 from __future__ import annotations
@@ -10,19 +10,17 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Awaitable, Callable, Mapping
-from concurrent.futures import Future as ThreadFuture
+from functools import partial
 from typing import Any, TypeVar
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped
-from numpy.typing import NDArray
 from openarm_interfaces.srv import MoveObject, RemoveObject, ResetWorld, SetPause, SpawnObject, StepSimulation
-from rclpy.task import Future
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import pose_to_matrix, xyz
 from openarm_common.ros.node import BaseNode
 from openarm_common.scene.scene import Scene, load_scene
+from openarm_common.types import Array
 from openarm_sim_bridge.ros.state_publisher import WORLD_FRAME
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.world.compiled import CompiledWorld
@@ -34,20 +32,31 @@ _ANSWER_S = 1.0
 _UPRIGHT = 1e-3
 
 
-async def answer(node: BaseNode[Any], response: Any, work: Awaitable[str]) -> Any:
-    """Fill `success` and `message` of a response with the outcome of some work."""
-    try:
-        response.message = await work
-        response.success = True
-    except OpenArmError as error:
-        response.success = False
-        response.message = str(error)
-        node.get_logger().warning(str(error))
-    return response
+def serve(node: BaseNode[Any], kind: Any, name: str, work: Callable[[Any], Awaitable[str]]) -> None:
+    """Offer a service that answers with the message that `work` returns, or with its error.
+
+    Args:
+        node: Owner.
+        kind: Type of the service; its response has `success` and `message`.
+        name: Absolute name.
+        work: Is given the request.
+    """
+
+    async def on_request(request: Any, response: Any) -> Any:
+        try:
+            response.message = await work(request)
+            response.success = True
+        except OpenArmError as error:
+            response.success = False
+            response.message = str(error)
+            node.get_logger().warning(str(error))
+        return response
+
+    node.create_service(kind, name, on_request)
 
 
 def between_ticks(simulation: Simulation, fn: Callable[[], T]) -> T:
-    """Run a short function in the thread of the simulation and wait for it; not for the executor.
+    """Run a short function in the thread of the simulation and wait for it; call from a worker thread.
 
     Raises:
         OpenArmError: TIMEOUT, and what the function raises.
@@ -58,13 +67,13 @@ def between_ticks(simulation: Simulation, fn: Callable[[], T]) -> T:
         raise OpenArmError(Code.TIMEOUT, f"the physics did not answer within {_ANSWER_S:.0f} s") from error
 
 
-class SimulationServices:
+class SimulationServer:
     """/sim/reset_world, /sim/set_pause, /sim/step, and /sim/spawn_object, remove_object, move_object.
 
     Args:
         node: Owner.
         stage: Makes worlds.
-        scene: The scene that the world shows.
+        scene: The scene that is simulated.
         simulation: Whose world it is.
         on_scene: Called (in a worker thread) with a scene that was loaded.
     """
@@ -83,33 +92,15 @@ class SimulationServices:
         self._simulation = simulation
         self._on_scene = on_scene
         self._changing = threading.Lock()
-        node.create_service(ResetWorld, "/sim/reset_world", self._on_reset)
-        node.create_service(SetPause, "/sim/set_pause", self._on_pause)
-        node.create_service(StepSimulation, "/sim/step", self._on_step)
-        node.create_service(SpawnObject, "/sim/spawn_object", self._on_spawn)
-        node.create_service(RemoveObject, "/sim/remove_object", self._on_remove)
-        node.create_service(MoveObject, "/sim/move_object", self._on_move)
-
-    # --- callbacks
-    async def _on_reset(self, request: ResetWorld.Request, response: ResetWorld.Response) -> ResetWorld.Response:
-        return await answer(self._node, response, self._node.in_thread(self._reset, request))
-
-    async def _on_pause(self, request: SetPause.Request, response: SetPause.Response) -> SetPause.Response:
-        return await answer(self._node, response, self._node.in_thread(self._pause, request.paused))
-
-    async def _on_step(
-        self, request: StepSimulation.Request, response: StepSimulation.Response
-    ) -> StepSimulation.Response:
-        return await answer(self._node, response, self._step(request.steps))
-
-    async def _on_spawn(self, request: SpawnObject.Request, response: SpawnObject.Response) -> SpawnObject.Response:
-        return await answer(self._node, response, self._node.in_thread(self._spawn, request))
-
-    async def _on_remove(self, request: RemoveObject.Request, response: RemoveObject.Response) -> RemoveObject.Response:
-        return await answer(self._node, response, self._node.in_thread(self._remove, request.name))
-
-    async def _on_move(self, request: MoveObject.Request, response: MoveObject.Response) -> MoveObject.Response:
-        return await answer(self._node, response, self._node.in_thread(self._move, request.name, request.pose))
+        serve(node, StepSimulation, "/sim/step", self._step)
+        for kind, name, work in (
+            (ResetWorld, "reset_world", self._reset),
+            (SetPause, "set_pause", self._pause),
+            (SpawnObject, "spawn_object", self._spawn),
+            (RemoveObject, "remove_object", self._remove),
+            (MoveObject, "move_object", self._move),
+        ):
+            serve(node, kind, f"/sim/{name}", partial(node.in_thread, work))
 
     # --- work, in a worker thread
     def _reset(self, request: ResetWorld.Request) -> str:
@@ -127,10 +118,8 @@ class SimulationServices:
         self._on_scene(scene)
         return f"scene {scene.name!r} with {len(scene.objects)} objects"
 
-    def _start_of(
-        self, request: ResetWorld.Request, scene: Scene
-    ) -> tuple[dict[str, float], dict[str, NDArray[np.float64]]]:
-        """Which joints and objects start elsewhere than at home and in their places of the scene."""
+    def _start_of(self, request: ResetWorld.Request, scene: Scene) -> tuple[dict[str, float], dict[str, Array]]:
+        """Return joint positions and object poses of a request that differ from the start of the scene."""
         keyframe = request.keyframe
         joints = self._stage.posture(keyframe) if keyframe not in ("", "home") else dict[str, float]()
         command = self._simulation.controller.check_command(request.joint_names, request.joint_positions)
@@ -148,60 +137,48 @@ class SimulationServices:
         }
         return joints | dict(command.positions), objects
 
-    def _pause(self, paused: bool) -> str:
-        between_ticks(self._simulation, lambda: self._simulation.set_paused(paused))
-        return "paused" if paused else "running"
+    def _pause(self, request: SetPause.Request) -> str:
+        between_ticks(self._simulation, lambda: self._simulation.set_paused(request.paused))
+        return "paused" if request.paused else "running"
 
-    async def _step(self, steps: int) -> str:
+    async def _step(self, request: StepSimulation.Request) -> str:
         """Wait in the executor, not in a worker thread: many steps take long."""
-        begun = self._node.in_thread(between_ticks, self._simulation, lambda: self._simulation.advance(steps))
-        stepped = Future(executor=self._node.executor)
-
-        def done(stepping: ThreadFuture[int]) -> None:
-            error = stepping.exception()
-            stepped.set_result(stepping.result()) if error is None else stepped.set_exception(error)
-            if self._node.executor is not None:
-                self._node.executor.wake()
-
-        (await begun).add_done_callback(done)
-        t_ns: Any = await stepped
-        return f"simulated time is {t_ns * 1e-9:.3f} s"
+        node, simulation = self._node, self._simulation
+        stepped = await node.in_thread(between_ticks, simulation, lambda: simulation.advance(request.steps))
+        return f"simulated time is {await node.awaitable(stepped) * 1e-9:.3f} s"
 
     def _spawn(self, request: SpawnObject.Request) -> str:
-        with self._changing:
-            scene = with_object(self._present, _object_of(request, self._present.table.top_z))
-            compiled = self._stage.compile(self._simulation.world, scene)
-            between_ticks(self._simulation, lambda: self._simulation.world.extend(compiled))
-            self._present = scene
+        self._extend(lambda scene: with_object(scene, _object_of(request, scene.table.top_z)))
         return f"{request.name!r} is in the world"
 
-    def _remove(self, name: str) -> str:
+    def _remove(self, request: RemoveObject.Request) -> str:
+        self._extend(lambda scene: without_object(scene, request.name))
+        return f"{request.name!r} is out of the world"
+
+    def _extend(self, change: Callable[[Scene], Scene]) -> None:
         with self._changing:
-            scene = without_object(self._present, name)
+            scene = change(self._present)
             compiled = self._stage.compile(self._simulation.world, scene)
             between_ticks(self._simulation, lambda: self._simulation.world.extend(compiled))
             self._present = scene
-        return f"{name!r} is out of the world"
 
-    def _move(self, name: str, pose: PoseStamped) -> str:
+    def _move(self, request: MoveObject.Request) -> str:
         with self._changing:
-            T = _pose_of(name, pose, self._present)
-            between_ticks(self._simulation, lambda: self._simulation.world.move_object(name, T))
-        return f"{name!r} is at ({', '.join(f'{v:.3f}' for v in T[:3, 3])}) m in {WORLD_FRAME}"
+            T = _pose_of(request.name, request.pose, self._present)
+            between_ticks(self._simulation, lambda: self._simulation.world.move_object(request.name, T))
+        return f"{request.name!r} is at ({', '.join(f'{v:.3f}' for v in T[:3, 3])}) m in {WORLD_FRAME}"
 
     # --- between two ticks
-    def _reset_world(self, joints: Mapping[str, float], objects: Mapping[str, NDArray[np.float64]]) -> None:
+    def _reset_world(self, joints: Mapping[str, float], objects: Mapping[str, Array]) -> None:
         self._simulation.world.reset(joints, objects)
         self._simulation.restart()
 
-    def _exchange(
-        self, compiled: CompiledWorld, joints: Mapping[str, float], objects: Mapping[str, NDArray[np.float64]]
-    ) -> None:
+    def _exchange(self, compiled: CompiledWorld, joints: Mapping[str, float], objects: Mapping[str, Array]) -> None:
         self._simulation.world.exchange(compiled, joints, objects)
         self._simulation.restart()
 
 
-def _pose_of(name: str, pose: PoseStamped, scene: Scene) -> NDArray[np.float64]:
+def _pose_of(name: str, pose: PoseStamped, scene: Scene) -> Array:
     """T_world_object of an object of a scene.
 
     Raises:
@@ -210,14 +187,14 @@ def _pose_of(name: str, pose: PoseStamped, scene: Scene) -> NDArray[np.float64]:
     there = {item.name: item for item in scene.objects}
     if name not in there:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {', '.join(there) or 'none'}")
-    T, stands = _pose_in_world(pose, scene.table.top_z)
-    if stands:
+    T, on_table = _pose_in_world(pose, scene.table.top_z)
+    if on_table:
         T[2, 3] += 0.5 * there[name].size[2]
     return T
 
 
-def _pose_in_world(pose: PoseStamped, table_top_z: float) -> tuple[NDArray[np.float64], bool]:
-    """T_world_object, and whether its height is that of what the object shall stand on (z = 0 on the table).
+def _pose_in_world(pose: PoseStamped, table_top_z: float) -> tuple[Array, bool]:
+    """Return T_world_object, and whether z = 0 on the table was given, where the object is put on its bottom.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for a frame that is neither table nor world, or a tilted object.
@@ -230,10 +207,10 @@ def _pose_in_world(pose: PoseStamped, table_top_z: float) -> tuple[NDArray[np.fl
     T = pose_to_matrix(pose.pose)
     if T[2, 2] < 1.0 - _UPRIGHT:
         raise OpenArmError(Code.INVALID_ARGUMENT, "the pose is tilted, expected a turn about z only")
-    stands = frame == "table" and T[2, 3] == 0.0
+    on_table = frame == "table" and T[2, 3] == 0.0
     if frame == "table":
         T[2, 3] += table_top_z
-    return T, stands
+    return T, on_table
 
 
 def _object_of(request: SpawnObject.Request, table_top_z: float) -> dict[str, Any]:
@@ -242,7 +219,7 @@ def _object_of(request: SpawnObject.Request, table_top_z: float) -> dict[str, An
     Raises:
         OpenArmError: INVALID_ARGUMENT, as `_pose_in_world`.
     """
-    T, stands = _pose_in_world(request.pose, table_top_z)
+    T, on_table = _pose_in_world(request.pose, table_top_z)
     x, y, z = (float(v) for v in T[:3, 3])
     return {
         "name": request.name,
@@ -250,6 +227,6 @@ def _object_of(request: SpawnObject.Request, table_top_z: float) -> dict[str, An
         "size": tuple(xyz(request.size).tolist()),
         "color": request.color,
         "mass": request.mass,
-        "position": (x, y) if stands else (x, y, z),
+        "position": (x, y) if on_table else (x, y, z),
         "yaw": math.atan2(T[1, 0], T[0, 0]),
     }

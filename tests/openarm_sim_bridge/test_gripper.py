@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.control.actuation import End
+from openarm_sim_bridge.control.arm import End
 from openarm_sim_bridge.control.gripper import GripperConfig, GripperFollower, GripperGoal, GripperOutcome
 from openarm_sim_bridge.control.trajectory import JointGroup
 

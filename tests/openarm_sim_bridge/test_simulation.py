@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.control.actuation import End, TrajectoryConfig, TrajectoryOutcome
+from openarm_sim_bridge.control.arm import End, TrajectoryConfig, TrajectoryOutcome
 from openarm_sim_bridge.control.controller import RobotController
 from openarm_sim_bridge.control.gripper import GripperConfig
 from openarm_sim_bridge.control.trajectory import JointGroup, Trajectory
+from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.world.world import JointReadout, World
 
@@ -44,7 +45,7 @@ class Bench:
         self.world, self.controller = make_controller()
         self.states: list[tuple[float, JointReadout]] = []
         self._told = threading.Condition()
-        self.simulation = Simulation(self.world, self.controller, self._observe, speed=speed)
+        self.simulation = Simulation(SimulatedRobot(self.world, self.controller), self._observe, speed=speed)
 
     def _observe(self, state: JointReadout) -> None:
         with self._told:
@@ -297,7 +298,7 @@ def test_a_fault_of_the_program_in_the_thread_is_told() -> None:
     def observe(_state: JointReadout) -> None:
         raise ZeroDivisionError("a fault")
 
-    simulation = Simulation(world, controller, observe, crashed=crashed)
+    simulation = Simulation(SimulatedRobot(world, controller), observe, crashed=crashed)
     simulation.start()
     assert ended.wait(5.0)
     simulation.stop()

@@ -16,7 +16,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene, SceneObject, load_scene
 from openarm_sim_bridge.config import BridgeConfig
-from openarm_sim_bridge.control.actuation import TrajectoryConfig, TrajectoryOutcome
+from openarm_sim_bridge.control.arm import TrajectoryConfig, TrajectoryOutcome
 from openarm_sim_bridge.control.controller import RobotController
 from openarm_sim_bridge.control.gripper import GripperConfig, GripperGoal, GripperOutcome
 from openarm_sim_bridge.control.trajectory import Trajectory, TrajectoryResult

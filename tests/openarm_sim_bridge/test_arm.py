@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.errors import Code
-from openarm_sim_bridge.control.actuation import End, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
+from openarm_sim_bridge.control.arm import End, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
 from openarm_sim_bridge.control.tracker import Tracker
 from openarm_sim_bridge.control.trajectory import (
     JointGroup,

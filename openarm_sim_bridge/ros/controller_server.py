@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Base of the action servers of arms and grippers: a goal starts between two ticks and is awaited in the executor."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from concurrent.futures import Future as ThreadFuture
+from typing import Any, Generic, TypeVar
+
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
+
+from openarm_common.ros.node import BaseNode
+from openarm_sim_bridge.control.arm import End
+from openarm_sim_bridge.simulation import Simulation
+
+OutcomeT = TypeVar("OutcomeT")
+
+
+class ControllerServer(ABC, Generic[OutcomeT]):
+    """Serves the action of one controller.
+
+    Args:
+        node: Owner.
+        simulation: Whose thread runs the controller.
+        label: Names arm or gripper in the log.
+        kind: Type of the action.
+        name: Absolute name of the action.
+        cancel: Ends the goal that the controller follows; called between two ticks.
+    """
+
+    def __init__(
+        self,
+        node: BaseNode[Any],
+        simulation: Simulation,
+        label: str,
+        kind: type,
+        name: str,
+        cancel: Callable[[], None],
+    ) -> None:
+        self._node = node
+        self._simulation = simulation
+        self._label = label
+        self._cancel = cancel
+        self._server = ActionServer(
+            node, kind, name, self._execute, goal_callback=self._on_goal, cancel_callback=self._on_cancel
+        )
+
+    def destroy(self) -> None:
+        """Take the action away."""
+        self._server.destroy()
+
+    @abstractmethod
+    async def _execute(self, handle: ServerGoalHandle) -> Any:
+        """Follow a goal and return its result."""
+
+    def _on_goal(self, _request: Any) -> GoalResponse:
+        return GoalResponse.ACCEPT
+
+    def _on_cancel(self, _handle: ServerGoalHandle) -> CancelResponse:
+        self._simulation.call(self._cancel)
+        return CancelResponse.ACCEPT
+
+    async def _follow(
+        self, handle: ServerGoalHandle, start: Callable[[Callable[[OutcomeT], None]], None]
+    ) -> OutcomeT | None:
+        """Start a goal between two ticks and wait for its end.
+
+        Args:
+            handle: Of the goal.
+            start: Starts it; is given the function that takes the outcome.
+
+        Returns:
+            The outcome; None when the simulation shuts down.
+
+        Raises:
+            OpenArmError: What `start` raised.
+        """
+        ended: ThreadFuture[OutcomeT] = ThreadFuture()
+
+        def started(call: ThreadFuture[None]) -> None:
+            if call.cancelled():
+                ended.cancel()
+            elif (error := call.exception()) is not None:
+                ended.set_exception(error)
+
+        self._simulation.call(lambda: start(ended.set_result)).add_done_callback(started)
+        if handle.is_cancel_requested:
+            self._simulation.call(self._cancel)
+        outcome: OutcomeT | None = await self._node.awaitable(ended)
+        return outcome
+
+    def _end(self, handle: ServerGoalHandle, end: End, text: str) -> None:
+        """Set the state in which the goal ends, and log the reason where it did not succeed."""
+        if end is End.SUCCEEDED:
+            handle.succeed()
+        elif end is End.CANCELLED:
+            handle.canceled()
+            self._node.get_logger().info(f"{self._label}: {text}")
+        else:
+            handle.abort()
+            self._node.get_logger().warning(f"{self._label}: {text}")
