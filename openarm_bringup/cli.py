@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line: `openarm COMMAND`.
 
-Commands are functions that return an `Outcome`; here alone it is printed, written as JSON and turned into the exit
+Commands are functions that return an `Outcome`; only here it is printed, written as JSON and turned into the exit
 code. Modules of commands import heavy libraries inside their functions, so that `openarm --help` stays quick.
 """
 
@@ -10,75 +10,52 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Sequence
-from importlib import import_module
+from collections.abc import Sequence
 from pathlib import Path
 
 import cyclopts
 from cyclopts import App, Group, Parameter
 
 from openarm_bringup.outcome import FOR_PEOPLE, Outcome, failure
-from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 
-#: Commands of the package that evaluates; it imports this one, which therefore names it here alone.
+#: Commands of the package that evaluates. It imports this one, which therefore knows it by name only.
 EVALUATION = "openarm_evaluation.commands"
 
-HELP = """Eyes and hands for the OpenArm robot.
+HELP = """Vision-guided grasping for the OpenArm robot.
 
-`openarm demo` shows all of it; `openarm up` starts the node graph, `openarm pick red` asks it for a grasp."""
+`openarm demo` shows all of it; `openarm up` starts the node graph, `openarm pick red` requests a grasp."""
 EPILOGUE = """Every command takes `--json [PATH]`: the outcome as JSON, on stdout or in PATH (a name ending in .json).
 Exit code 0: what was asked happened. 1: it did not; a code and a sentence say why. 2: the call was wrong."""
 
 
+#: Commands by group of the help: a module and its function or App. They are imported when they are needed.
+COMMANDS = {
+    "Run": (f"{EVALUATION}.demo:demo", "up:up", "view:view", "calibrate:calibrate"),
+    "Grasp": ("pick:pick", "pick:order", f"{EVALUATION}.campaign:campaign"),
+    "Inspect": ("processes:ps", "processes:logs", "doctor:doctor", "tf:tf"),
+    "Messages": ("ros2:topic", "ros2:service", "ros2:action", "ros2:node", "ros2:param"),
+    "Record and check": ("record:record", "record:replay", "record:check"),
+    "Models and graphs": ("model:model", "graph:graph", "grasp:grasp", f"{EVALUATION}.detector:detector"),
+    "Develop": ("checks:test", "checks:lint", "checks:completion"),
+}
+
+
 def build_app() -> App:
     """Return the application with all its commands."""
-    from openarm_bringup.commands import (
-        calibrate,
-        checks,
-        completion,
-        doctor,
-        graph,
-        grasp,
-        model,
-        order,
-        param,
-        pick,
-        processes,
-        record,
-        ros2,
-        tf,
-        up,
-        view,
-    )
-
-    demo, campaign, detector = (import_module(f"{EVALUATION}.{name}") for name in ("demo", "campaign", "detector"))
     app = App(
         name="openarm",
         help=HELP,
         help_epilogue=EPILOGUE,
         help_format="markdown",
         version=_version,
-        default_parameter=Parameter(negative_iterable=()),
+        default_parameter=Parameter(negative=(), negative_iterable=()),
     )
-    groups: dict[str, tuple[App | Callable[..., Outcome], ...]] = {
-        "Run": (demo.demo, up.up, view.view, calibrate.app),
-        "Ask for grasps": (pick.pick, order.order, campaign.campaign),
-        "Look inside": (processes.ps, processes.logs, doctor.doctor, tf.app),
-        "Messages": (ros2.topic, ros2.service, ros2.action, ros2.node, param.app),
-        "Record and check": (record.record, record.replay, record.check),
-        "Models and graphs": (model.model, graph.app, grasp.app, detector.app),
-        "Develop": (checks.test, checks.lint, completion.completion_of(app)),
-    }
-    for number, (title, commands) in enumerate(groups.items()):
+    for number, (title, commands) in enumerate(COMMANDS.items()):
         group = Group(title, sort_key=number)
         for command in commands:
-            if isinstance(command, App):
-                command.group = group
-                app.command(command)
-            else:
-                app.command(command, group=group)
-    options = Group("Options", sort_key=len(groups))
+            app.command(command if "." in command else f"openarm_bringup.commands.{command}", group=group)
+    options = Group("Options", sort_key=len(COMMANDS))
     for flag in ("--help", "--version"):
         app[flag].group = options
     return app
@@ -96,6 +73,9 @@ def run(argv: Sequence[str]) -> int:
 
 def _run(tokens: Sequence[str], sink: str | None) -> int:
     app = build_app()
+    if not tokens or tokens[0] in ("--help", "-h"):
+        for name in list(app):
+            _ = app[name]  # imported, so that its summary is listed
     try:
         result = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
     except cyclopts.CycloptsError as error:
@@ -115,7 +95,7 @@ def _run(tokens: Sequence[str], sink: str | None) -> int:
 def take_json(argv: Sequence[str]) -> tuple[list[str], str | None]:
     """Split `--json [PATH]` off; the sink is None (not asked for), "-" (stdout) or a path.
 
-    A value is taken as the path only when it ends in .json or is "-", so that `--json pick red` means what it says.
+    A value is taken as the path only when it ends in .json or is "-": in `--json pick red`, `pick` is the command.
     """
     tokens = list(argv)
     rest = tokens.index("--") if "--" in tokens else len(tokens)
@@ -135,6 +115,8 @@ def _show(outcome: Outcome, sink: str | None) -> None:
         _print(json.dumps(outcome.as_json(), indent=2, default=str))
         return
     if sink is not None:
+        from openarm_bringup.supervision import runs
+
         runs.write_json(Path(sink), outcome.as_json())
     if outcome.text:
         _print(outcome.text)
@@ -160,12 +142,9 @@ def _complain(text: str) -> None:
 
 
 def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
+    from openarm_bringup.versions import versions
 
-    try:
-        return version("openarm-vision")
-    except PackageNotFoundError:
-        return "unknown (run from a checkout that is not installed)"
+    return versions(("openarm-vision",))["openarm-vision"]
 
 
 def main() -> None:
@@ -173,7 +152,7 @@ def main() -> None:
     try:
         code = run(sys.argv[1:])
         sys.stdout.flush()
-    except BrokenPipeError:  # who reads has read enough, as `openarm topic echo ... | head` does
+    except BrokenPipeError:  # as in `openarm topic echo ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     sys.exit(code)

@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import array
 import importlib
 import re
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import yaml
 
 from openarm_bringup.suggest import unknown
@@ -52,12 +50,18 @@ def to_data(value: Any, longest: int | None = None) -> Any:
         return {name: to_data(getattr(value, name), longest) for name in value.get_fields_and_field_types()}
     if isinstance(value, bytes | bytearray):
         value = list(value)
-    if isinstance(value, np.ndarray | array.array | list | tuple):
-        items: Sequence[Any] = value.tolist() if hasattr(value, "tolist") else value  # type: ignore[union-attr]
-        if longest is not None and len(items) > longest:
-            return f"<{len(items)} values>"
-        return [to_data(item, longest) for item in items]
-    return value.item() if isinstance(value, np.generic) else value
+    value = value.tolist() if hasattr(value, "tolist") else value  # arrays, and scalars of numpy
+    if not isinstance(value, list | tuple):
+        return value
+    items: Sequence[Any] = value
+    if longest is not None and len(items) > longest:
+        return f"<{len(items)} values>"
+    return [to_data(item, longest) for item in items]
+
+
+def to_yaml(data: Any) -> str:
+    """Return plain data as YAML, fields in their order."""
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None)
 
 
 def fill(message: Any, data: Any, where: str = "") -> Any:

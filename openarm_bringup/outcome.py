@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every command gives back: one object for people, scripts and the exit code."""
+"""The result of a command: one object for people, scripts and the exit code."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import sys
 from collections.abc import Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from openarm_common.errors import Code, OpenArmError
 
-#: Whether stdout is for people; not where it is for the one JSON document of `--json`.
+if TYPE_CHECKING:
+    from rich.console import Console
+
+#: Whether stdout is for people, not for the one JSON document of `--json`.
 FOR_PEOPLE: ContextVar[bool] = ContextVar("FOR_PEOPLE", default=True)
 
 
@@ -23,7 +26,7 @@ class Outcome:
         success: Whether what was asked happened.
         message: One sentence for people.
         code: Why it did not; OK when it did.
-        data: What `--json` writes beside success, code and message.
+        data: What `--json` writes in addition to success, code and message.
         text: Longer text for people (a table, a drawing), printed before the message.
     """
 
@@ -48,6 +51,13 @@ def show(text: str) -> None:
     if FOR_PEOPLE.get():
         sys.stdout.write(text)
         sys.stdout.flush()
+
+
+def console() -> Console:
+    """Return a console on stderr, for what a command shows while it runs."""
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
 
 
 def failure(error: OpenArmError, **data: Any) -> Outcome:

@@ -43,7 +43,7 @@ def nested_types(message: type[Any]) -> list[str]:
     found: list[str] = []
     for kind in message.get_fields_and_field_types().values():
         match = SEQUENCE.match(kind)
-        base = (match["seq"] or match["array"]) if match else kind
+        base = (match["of"] or match["array"]) if match else kind
         if "/" in base:
             package, _, short = base.partition("/")
             found.append(f"{package}/msg/{short.removeprefix('msg/')}")

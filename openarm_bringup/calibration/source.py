@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the offline commands of `openarm calibrate` work on: a session file, or a bag of which samples are taken."""
+"""Samples for the offline commands of `openarm calibrate`: of a session file, or of a bag."""
 
 from __future__ import annotations
 
 import datetime
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,17 +23,21 @@ if TYPE_CHECKING:
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Recording:
-    """What a bag does not say.
+class Source:
+    """Which samples of a file are solved, what a bag does not say, and where calibrations are stored.
 
     Args:
+        exclude: Names of samples to leave out.
+        store: Folder of stored calibrations.
         camera: Of a bag: whose images are used; needed when it has several.
         board: Of a bag: keys of the board as YAML, such as "{kind: charuco}"; 4x11 circles when not given.
-        carrier: Of a bag: link that holds the board when the camera stands; that of the right hand when not given.
+        carrier: Of a bag: link that holds the board when the camera is fixed; that of the right hand when not given.
         mount_seed: Of a bag: of simulated mounts; what it says of itself when not given.
         session: Of a bag: file (.npz) to write the samples to.
     """
 
+    exclude: tuple[str, ...] = ()
+    store: Path | None = None
     camera: str = ""
     board: str = ""
     carrier: str = ""
@@ -41,13 +45,14 @@ class Recording:
     session: Path | None = None
 
 
-#: No option of a bag was given.
-NOT_GIVEN = Recording()
+#: No option is given.
+ALL_SAMPLES = Source()
+_OF_BAGS = ("camera", "board", "carrier", "mount_seed", "session")
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Samples, what they give, and what became of the images of a bag (empty for a session file)."""
+    """Samples, the result, and what became of the images of a bag (empty for a session file)."""
 
     samples: SampleSet
     result: Result
@@ -56,16 +61,21 @@ class Solved:
 
 
 def with_solved(
-    source: Path,
-    recording: Recording,
-    exclude: tuple[str, ...],
-    store: Path | None,
+    path: Path,
+    source: Source,
     then: Callable[[Solved], Outcome],
     *,
     algorithm: str = "REFINED",
     free_intrinsics: bool = False,
 ) -> Outcome:
-    """Open a session file or a bag, solve it, and go on; what a bag lacks for that is told with its stills.
+    """Open a session file or a bag, solve it, and go on; what a bag lacks for that is reported with its stills.
+
+    Args:
+        path: Session file (.npz), or a bag.
+        source: Options of the command line.
+        then: Makes the outcome of what was solved.
+        algorithm: REFINED, or a closed form.
+        free_intrinsics: Estimate the intrinsics, too.
 
     Raises:
         OpenArmError: What is wrong with the file or the options; DEGENERATE, when a session determines nothing.
@@ -79,12 +89,12 @@ def with_solved(
     config = SolveConfig(extras=("intrinsics",)) if free_intrinsics else None
     stills: list[dict[str, Any]] = []
     text = ""
-    if source.is_dir() or source.suffix == ".mcap":
-        samples, digest, stills, text = _from_bag(source, recording)
+    if path.is_dir() or path.suffix == ".mcap":
+        samples, digest, stills, text = _from_bag(path, source)
     else:
-        samples, digest = _from_session(source, recording)
-    without_named(samples, exclude)
-    stored = stored_of(samples, store)
+        samples, digest = _from_session(path, source)
+    without_named(samples, source.exclude)
+    stored = stored_of(samples, source.store)
     try:
         result = calibrate(samples, algorithm=name, config=config, session=digest, created=now(), stored=stored)
     except OpenArmError as error:
@@ -94,11 +104,11 @@ def with_solved(
     return then(Solved(samples, result, stills, text))
 
 
-def _from_session(path: Path, recording: Recording) -> tuple[SampleSet, str]:
+def _from_session(path: Path, source: Source) -> tuple[SampleSet, str]:
     from openarm_calibration.sampling.session_file import load_session
     from openarm_common.robot.description import RobotDescription
 
-    given = [f"--{f.name.replace('_', '-')}" for f in fields(recording) if getattr(recording, f.name) != f.default]
+    given = [f"--{name.replace('_', '-')}" for name in _OF_BAGS if getattr(source, name) != getattr(ALL_SAMPLES, name)]
     if given:
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
@@ -108,17 +118,17 @@ def _from_session(path: Path, recording: Recording) -> tuple[SampleSet, str]:
     return load_session(path, RobotDescription.load())
 
 
-def _from_bag(path: Path, recording: Recording) -> tuple[SampleSet, str, list[dict[str, Any]], str]:
+def _from_bag(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str, Any]], str]:
     from openarm_bringup.bags.bag import open_bag
     from openarm_bringup.calibration.ros.samples import BagOptions, samples_of
     from openarm_calibration.sampling import stills
 
-    session = recording.session
+    session = source.session
     if session is not None and session.suffix != ".npz":
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--session {session}: expected a name that ends in .npz")
-    if recording.mount_seed is not None and recording.mount_seed < 0:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"--mount-seed {recording.mount_seed}: expected 0 or more")
-    options = BagOptions(recording.camera, _board(recording.board), recording.carrier, recording.mount_seed)
+    if source.mount_seed is not None and source.mount_seed < 0:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--mount-seed {source.mount_seed}: expected 0 or more")
+    options = BagOptions(source.camera, _board(source.board), source.carrier, source.mount_seed)
     with open_bag(path) as bag:
         samples, found = samples_of(bag, options)
     digest = samples.save(session) if session is not None else samples.digest()
@@ -135,7 +145,7 @@ def _board(text: str) -> Board:
 
 
 def store_in(folder: Path | None) -> CalibrationStore:
-    """The store of a folder; without one, the default.
+    """Return the store of a folder; without one, the default.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when it is a file.
@@ -148,7 +158,7 @@ def store_in(folder: Path | None) -> CalibrationStore:
 
 
 def stored_of(samples: SampleSet, store: Path | None) -> StoredCalibration | None:
-    """What is stored of the camera; None also for one of other mounts, whose distance says nothing."""
+    """Return what is stored of the camera; None also for other mounts, whose distance says nothing."""
     found = store_in(store).find(samples.head.camera)
     if found is None or found.calibration.mount_seed != samples.head.mount_seed:
         return None
@@ -156,5 +166,5 @@ def stored_of(samples: SampleSet, store: Path | None) -> StoredCalibration | Non
 
 
 def now() -> str:
-    """Date and time for the record."""
+    """Return date and time for the record."""
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm calibrate`: boards, and what is done with a session file; only `auto` and `sample` need a robot."""
+"""`openarm calibrate`: boards, and work on session files; only `auto` and `sample` need a robot."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import App
 
-from openarm_bringup.calibration.source import NOT_GIVEN, Recording, Solved, now, store_in, stored_of, with_solved
+from openarm_bringup.calibration.source import ALL_SAMPLES, Solved, Source, now, store_in, stored_of, with_solved
 from openarm_bringup.commands import calibrate_live
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
@@ -16,13 +16,13 @@ from openarm_common.errors import Code, OpenArmError
 if TYPE_CHECKING:
     from openarm_calibration.store.store import CalibrationStore, StoredCalibration
 
-app = App(name="calibrate", help="Where are the cameras? Boards, solving, checking and storing hand-eye calibrations.")
+calibrate = App(name="calibrate", help="Hand-eye calibration: boards, sampling, solving, checking and storing.")
 
-app.command(calibrate_live.auto)
-app.command(calibrate_live.sample)
+calibrate.command(calibrate_live.auto)
+calibrate.command(calibrate_live.sample)
 
 
-@app.command
+@calibrate.command
 def board(
     out: Path,
     *,
@@ -59,85 +59,54 @@ def board(
     return Outcome(True, message, data={"written": str(out), "board": made.model_dump(), "size": list(made.size)})
 
 
-@app.command
+@calibrate.command
 def solve(
     samples: Path,
     *,
     algorithm: str = "REFINED",
-    exclude: tuple[str, ...] = (),
-    free_intrinsics: Annotated[bool, Parameter(negative=())] = False,
-    save: Annotated[bool, Parameter(negative=())] = False,
-    store: Path | None = None,
-    recording: Recording = NOT_GIVEN,
+    free_intrinsics: bool = False,
+    save: bool = False,
+    source: Source = ALL_SAMPLES,
 ) -> Outcome:
     """Solve a session file or a bag and say how good the result is.
 
     Args:
         samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
         algorithm: REFINED, or a closed form: TSAI PARK HORAUD ANDREFF DANIILIDIS SHAH LI.
-        exclude: Names of samples to leave out.
-        free_intrinsics: Find focal lengths and principal point as well, where those of camera_info are in doubt.
+        free_intrinsics: Estimate focal lengths and principal point as well, where those of camera_info are in doubt.
         save: Store the result, unless it fails.
-        store: Folder of stored calibrations.
-        recording: What a bag does not say.
     """
-    place = store_in(store) if save else None
+    place = store_in(source.store) if save else None
     return with_solved(
-        samples,
-        recording,
-        exclude,
-        store,
-        lambda done: _outcome(done, place),
-        algorithm=algorithm,
-        free_intrinsics=free_intrinsics,
+        samples, source, lambda done: _outcome(done, place), algorithm=algorithm, free_intrinsics=free_intrinsics
     )
 
 
-@app.command
-def check(
-    samples: Path, *, exclude: tuple[str, ...] = (), store: Path | None = None, recording: Recording = NOT_GIVEN
-) -> Outcome:
-    """Judge a session file or a bag and its distance from what is stored; exit code 1 when it fails the limits.
+@calibrate.command
+def check(samples: Path, *, source: Source = ALL_SAMPLES) -> Outcome:
+    """Validate a session file or a bag, and its distance from what is stored; exit code 1 when it fails the limits.
 
     Args:
         samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
-        exclude: Names of samples to leave out.
-        store: Folder of stored calibrations.
-        recording: What a bag does not say.
     """
-    return with_solved(samples, recording, exclude, store, lambda done: _outcome(done, None))
+    return with_solved(samples, source, lambda done: _outcome(done, None))
 
 
-@app.command
-def save(
-    samples: Path,
-    *,
-    algorithm: str = "REFINED",
-    exclude: tuple[str, ...] = (),
-    store: Path | None = None,
-    force: Annotated[bool, Parameter(negative=())] = False,
-    recording: Recording = NOT_GIVEN,
-) -> Outcome:
+@calibrate.command
+def save(samples: Path, *, algorithm: str = "REFINED", force: bool = False, source: Source = ALL_SAMPLES) -> Outcome:
     """Solve a session file or a bag and store the result; a running graph takes it over at once.
 
     Args:
         samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
         algorithm: As for `solve`.
-        exclude: Names of samples to leave out.
-        store: Folder of stored calibrations.
-        recording: What a bag does not say.
         force: Store also what fails the limits.
     """
-    place = store_in(store)
-    return with_solved(
-        samples, recording, exclude, store, lambda done: _outcome(done, place, force=force), algorithm=algorithm
-    )
+    place = store_in(source.store)
+    return with_solved(samples, source, lambda done: _outcome(done, place, force=force), algorithm=algorithm)
 
 
-@app.command
-def together(
-    *sessions: Path, save: Annotated[bool, Parameter(negative=())] = False, store: Path | None = None
-) -> Outcome:
+@calibrate.command
+def together(*sessions: Path, save: bool = False, store: Path | None = None) -> Outcome:
     """Solve sessions of several cameras at once: they share the robot's errors, and the board where it is the same.
 
     Args:
@@ -171,23 +140,13 @@ def together(
     return Outcome(True, grades, data=data, text=text)
 
 
-@app.command
-def report(
-    samples: Path,
-    out: Path,
-    *,
-    exclude: tuple[str, ...] = (),
-    store: Path | None = None,
-    recording: Recording = NOT_GIVEN,
-) -> Outcome:
+@calibrate.command
+def report(samples: Path, out: Path, *, source: Source = ALL_SAMPLES) -> Outcome:
     """Write a page with pictures on a session file or a bag: coverage, residuals, poses, samples, methods.
 
     Args:
         samples: Session file (.npz), or a bag: folder of rosbag2, or MCAP file.
         out: HTML file to write.
-        exclude: Names of samples to leave out.
-        store: Folder of stored calibrations.
-        recording: What a bag does not say.
     """
     from openarm_calibration.report.report import page
 
@@ -200,13 +159,13 @@ def report(
             out.write_text(page(done.samples, done.result), encoding="utf-8")
         except OSError as error:
             raise OpenArmError(Code.ENVIRONMENT, f"can't write {out}: {error.strerror}") from error
-        said = f"{done.result.verdict.grade}; wrote {out}"
-        return Outcome(True, said, data={"written": str(out), **_json(done)}, text=done.text)
+        message = f"{done.result.verdict.grade}; wrote {out}"
+        return Outcome(True, message, data={"written": str(out), **_json(done)}, text=done.text)
 
-    return with_solved(samples, recording, exclude, store, write)
+    return with_solved(samples, source, write)
 
 
-@app.command(name="list")
+@calibrate.command(name="list")
 def list_(*, store: Path | None = None) -> Outcome:
     """Name the stored calibrations, with their history.
 
@@ -230,7 +189,7 @@ def list_(*, store: Path | None = None) -> Outcome:
     return Outcome(True, f"{len(lines)} stored in {opened.folder}", data=data, text="\n".join(lines))
 
 
-@app.command
+@calibrate.command
 def rollback(camera: str, *, store: Path | None = None) -> Outcome:
     """Go back to the calibration of a camera before the present one.
 

@@ -6,12 +6,11 @@ from __future__ import annotations
 import math
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING, Any, Literal
 
 from openarm_bringup.calibration.source import store_in
-from openarm_bringup.outcome import Outcome
+from openarm_bringup.commands.connect import Domain, Sets, join_graph, requires_node
+from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
@@ -20,11 +19,8 @@ if TYPE_CHECKING:
     from openarm_bringup.supervision.supervisor import Event
     from openarm_calibration.ros.client import AutoResult
 
-#: Of ROS_DOMAIN_ID; there are no ports above.
-LAST_DOMAIN = 232
 #: Of the node's parameter auto.poses.
 MOST_POSES = 100
-Flag = Annotated[bool, Parameter(negative=())]
 
 
 def auto(
@@ -32,28 +28,27 @@ def auto(
     camera: str = "both",
     mount_seed: str | None = None,
     poses: int = 0,
-    save: Flag = False,
+    save: bool = False,
     store: Path | None = None,
-    delay: Flag = False,
-    running: Flag = False,
-    domain: int | None = None,
-    set_: Annotated[tuple[str, ...], Parameter(name="--set")] = (),
+    delay: bool = False,
+    running: bool = False,
+    domain: Domain = None,
+    set_: Sets = (),
 ) -> Outcome:
-    """Calibrate by itself: the arm moves from one telling pose to the next, takes samples, and solves.
+    """Calibrate automatically: the arm moves from one informative pose to the next, takes samples, and solves.
 
     Starts a simulated robot with a board of its own, and stops it afterwards. Leaves a folder below runs/ with the
     samples and a page with pictures for each camera. Ctrl-C stops the arm.
 
     Args:
-        camera: Name of a camera (overhead, wrist), or both, one after the other.
+        camera: Name of a camera (overhead, wrist), or "both", one after the other.
         mount_seed: Of the simulated mounts, or "none"; that of the graph `calibrate` when not given.
         poses: Samples a camera at most; 0: the node's parameter auto.poses.
         save: Store the result, unless it fails the limits.
         store: Folder of stored calibrations.
         delay: Also measure how old images are at their stamps.
-        running: Use the graph that runs already, with the board in place, instead of a simulated one.
+        running: Use the graph that runs, with the board in place, instead of a simulated one.
         domain: ROS_DOMAIN_ID; a free one, or that of the running graph, when not given.
-        set_: A parameter, as node.param=value.
     """
     from openarm_bringup.calibration.run import (
         CalibrationListeners,
@@ -88,24 +83,22 @@ def auto(
     return _outcome(run.results, run.error, run.run_dir)
 
 
-def sample(*, remove: str | None = None, session: str = "", advice: Flag = False, domain: int | None = None) -> Outcome:
-    """Take a sample where the arm stands now, in the graph that runs, and say what to do next.
+def sample(*, remove: str | None = None, session: str = "", advice: bool = False, domain: Domain = None) -> Outcome:
+    """Take a sample at the present posture, in the running graph, and advise what to do next.
 
     Args:
         remove: Instead, remove the sample of that name ("last" is the last one).
         session: Write all samples to this file (.npz) afterwards.
-        advice: Take none; list what there is and what to do next.
-        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
+        advice: Take none; list the samples and advise what to do next.
     """
     if remove is not None and advice:
         raise OpenArmError(Code.INVALID_ARGUMENT, "--remove and --advice exclude each other")
     if session and not session.endswith(".npz"):
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--session {session}: expected a name that ends in .npz")
-    _meet(domain)
-    from openarm_bringup.commands.pick import needing
+    join_graph(domain)
     from openarm_calibration.ros.client import CalibrationClient
 
-    with needing("calibration", "calibrate"), CalibrationClient() as client:
+    with requires_node("calibration", "calibrate"), CalibrationClient() as client:
         if remove is not None:
             done = client.remove("" if remove == "last" else remove)
         elif advice:
@@ -124,37 +117,26 @@ def _running(camera: str, poses: int, save: bool, delay: bool, domain: int | Non
         raise OpenArmError(
             Code.INVALID_ARGUMENT, "--running needs --camera NAME: the board has to be moved between the cameras"
         )
-    _meet(domain)
-    from openarm_bringup.commands.pick import needing
+    join_graph(domain)
     from openarm_calibration.ros.client import CalibrationClient
 
     show.camera(camera)
     stop = threading.Event()
-    with needing("calibration", "calibrate"), CalibrationClient() as client:
+    with requires_node("calibration", "calibrate"), CalibrationClient() as client:
         try:
             result = client.auto(
                 camera, poses=poses, measure_delay=delay, save=save, on_feedback=show.feedback, stop=stop
             )
         except KeyboardInterrupt:
-            return Outcome(False, "cancelled by Ctrl-C; the arm stands where it is", Code.CANCELLED)
+            return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED)
     return _outcome({camera: result}, None, None)
-
-
-def _meet(domain: int | None) -> None:
-    from openarm_bringup.commands.pick import meet_graph
-
-    if domain is not None and not 0 <= domain <= LAST_DOMAIN:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"--domain {domain}: expected 0 to {LAST_DOMAIN}")
-    meet_graph(domain)
 
 
 class _Show:
     """Prints what happens, on stderr."""
 
     def __init__(self) -> None:
-        from rich.console import Console
-
-        self._console: Console = Console(stderr=True, highlight=False)
+        self._console = console()
         self._last = ""
 
     def event(self, event: Event) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm test` and `openarm lint`: the developer's loop."""
+"""`openarm test`, `lint` and `completion`: for developers, and for the shell."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -50,7 +50,7 @@ def test(*args: Rest) -> Outcome:
 
 
 def lint() -> Outcome:
-    """Check style and types: ruff, and basedpyright on the cores (installed at the first call)."""
+    """Check style and types: ruff and basedpyright (installed at the first call)."""
     root = _checkout()
     python = Path(sys.executable)
     if importlib.util.find_spec("basedpyright") is None:
@@ -74,6 +74,22 @@ def lint() -> Outcome:
     return Outcome(True, "style and types are sound", data={"checks": results})
 
 
+def completion(shell: Literal["bash", "zsh", "fish"] = "bash", *, install: bool = False) -> Outcome:
+    """Print what makes a shell complete this command line, as in: eval "$(openarm completion bash)".
+
+    Args:
+        shell: Which shell.
+        install: Write it where the shell finds it, for every new shell, instead of printing it.
+    """
+    from openarm_bringup.cli import build_app
+
+    if install:
+        path = build_app().install_completion(shell=shell)
+        return Outcome(True, f"written to {path}; new shells complete `openarm`", data={"path": str(path)})
+    script = build_app().generate_completion(shell=shell)
+    return Outcome(True, data={"shell": shell, "script": script}, text=script)
+
+
 def _in_order(tests: Path) -> list[str]:
     """Return what is in tests/, files and quick folders first."""
     entries = [path for path in tests.iterdir() if path.is_dir() or path.name.startswith("test_")]
@@ -86,7 +102,7 @@ def _in_order(tests: Path) -> list[str]:
 
 
 def _shared_out() -> list[str]:
-    """Options with which tests run in several processes, where there are processors for them."""
+    """Return options that run tests in several processes, where there are processors for them."""
     if len(os.sched_getaffinity(0)) < WORKERS:
         return []
     return ["-n", str(WORKERS), "--dist", "loadfile", "--no-loadscope-reorder"]
@@ -96,6 +112,6 @@ def _checkout() -> Path:
     root = Path(__file__).resolve().parents[2]
     if not (root / "tests").is_dir():
         raise OpenArmError(
-            Code.ENVIRONMENT, f"there are no tests beside {root / 'openarm_bringup'}; run this in a checkout"
+            Code.ENVIRONMENT, f"there is no tests/ next to {root / 'openarm_bringup'}; run this in a checkout"
         )
     return root

@@ -1,39 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm graph`: look at a graph before anything starts."""
+"""`openarm graph`: check and draw graphs, without starting anything."""
 
 from __future__ import annotations
 
-import importlib.util
 from typing import Literal
 
 from cyclopts import App
 
 from openarm_bringup.outcome import Outcome
-from openarm_bringup.supervision.draw import edges, mermaid, text
-from openarm_bringup.supervision.environment import domain_id
-from openarm_bringup.supervision.graph import Graph, graph_names, load_graph
-from openarm_bringup.supervision.shm import shm_free_mib, shm_need_mib
 from openarm_common.errors import Code
 
-app = App(name="graph", help="Check and draw graphs; `openarm graph list` names them.")
+graph = App(name="graph", help="Check and draw graphs; `openarm graph list` names them.")
 
 
-@app.command(name="list")
+@graph.command(name="list")
 def list_() -> Outcome:
     """Name the graphs that come with the suite."""
+    from openarm_bringup.supervision.graph import graph_names, load_graph
+
     graphs = {name: load_graph(name).description for name in graph_names()}
     return Outcome(
         True, data={"graphs": graphs}, text="\n".join(f"{name:<14}{about}" for name, about in graphs.items())
     )
 
 
-@app.command
+@graph.command
 def check(graph: str = "sim") -> Outcome:
     """Check a graph file: keys, names, needs, parameter files, modules, shared memory.
 
     Args:
         graph: Name of a graph, or a file.
     """
+    from openarm_bringup.supervision.environment import domain_id
+    from openarm_bringup.supervision.graph import load_graph
+    from openarm_bringup.supervision.shm import shm_free_mib, shm_need_mib
+
     loaded = load_graph(graph)
     missing = {name: spec.module for name, spec in loaded.nodes.items() if spec.module and not _exists(spec.module)}
     need, free = shm_need_mib(loaded, extra_participants=4), shm_free_mib()
@@ -51,12 +52,12 @@ def check(graph: str = "sim") -> Outcome:
         return Outcome(False, message, Code.CONFIG_INVALID, data)
     return Outcome(
         True,
-        f"{loaded.name}: {len(loaded.nodes)} nodes, {need:.0f} MiB of /dev/shm ({free:.0f} free): sound",
+        f"{loaded.name}: {len(loaded.nodes)} nodes, {need:.0f} MiB of /dev/shm ({free:.0f} free): valid",
         data=data,
     )
 
 
-@app.command
+@graph.command
 def draw(graph: str = "sim", *, form: Literal["text", "mermaid"] = "text") -> Outcome:
     """Draw a graph: nodes in the order of their start, or a Mermaid flowchart for a README.
 
@@ -64,12 +65,17 @@ def draw(graph: str = "sim", *, form: Literal["text", "mermaid"] = "text") -> Ou
         graph: Name of a graph, or a file.
         form: text or mermaid.
     """
-    loaded: Graph = load_graph(graph)
+    from openarm_bringup.supervision.draw import edges, mermaid, text
+    from openarm_bringup.supervision.graph import load_graph
+
+    loaded = load_graph(graph)
     drawing = mermaid(loaded) if form == "mermaid" else text(loaded)
     return Outcome(True, data={"graph": loaded.name, "drawing": drawing, "edges": edges(loaded)}, text=drawing)
 
 
 def _exists(module: str) -> bool:
+    import importlib.util
+
     try:
         return importlib.util.find_spec(module) is not None
     except ModuleNotFoundError:  # the parent package

@@ -10,10 +10,10 @@ from cyclopts import App
 
 from openarm_bringup.outcome import Outcome
 
-app = App(name="grasp", help="The grasp's state machine.")
+grasp = App(name="grasp", help="The grasp's state machine.")
 
 
-@app.command
+@grasp.command
 def graph(transitions: Path | None = None, *, form: Literal["text", "mermaid"] = "text") -> Outcome:
     """Check and draw the states of a grasp and which follows which: a table, or a Mermaid diagram.
 

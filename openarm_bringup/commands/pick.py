@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm pick`: ask the running graph for a grasp."""
+"""`openarm pick` and `order`: ask the running graph for grasps."""
 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from cyclopts import Parameter
-
-from openarm_bringup.outcome import Outcome
+from openarm_bringup.commands.connect import Domain, join_graph, requires_node
+from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
@@ -23,7 +21,6 @@ if TYPE_CHECKING:
 
 
 Arm = Literal["auto", "left", "right"]
-Flag = Annotated[bool, Parameter(negative=())]
 T = TypeVar("T")
 
 
@@ -37,27 +34,26 @@ def pick(
     yaw: list[float] | None = None,
     phase: Literal["all", "pick", "place"] = "all",
     time_limit: float = 0.0,
-    dry_run: Flag = False,
-    domain: int | None = None,
+    dry_run: bool = False,
+    domain: Domain = None,
     timeout: float = 300.0,
 ) -> Outcome:
-    """Pick an object and place it, or two at once; the states are shown while it runs, Ctrl-C cancels it.
+    """Pick an object and place it, or two simultaneously; the states are shown while it runs, Ctrl-C cancels it.
 
-    `openarm pick red blue` picks both with both arms at the same time; one after the other where the arms would be in
-    each other's way. Where something is said of two objects, it is said of each: `--arm left --arm right`.
+    `openarm pick red blue` picks two objects with both arms in parallel, or one after the other where the arms would
+    come too near to each other. Options of two objects are given once for each: `--arm left --arm right`.
 
     Args:
-        label: What to pick: a label such as red, or words such as "red cube left of the can"; without one, what is seen
-            best.
-        second: Another object, at the same time.
+        label: What to pick: a label such as red, or words such as "red cube left of the can"; without one, the object
+            that is detected best.
+        second: Another object, picked in parallel.
         arm: Which arm: auto when not given.
-        at: x y near which the object stands, base frame, m: which of several alike.
+        at: x y near the object, base frame, m: selects one of several alike.
         place: Where to: x y z of the footprint centre, base frame, m (z is not read: the table); chosen when not given.
-        yaw: Of the object where it is put down, degrees about the vertical; as the hand likes when not given.
+        yaw: Of the object where it is put down, degrees about the vertical; unconstrained when not given.
         phase: pick ends with the object in the hand, place puts down what the hand holds; all does both.
         time_limit: Of the robot, s; then it holds, and the hand keeps what it holds. 0 is none.
         dry_run: Plan and report, do not move.
-        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
         timeout: Longest wait, s.
     """
     labels = (label, second) if second else (label,)
@@ -65,8 +61,8 @@ def pick(
     places, yaws = _each("place", place, labels), _each("yaw", yaw, labels)
     if second and phase != "all":
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--phase {phase} is of one object; two are picked and placed")
-    meet_graph(domain)
-    labels, spots = _meant(labels, spots)
+    join_graph(domain)
+    labels, spots = _resolve(labels, spots)
     from openarm_grasp.ros.answers import Wanted
     from openarm_grasp.ros.client import GraspClient
 
@@ -75,7 +71,7 @@ def pick(
         for name, which, where, turn, spot in zip(labels, arms, places, yaws, spots, strict=True)
     ]
     show = _Steps(labels)
-    with needing("grasp", "sim"), GraspClient() as client:
+    with requires_node("grasp", "sim"), GraspClient() as client:
         try:
             if second:
                 first, other = wanted
@@ -99,31 +95,31 @@ def pick(
         except KeyboardInterrupt:
             asked = {"labels": labels} if second else {"label": label}
             return Outcome(False, "cancelled by Ctrl-C; the robot holds where it is", Code.CANCELLED, asked)
-    if not dry_run:
-        return Outcome(result.success, result.message, result.code, {**_told(result), "dry_run": False})
-    data = {**_told(result), "dry_run": True, "options": [_fared(option) for option in result.options]}
-    return Outcome(result.success, result.message, result.code, data, _weighed(result.options))
+    data, options = {**_result_row(result), "dry_run": dry_run}, result.options if dry_run else ()
+    if dry_run:
+        data["options"] = [_option_row(option) for option in options]
+    return Outcome(result.success, result.message, result.code, data, _options_table(options))
 
 
-def _meant(
+def _resolve(
     labels: Sequence[str], spots: Sequence[tuple[float, float] | None]
 ) -> tuple[Sequence[str], Sequence[tuple[float, float] | None]]:
-    """Labels and places of what is asked for; who asks in several words means one object of those in view."""
+    """Return labels and positions; a request of several words is resolved to one of the detected objects."""
     worded = [i for i, label in enumerate(labels) if " " in label.strip()]
     if not worded:
         return labels, spots
-    from openarm_bringup.ros import things_client
+    from openarm_bringup.ros import object_client
 
     names, places = list(labels), list(spots)
-    for i, thing in zip(worded, things_client.find([labels[i] for i in worded]), strict=True):
+    for i, item in zip(worded, object_client.find([labels[i] for i in worded]), strict=True):
         if places[i] is not None:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"{labels[i]!r} says where it stands; leave --at out")
-        names[i], places[i] = thing.label, (float(thing.position[0]), float(thing.position[1]))
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{labels[i]!r} says where it is; leave --at out")
+        names[i], places[i] = item.label, (float(item.position[0]), float(item.position[1]))
     return names, places
 
 
 def _each(name: str, given: list[T] | None, labels: Sequence[str]) -> Sequence[T | None]:
-    """What an option says of each object; None where it says nothing."""
+    """Return the value of an option for each object; None where it is not given."""
     if given is None:
         return [None] * len(labels)
     if len(given) != len(labels):
@@ -136,31 +132,29 @@ def _each(name: str, given: list[T] | None, labels: Sequence[str]) -> Sequence[T
 
 
 class _Steps:
-    """Shows each state as it is entered, at robot time since the first."""
+    """Prints each state as it is entered, at robot time since the first."""
 
     def __init__(self, labels: Sequence[str]) -> None:
-        from rich.console import Console
-
-        self._console = Console(stderr=True, highlight=False)
+        self._console = console()
         self._width = max(map(len, labels)) if len(labels) > 1 else 0
         self._first_s: float | None = None
 
     def __call__(self, status: GraspStatus) -> None:
         stamp = status.header.stamp.sec + status.header.stamp.nanosec * 1e-9
         self._first_s = stamp if self._first_s is None else self._first_s
-        who = f"{status.label:<{self._width}}  " if self._width else ""
-        line = f"{stamp - self._first_s:7.2f} s  {who}[cyan]{status.state:<18}[/cyan]"
+        label = f"{status.label:<{self._width}}  " if self._width else ""
+        line = f"{stamp - self._first_s:7.2f} s  {label}[cyan]{status.state:<18}[/cyan]"
         self._console.print(line, end=" ")
         self._console.print(status.reason, markup=False)
 
 
-def _fared(option: Option) -> dict[str, Any]:
+def _option_row(option: Option) -> dict[str, Any]:
     margin = option.limit_margin
     return {**asdict(option), "code": str(option.code), "limit_margin": None if math.isnan(margin) else margin}
 
 
-def _weighed(options: Sequence[Option]) -> str:
-    """Every way to grasp that was weighed: what its score is made of, and why it was not chosen."""
+def _options_table(options: Sequence[Option]) -> str:
+    """Return a table of the candidates that were rated: the terms of each score, and why it was not chosen."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -169,7 +163,7 @@ def _weighed(options: Sequence[Option]) -> str:
         return ""
     parts = list(dict.fromkeys(name for option in options for name in option.parts))
     table = Table(box=None, pad_edge=False)
-    table.add_column("way to grasp", no_wrap=True)
+    table.add_column("candidate", no_wrap=True)
     table.add_column("arm", no_wrap=True)
     for name in ("score", *parts, "margin"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -180,84 +174,63 @@ def _weighed(options: Sequence[Option]) -> str:
         score = f"{option.score:+.2f}" if option.parts else ""
         code = f"{option.code}: " if option.code not in ("", Code.OK) else ""
         table.add_row(option.id, option.arm, score, *values, margin, escape(f"{code}{option.message}"))
-    console = Console(width=160, color_system=None)
-    with console.capture() as shown:
-        console.print(table)
+    page = Console(width=160, color_system=None)
+    with page.capture() as shown:
+        page.print(table)
     lines = (line.rstrip() for line in shown.get().splitlines())
-    return "\n".join(lines) + "\n(margin: to the nearest joint limit, on the way down and up again)\n"
+    return "\n".join(lines) + "\n(margin: to the nearest joint limit, on the approach and the retreat)\n"
 
 
-def _told(result: GraspResult) -> dict[str, Any]:
-    return {
-        "outcome": result.outcome,
-        "label": result.label,
-        "arm": result.arm,
-        "route": result.route,
-        "attempts": result.attempts,
-        "place_position": list(result.place_position),
-        "duration": result.duration,
-    }
+def _result_row(result: GraspResult) -> dict[str, Any]:
+    names = ("outcome", "label", "arm", "route", "attempts", "duration")
+    row = {name: getattr(result, name) for name in names}
+    return {**row, "place_position": list(result.place_position)}
 
 
 def _of_two(result: PairResult, *, dry_run: bool) -> Outcome:
     answers = [
-        {"success": one.success, "code": str(one.code), "message": one.message, **_told(one)} for one in result.answers
+        {"success": one.success, "code": str(one.code), "message": one.message, **_result_row(one)}
+        for one in result.answers
     ]
-    data = {
-        "outcome": result.outcome,
-        "at_once": result.at_once,
-        "answers": answers,
-        "duration": result.duration,
-        "dry_run": dry_run,
-    }
+    data = {name: getattr(result, name) for name in ("outcome", "at_once", "duration")}
+    data |= {"answers": answers, "dry_run": dry_run}
     return Outcome(result.success, result.message, result.code, data)
 
 
-def meet_graph(domain: int | None) -> None:
-    """Set this process up to meet the graph: of that domain, or the only one that runs here."""
-    from openarm_bringup.supervision import runs
-    from openarm_bringup.supervision.environment import ACROSS_MACHINES, PROFILE, network_profile
+def order(
+    *labels: str, bins: Path | None = None, each: int = 1, domain: Domain = None, timeout: float = 300.0
+) -> Outcome:
+    """Pick several objects of the running graph and place them, until nothing is left or nothing can be done.
 
-    try:
-        record = runs.the_running(domain)
-    except OpenArmError as error:
-        if error.code != Code.NOT_READY:
-            raise
-        # It may run elsewhere, or have been started by other means: the environment says where.
-        if domain is not None:
-            os.environ["ROS_DOMAIN_ID"] = str(domain)
-        os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        return
-    os.environ["ROS_DOMAIN_ID"] = str(record.domain)
-    if record.discovery != "system_default":
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = record.discovery.upper()
-    if record.discovery in ACROSS_MACHINES:
-        os.environ.setdefault(PROFILE, str(network_profile()))
-
-
-@contextmanager
-def needing(node: str, graph: str) -> Iterator[None]:
-    """Where a node does not answer because the graph that runs here has none of the name, say that, and who has.
+    `openarm order red --each 9` takes all that is red; with --bins, each class goes into its bin.
 
     Args:
-        node: Its name.
-        graph: That has it.
-
-    Raises:
-        OpenArmError: NOT_READY.
+        labels: What to pick, in this order.
+        bins: YAML with `bins` (rectangles x, y on the table, m), `classes` (bin of a label) and `rest` (bin of others).
+        each: Most objects of one label.
+        timeout: Longest wait for one object, s.
     """
-    from openarm_bringup.supervision import runs
+    from openarm_grasp.strategy.orders import Order, load_bins
 
-    try:
-        yield
-    except OpenArmError as error:
-        domain = os.environ.get("ROS_DOMAIN_ID", "0")
-        here = [run for run in runs.running() if str(run.domain) == domain]
-        if error.code != Code.NOT_READY or not here or any(node in run.nodes for run in here):
-            raise
-        names = " and ".join(run.graph for run in here)
-        raise OpenArmError(
-            Code.NOT_READY,
-            f"what runs here in domain {domain} ({names}) has no node `{node}`, and no other answers: stop it, and "
-            f"start one that has it, `openarm up {graph}`",
-        ) from error
+    work = Order(labels, load_bins(bins) if bins is not None else None, each)
+    join_graph(domain)
+    from openarm_grasp.ros.client import GraspClient
+
+    shown, results = console(), list[dict[str, Any]]()
+    with requires_node("grasp", "sim"), GraspClient() as client:
+        while ask := work.next():
+            try:
+                result = client.pick(ask.label, place=ask.place, leave=ask.leave, timeout=timeout)
+            except KeyboardInterrupt:
+                data = {"placed": work.placed, "results": results}
+                return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED, data)
+            work.done(ask, result.code, result.message, result.place_position)
+            results.append({"label": ask.label, "place": ask.place, "code": result.code, "message": result.message})
+            shown.print(f"{ask.label}: {result.code}: {result.message}", markup=False)
+            if result.code in (Code.CANCELLED, Code.ROBOT_LOST, Code.NOT_READY):
+                raise OpenArmError(result.code, f"the order was stopped at {ask.label!r}: {result.message}")
+    faults = work.faults()
+    data = {"outcome": work.outcome, "placed": work.placed, "faults": dict(faults), "results": results}
+    text = "; ".join(f"{label}: {why}" for label, why in faults.items())
+    message = f"{work.outcome}: {len(work.placed)} placed" + (f"; {text}" if text else "")
+    return Outcome(not faults, message, Code.OK if not faults else Code.PLACE_FAILED, data)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm ps` and `openarm logs`: what runs now, and what it says."""
+"""`openarm ps` and `openarm logs`: running graphs and their logs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from openarm_bringup.outcome import Outcome, show
-from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
@@ -24,6 +23,8 @@ def ps(*, seconds: float = 0.5) -> Outcome:
     Args:
         seconds: How long the CPU is measured.
     """
+    from openarm_bringup.supervision import runs
+
     records = runs.running()
     if not records:
         return Outcome(True, "no graph is running; start one with `openarm up`", data={"graphs": []})
@@ -73,14 +74,14 @@ def _usage(members: list[psutil.Process]) -> dict[str, float]:
             usage["cpu_percent"] += member.cpu_percent()
             usage["rss_mib"] += member.memory_info().rss / 2**20
         except psutil.NoSuchProcess:
-            continue  # it ended while we looked; shown like one that does not run
+            continue  # it has ended meanwhile; shown like one that does not run
     return usage
 
 
 def logs(
     node: str | None = None,
     *,
-    follow: Annotated[bool, Parameter(name=["--follow", "-f"], negative=())] = False,
+    follow: Annotated[bool, Parameter(name=["--follow", "-f"])] = False,
     lines: Annotated[int, Parameter(name=["--lines", "-n"])] = 50,
     run: str = "latest",
 ) -> Outcome:
@@ -118,6 +119,8 @@ def logs(
 
 def _log_folder(run: str, node: str | None) -> Path:
     """The newest graph that runs and has the node, else the folder of the run."""
+    from openarm_bringup.supervision import runs
+
     if run == "latest":
         records = runs.running()
         having = [record for record in records if node in record.nodes] or records

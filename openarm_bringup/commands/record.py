@@ -5,21 +5,16 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
-import threading
 import time
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from cyclopts import Parameter
-from rich.console import Console
-
-from openarm_bringup.outcome import Outcome
+from openarm_bringup.commands.connect import Domain, join_graph, stop_event
+from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code, OpenArmError
 
-#: Whose versions a bag remembers.
+#: Packages whose versions are kept in a bag.
 PACKAGES = ("openarm-vision", "mujoco", "numpy", "opencv-python-headless", "ros-jazzy-rclpy", "rosbags")
 
 
@@ -30,7 +25,7 @@ def record(
     topics: tuple[str, ...] = (),
     duration: float = 0.0,
     image_rate: float = 0.0,
-    domain: int | None = None,
+    domain: Domain = None,
 ) -> Outcome:
     """Record topics of the running graph until Ctrl-C, to a rosbag2 folder (MCAP, zstd).
 
@@ -40,31 +35,24 @@ def record(
         topics: Regular expressions of topic names, instead of a profile.
         duration: End after this long, s of wall clock; 0 waits for Ctrl-C.
         image_rate: Keep at most this many frames a second of each camera; 0 keeps all.
-        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
     """
-    from openarm_bringup.commands.pick import meet_graph
-
-    meet_graph(domain)
+    join_graph(domain)
     from openarm_bringup.bags.ros.recorder import PROFILES, Recorder
 
     path = bag or Path(datetime.now().strftime("bag_%Y%m%d_%H%M%S"))
     number = int(os.environ.get("ROS_DOMAIN_ID") or "0")
-    stop = threading.Event()
-    before = {n: signal.signal(n, lambda *_: stop.set()) for n in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with Recorder(number, path, topics or PROFILES[profile], _custom(number), image_rate) as recorder:
-            while not stop.is_set() and not recorder.wait_began(0.2):
-                pass
-            topics_now = f"{len(recorder.topics)} topics" if recorder.topics else "topics that come to be"
-            console = Console(stderr=True, highlight=False)
-            console.print(f"recording {topics_now} to {path}; Ctrl-C ends it", markup=False, soft_wrap=True)
-            deadline = time.monotonic() + (duration or float("inf"))
-            while (left := deadline - time.monotonic()) > 0.0 and not stop.is_set():
-                if not recorder.wait(min(0.2, left)):
-                    break
-    finally:
-        for n, handler in before.items():
-            signal.signal(n, handler)
+    with (
+        stop_event() as stop,
+        Recorder(number, path, topics or PROFILES[profile], _custom(number), image_rate) as recorder,
+    ):
+        while not stop.is_set() and not recorder.wait_began(0.2):
+            pass
+        topics_now = f"{len(recorder.topics)} topics" if recorder.topics else "topics that will be published"
+        console().print(f"recording {topics_now} to {path}; Ctrl-C ends it", markup=False, soft_wrap=True)
+        deadline = time.monotonic() + (duration or float("inf"))
+        while (left := deadline - time.monotonic()) > 0.0 and not stop.is_set():
+            if not recorder.wait(min(0.2, left)):
+                break
     recorded = recorder.recorded
     data: dict[str, Any] = {
         "bag": str(path),
@@ -97,14 +85,14 @@ def replay(
     bag: Path,
     *,
     rate: float = 1.0,
-    clock: Annotated[bool, Parameter(negative=())] = False,
+    clock: bool = False,
     start: float = 0.0,
     duration: float = 0.0,
-    loop: Annotated[bool, Parameter(negative=())] = False,
+    loop: bool = False,
     topics: tuple[str, ...] = (),
     remap: tuple[str, ...] = (),
-    until_idle: Annotated[bool, Parameter(negative=())] = False,
-    domain: int | None = None,
+    until_idle: bool = False,
+    domain: Domain = None,
 ) -> Outcome:
     """Publish a bag in place of the robot, in the order and with the quality of service in which it was recorded.
 
@@ -118,37 +106,29 @@ def replay(
         topics: Only these.
         remap: FROM:=TO of topic names; may be given several times.
         until_idle: At the end, wait until what the graph publishes has ceased for a second.
-        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
     """
     if rate < 0.0 or start < 0.0 or duration < 0.0:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"--rate, --start, --duration: 0 or more, got {rate, start, duration}"
         )
     from openarm_bringup.bags.bag import open_bag
-    from openarm_bringup.commands.pick import meet_graph
 
     names = dict(_split(pair) for pair in remap)
-    stop = threading.Event()
     with open_bag(bag) as opened:
         unknown = sorted(set(topics) - set(opened.topics))
         if unknown:
             known = ", ".join(sorted(opened.topics))
             raise OpenArmError(Code.INVALID_ARGUMENT, f"not in {bag}: {', '.join(unknown)}; topics: {known}")
-        meet_graph(domain)
+        join_graph(domain)
         from openarm_bringup.bags.ros.player import Player
 
-        before = {n: signal.signal(n, lambda *_: stop.set()) for n in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            with Player(opened, topics or None, names, clock=clock) as player:
-                while True:
-                    player.play(rate, start, duration, stop)
-                    if not loop or stop.is_set():
-                        break
-                if until_idle and not stop.is_set():
-                    player.wait_idle(1.0, 60.0)
-        finally:
-            for n, handler in before.items():
-                signal.signal(n, handler)
+        with stop_event() as stop, Player(opened, topics or None, names, clock=clock) as player:
+            while True:
+                player.play(rate, start, duration, stop)
+                if not loop or stop.is_set():
+                    break
+            if until_idle and not stop.is_set():
+                player.wait_idle(1.0, 60.0)
         mended = f"; it was cut short: {opened.mended} bytes at its end were not whole" if opened.mended else ""
     data = {"bag": str(bag), "messages": player.published, "late_ms": player.late_ms}
     data |= {"unknown_types": player.unknown, "left_to_graph": player.left}
@@ -167,7 +147,7 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
     Args:
         bag: Folder of rosbag2, or an MCAP file.
         golden: File with the numbers that are expected; golden.json in the bag's folder when not given.
-        scene: Whose table the objects stand on.
+        scene: Scene whose table the objects stand on.
         update: Write the numbers instead of comparing.
     """
     from openarm_bringup.bags import golden as stored
@@ -200,20 +180,14 @@ def _split(pair: str) -> tuple[str, str]:
 
 
 def _custom(domain: int) -> dict[str, str]:
-    """What a bag remembers of its origin: versions, and graph, parameters and seed of the run it was made in."""
+    """Return what is kept with a bag: versions, and graph and parameters of the run that it is recorded from."""
     from openarm_bringup.supervision import runs
+    from openarm_bringup.versions import versions
 
-    custom = {name: _version(name) for name in PACKAGES}
+    custom = versions(PACKAGES)
     try:
         run = runs.the_running(domain)
     except OpenArmError:
         return custom  # recorded from a graph that was started by other means
     files = sorted(Path(run.run_dir, "params").glob("*.yaml"))
     return custom | {"graph": run.graph, "parameters": "".join(path.read_text(encoding="utf-8") for path in files)}
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "unknown"

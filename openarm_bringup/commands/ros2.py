@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm topic`, `service`, `action`, `node`: what users of the ros2 command expect, without an installed ROS.
+"""`openarm topic`, `service`, `action`, `node`, `param`: what the ros2 command does, without an installed ROS.
 
 Messages are written and read as YAML. Every command finds the graph that runs on this machine.
 """
@@ -11,13 +11,11 @@ import time
 from collections import deque
 from contextlib import suppress
 from itertools import pairwise
-from statistics import median
 from typing import Annotated, Any
 
-import yaml
 from cyclopts import App, Parameter
 
-from openarm_bringup.commands.pick import meet_graph
+from openarm_bringup.commands.connect import Count, Domain, graph_peer
 from openarm_bringup.outcome import Outcome, show
 from openarm_common.errors import Code, OpenArmError
 
@@ -25,6 +23,7 @@ topic = App(name="topic", help="List topics, echo them, measure their rate, publ
 service = App(name="service", help="List services and call them.")
 action = App(name="action", help="List actions and send goals.")
 node = App(name="node", help="List nodes and what each offers and uses.")
+param = App(name="param", help="List, read, set and dump parameters of running nodes.")
 
 #: Longer arrays are shown as their size.
 _LONGEST = 32
@@ -38,33 +37,19 @@ def _listing(names: dict[str, str], key: str) -> Outcome:
     width = max((len(name) for name in names), default=0)
     text = "\n".join(f"{name:<{width}}  {kind}" for name, kind in sorted(names.items()))
     if not names:
-        return Outcome(False, f"no node that is heard has {key}", Code.NOT_READY, {key: {}})
+        return Outcome(False, f"no discovered node has {key}", Code.NOT_READY, {key: {}})
     return Outcome(True, data={key: names}, text=text)
 
 
 @topic.command(name="list")
-def topic_list(*, domain: int | None = None) -> Outcome:
-    """List topics and their types.
-
-    Args:
-        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
-    """
-    meet_graph(domain)
-    from openarm_bringup.ros.peer import Peer
-
-    with Peer() as peer:
+def topic_list(*, domain: Domain = None) -> Outcome:
+    """List topics and their types."""
+    with graph_peer(domain) as peer:
         return _listing(peer.topics(), "topics")
 
 
 @topic.command
-def echo(
-    name: str,
-    *,
-    count: Annotated[int, Parameter(name=["--count", "-n"])] = 0,
-    full: Annotated[bool, Parameter(negative=())] = False,
-    timeout: float = 10.0,
-    domain: int | None = None,
-) -> Outcome:
+def echo(name: str, *, count: Count = 0, full: bool = False, timeout: float = 10.0, domain: Domain = None) -> Outcome:
     """Print the messages of a topic as YAML, until Ctrl-C.
 
     Args:
@@ -72,36 +57,32 @@ def echo(
         count: End after so many; 0 goes on.
         full: Print long arrays whole.
         timeout: Longest wait for the first message, s.
-        domain: ROS_DOMAIN_ID of the graph.
     """
-    meet_graph(domain)
-    from openarm_bringup.messages import interface, to_data
-    from openarm_bringup.ros.peer import Peer, find
-    from openarm_common.ros.node import QOS_LATCHED
+    from openarm_bringup.messages import interface, to_data, to_yaml
 
-    told: deque[Any] = deque(maxlen=count)
+    taken: deque[Any] = deque(maxlen=count)
     waiting: list[Any] = []
-    with Peer() as peer:
-        found, kind = find("topic", name, peer.topics())
+    with graph_peer(domain) as peer:
+        found, kind = peer.find("topic", name)
         offered = peer.offered(found)
         peer.node.create_subscription(interface(kind), found, waiting.append, offered)
         if not peer.spin_until(lambda: waiting, timeout):
             raise OpenArmError(Code.TIMEOUT, f"{found} was silent for {timeout:g} s")
-        if count and offered.durability == QOS_LATCHED.durability:
-            # What is kept comes at once, the oldest first: who asks for some of it means the newest.
+        if count and offered.durability == offered.durability.TRANSIENT_LOCAL:
+            # Kept messages come at once, the oldest first: some of them means the newest.
             peer.spin_until(lambda: False, _SETTLE_S)
             del waiting[:-count]
         with suppress(KeyboardInterrupt):  # the way to end it
-            while not count or len(told) < count:
+            while not count or len(taken) < count:
                 peer.spin_until(lambda: waiting, float("inf"))
                 data = to_data(waiting.pop(0), None if full else _LONGEST)
-                told.append(data)
-                show(yaml.safe_dump(data, sort_keys=False, default_flow_style=None) + "---\n")
-    return Outcome(True, data={"topic": found, "type": kind, "messages": list(told)})
+                taken.append(data)
+                show(to_yaml(data) + "---\n")
+    return Outcome(True, data={"topic": found, "type": kind, "messages": list(taken)})
 
 
 @topic.command
-def hz(name: str, *, seconds: float = 5.0, domain: int | None = None) -> Outcome:
+def hz(name: str, *, seconds: float = 5.0, domain: Domain = None) -> Outcome:
     """Measure the rate of a topic by the wall clock, what is lost, and how long messages take to arrive.
 
     The delay holds where publisher and this machine have one clock.
@@ -109,18 +90,17 @@ def hz(name: str, *, seconds: float = 5.0, domain: int | None = None) -> Outcome
     Args:
         name: Of the topic.
         seconds: How long.
-        domain: ROS_DOMAIN_ID of the graph.
     """
-    meet_graph(domain)
+    from statistics import median
+
     from openarm_bringup.bags.losses import Arrivals
     from openarm_bringup.messages import interface
-    from openarm_bringup.ros.peer import Peer, find
 
     at: list[float] = []
     delays: list[float] = []
     size, lost, arrivals = [0], [0], Arrivals()
-    with Peer() as peer:
-        found, kind = find("topic", name, peer.topics())
+    with graph_peer(domain) as peer:
+        found, kind = peer.find("topic", name)
 
         def take(data: bytes, info: Any) -> None:
             at.append(time.monotonic())
@@ -145,9 +125,9 @@ def hz(name: str, *, seconds: float = 5.0, domain: int | None = None) -> Outcome
         "delay_max_ms": max(delays),
         "bytes_per_s": size[0] / seconds,
     }
-    said = f"{found}: {rate:.2f} Hz, period {min(gaps) * 1e3:.1f} to {max(gaps) * 1e3:.1f} ms, {len(at)} messages"
-    said += f", {lost[0]} lost, {median(delays):.1f} ms on the way ({max(delays):.1f} at most)"
-    return Outcome(True, f"{said}, {size[0] / seconds / 1e6:.2f} MB/s", data=data)
+    message = f"{found}: {rate:.2f} Hz, period {min(gaps) * 1e3:.1f} to {max(gaps) * 1e3:.1f} ms, {len(at)} messages"
+    message += f", {lost[0]} lost, {median(delays):.1f} ms of delay ({max(delays):.1f} at most)"
+    return Outcome(True, f"{message}, {size[0] / seconds / 1e6:.2f} MB/s", data=data)
 
 
 @topic.command
@@ -156,33 +136,29 @@ def pub(
     *message: str,
     type_: Annotated[str, Parameter(name="--type")] = "",
     rate: float = 0.0,
-    count: Annotated[int, Parameter(name=["--count", "-n"])] = 1,
-    domain: int | None = None,
+    count: Count = 1,
+    domain: Domain = None,
 ) -> Outcome:
     """Publish a message, given as YAML.
 
     Args:
         name: Of the topic.
         message: Its fields, such as "{name: [a], position: [0.1]}"; what is left out keeps its default. As with ros2,
-            the type may stand before it.
-        type_: Of the message, where nobody else has the topic.
+            the type may precede it.
+        type_: Of the message, where no other node has the topic.
         rate: Hz, with more than one.
         count: How many.
-        domain: ROS_DOMAIN_ID of the graph.
     """
-    meet_graph(domain)
     from openarm_bringup.messages import fill, interface, type_and_fields
-    from openarm_bringup.ros.peer import Peer, find
-    from openarm_common.ros.node import QOS_COMMAND
 
-    with Peer() as peer:
+    with graph_peer(domain) as peer:
         asked, fields = type_and_fields(message)
         if asked or type_:
             found, kind = name if name.startswith("/") else f"/{name}", asked or type_
         else:
-            found, kind = find("topic", name, peer.topics())
+            found, kind = peer.find("topic", name)
         filled = fill(interface(kind)(), fields)
-        publisher = peer.node.create_publisher(interface(kind), found, QOS_COMMAND)
+        publisher = peer.node.create_publisher(interface(kind), found, 10)
         heard = peer.spin_until(publisher.get_subscription_count, 2.0)
         peer.spin_until(lambda: False, _SETTLE_S if heard else 0.0)
         for i in range(count):
@@ -190,43 +166,34 @@ def pub(
             peer.spin_until(lambda: False, 1.0 / rate if rate > 0.0 and i + 1 < count else 0.0)
         if heard:
             publisher.wait_for_all_acked()
-    said = f"{count} x {kind} on {found}" + ("" if heard else "; nobody listens there")
-    return Outcome(heard, said, Code.OK if heard else Code.NOT_READY, {"topic": found, "type": kind})
+    text = f"{count} x {kind} on {found}" + ("" if heard else "; it has no subscriber")
+    return Outcome(heard, text, Code.OK if heard else Code.NOT_READY, {"topic": found, "type": kind})
 
 
 @service.command(name="list")
-def service_list(
-    *, all_: Annotated[bool, Parameter("--all", negative=())] = False, domain: int | None = None
-) -> Outcome:
+def service_list(*, all_: Annotated[bool, Parameter("--all")] = False, domain: Domain = None) -> Outcome:
     """List services and their types.
 
     Args:
         all_: Also those for parameters and types that every node has.
-        domain: ROS_DOMAIN_ID of the graph.
     """
-    meet_graph(domain)
-    from openarm_bringup.ros.peer import Peer, plain
-
-    with Peer() as peer:
-        return _listing(peer.services() if all_ else plain(peer.services()), "services")
+    with graph_peer(domain) as peer:
+        return _listing(peer.services(all_=all_), "services")
 
 
 @service.command
-def call(name: str, *request: str, timeout: float = 30.0, domain: int | None = None) -> Outcome:
+def call(name: str, *request: str, timeout: float = 30.0, domain: Domain = None) -> Outcome:
     """Call a service; the request and the answer are YAML. The exit code follows the answer's `success`, if it has one.
 
     Args:
         name: Of the service.
-        request: Its fields, such as "{label: red}"; as with ros2, the type may stand before it.
+        request: Its fields, such as "{label: red}"; as with ros2, the type may precede it.
         timeout: Longest wait for the answer, s.
-        domain: ROS_DOMAIN_ID of the graph.
     """
-    meet_graph(domain)
     from openarm_bringup.messages import fields_of, fill, interface, to_data
-    from openarm_bringup.ros.peer import Peer, find
 
-    with Peer() as peer:
-        found, kind = find("service", name, peer.services())
+    with graph_peer(domain) as peer:
+        found, kind = peer.find("service", name)
         filled = fill(interface(kind).Request(), fields_of(request, found, kind))
         client = peer.node.create_client(interface(kind), found)
         if not peer.spin_until(client.service_is_ready, 5.0):
@@ -236,50 +203,33 @@ def call(name: str, *request: str, timeout: float = 30.0, domain: int | None = N
 
 
 @action.command(name="list")
-def action_list(*, domain: int | None = None) -> Outcome:
-    """List actions and their types.
-
-    Args:
-        domain: ROS_DOMAIN_ID of the graph.
-    """
-    meet_graph(domain)
-    from openarm_bringup.ros.peer import Peer
-
-    with Peer() as peer:
+def action_list(*, domain: Domain = None) -> Outcome:
+    """List actions and their types."""
+    with graph_peer(domain) as peer:
         return _listing(peer.actions(), "actions")
 
 
 @action.command(name=["send", "send_goal"])
-def send(
-    name: str,
-    *goal: str,
-    feedback: Annotated[bool, Parameter(negative=())] = False,
-    timeout: float = 300.0,
-    domain: int | None = None,
-) -> Outcome:
+def send(name: str, *goal: str, feedback: bool = False, timeout: float = 300.0, domain: Domain = None) -> Outcome:
     """Send a goal and wait for its result; Ctrl-C cancels it.
 
     Args:
         name: Of the action.
-        goal: Its fields as YAML; as with ros2, the type may stand before it.
+        goal: Its fields as YAML; as with ros2, the type may precede it.
         feedback: Print the feedback.
         timeout: Longest wait for the result, s.
-        domain: ROS_DOMAIN_ID of the graph.
     """
-    meet_graph(domain)
-    from openarm_bringup.messages import fields_of, fill, interface, to_data
-    from openarm_bringup.ros.peer import Peer, find
+    from openarm_bringup.messages import fields_of, fill, interface, to_data, to_yaml
 
-    def tell(message: Any) -> None:
+    def on_feedback(message: Any) -> None:
         if feedback:
-            data = to_data(message.feedback, _LONGEST)
-            sys.stderr.write(yaml.safe_dump(data, sort_keys=False, default_flow_style=None) + "---\n")
+            sys.stderr.write(to_yaml(to_data(message.feedback, _LONGEST)) + "---\n")
 
-    with Peer() as peer:
-        found, kind = find("action", name, peer.actions())
+    with graph_peer(domain) as peer:
+        found, kind = peer.find("action", name)
         filled = fill(interface(kind).Goal(), fields_of(goal, found, kind))
         client = peer.action_client(interface(kind), found)
-        handle = peer.result(client.send_goal_async(filled, feedback_callback=tell), 10.0, found)
+        handle = peer.result(client.send_goal_async(filled, feedback_callback=on_feedback), 10.0, found)
         if not handle.accepted:
             return Outcome(False, f"{found} refused the goal", Code.INVALID_ARGUMENT, {"action": found})
         future = handle.get_result_async()
@@ -292,38 +242,27 @@ def send(
 
 
 @node.command(name="list")
-def node_list(*, domain: int | None = None) -> Outcome:
-    """List nodes.
-
-    Args:
-        domain: ROS_DOMAIN_ID of the graph.
-    """
-    meet_graph(domain)
-    from openarm_bringup.ros.peer import Peer
-
-    with Peer() as peer:
+def node_list(*, domain: Domain = None) -> Outcome:
+    """List nodes."""
+    with graph_peer(domain) as peer:
         names = peer.nodes()
     return Outcome(True, data={"nodes": names}, text="\n".join(names))
 
 
 @node.command
-def info(name: str, *, domain: int | None = None) -> Outcome:
-    """Show what a node publishes and listens to, the services that it offers and calls, and its actions.
+def info(name: str, *, domain: Domain = None) -> Outcome:
+    """Show what a node publishes and subscribes to, the services that it offers and calls, and its actions.
 
     Args:
         name: Of the node.
-        domain: ROS_DOMAIN_ID of the graph.
     """
-    meet_graph(domain)
-    from openarm_bringup.ros.peer import Peer, find
-
-    with Peer() as peer:
-        found, _ = find("node", name, dict.fromkeys(peer.nodes(), ""))
+    with graph_peer(domain) as peer:
+        found, _ = peer.find("node", name)
         space, _, short = found.rpartition("/")
         where = (short, space or "/")
         parts = {
             "publishes": peer.node.get_publisher_names_and_types_by_node(*where),
-            "listens to": peer.node.get_subscriber_names_and_types_by_node(*where),
+            "subscribes to": peer.node.get_subscriber_names_and_types_by_node(*where),
             "offers": peer.node.get_service_names_and_types_by_node(*where),
             "calls": peer.node.get_client_names_and_types_by_node(*where),
         }
@@ -341,8 +280,72 @@ def info(name: str, *, domain: int | None = None) -> Outcome:
 
 
 def _answered(answer: dict[str, Any], data: dict[str, Any]) -> Outcome:
-    text = yaml.safe_dump(answer, sort_keys=False, default_flow_style=None)
+    from openarm_bringup.messages import to_yaml
+
+    text, data = to_yaml(answer), {**data, "answer": answer}
     if answer.get("success") is False:
-        code = answer.get("code") or Code.INTERNAL
-        return Outcome(False, str(answer.get("message", "")), code, {**data, "answer": answer}, text)
-    return Outcome(True, data={**data, "answer": answer}, text=text)
+        return Outcome(False, str(answer.get("message", "")), answer.get("code") or Code.INTERNAL, data, text)
+    return Outcome(True, data=data, text=text)
+
+
+@param.command(name="list")
+def param_list(node: str, *, domain: Domain = None) -> Outcome:
+    """List the parameters of a node.
+
+    Args:
+        node: Its name.
+    """
+    with graph_peer(domain) as peer:
+        names = peer.parameters(node).names
+    return Outcome(True, data={"parameters": names}, text="\n".join(names))
+
+
+@param.command(name="get")
+def param_get(node: str, name: str, *, domain: Domain = None) -> Outcome:
+    """Print a parameter.
+
+    Args:
+        node: Name of the node.
+        name: Of the parameter, such as approach.lift_height.
+    """
+    with graph_peer(domain) as peer:
+        value = peer.parameters(node).get([name])[name]
+    return Outcome(True, data={"name": name, "value": value}, text=str(value))
+
+
+@param.command(name="dump")
+def param_dump(node: str, *, domain: Domain = None) -> Outcome:
+    """Print all parameters of a node as a ROS parameter file.
+
+    Args:
+        node: Name of the node.
+    """
+    import yaml
+
+    with graph_peer(domain) as peer:
+        parameters = peer.parameters(node)
+        values = parameters.get(parameters.names)
+    file = {node.rpartition("/")[2]: {"ros__parameters": values}}
+    return Outcome(True, data={"parameters": values}, text=yaml.safe_dump(file, sort_keys=True))
+
+
+@param.command(name="set")
+def param_set(node: str, name: str, value: str, *, domain: Domain = None) -> Outcome:
+    """Set a parameter; most of the suite's are fixed at the start (`openarm up --set`) and say so.
+
+    Args:
+        node: Name of the node.
+        name: Of the parameter.
+        value: As YAML.
+    """
+    import yaml
+
+    with graph_peer(domain) as peer:
+        parameters = peer.parameters(node)
+        accepted, reason = parameters.set(name, yaml.safe_load(value))
+    found = parameters.node
+    data = {"node": found, "name": name, "value": value}
+    if not accepted:
+        hint = f"{reason or 'refused'}; give it at the start: openarm up --set {found.strip('/')}.{name}={value}"
+        return Outcome(False, f"{found} {name}: {hint}", Code.INVALID_ARGUMENT, data)
+    return Outcome(True, f"{found} {name} = {value}", data=data)

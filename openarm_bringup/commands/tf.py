@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from cyclopts import App
 
-from openarm_bringup.commands.pick import meet_graph
+from openarm_bringup.commands.connect import Domain, graph_peer
 from openarm_bringup.outcome import Outcome
 from openarm_bringup.suggest import unknown
-from openarm_bringup.view.tree_picture import Row, check, write
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
@@ -20,25 +19,25 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from openarm_bringup.ros.peer import Frames
+    from openarm_bringup.view.tree_picture import Row
 
     Edges = dict[str, tuple[str, NDArray[np.float64], bool]]
 
-app = App(name="tf", help="Show the tree of frames, or one frame in another.")
+tf = App(name="tf", help="Show the tree of frames, or one frame in another.")
 
-#: Joint frames are told on /tf at 50 Hz, the rest on /tf_static.
+#: Joint frames are published on /tf at 50 Hz, the rest on /tf_static.
 _LISTEN_S = 1.0
-#: Frames that a sentence names.
+#: Frames that a message names.
 _NAMED = 4
 
 
-@app.command
-def echo(target: str, source: str, *, domain: int | None = None) -> Outcome:
-    """Print where a frame is, as it is now.
+@tf.command
+def echo(target: str, source: str, *, domain: Domain = None) -> Outcome:
+    """Print the pose of a frame as it is now.
 
     Args:
-        target: Frame in which it is told.
-        source: Frame that is told of.
-        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
+        target: Frame in which the pose is expressed.
+        source: Frame whose pose it is.
     """
     from openarm_common.se3 import inverse, quat_xyzw_from_matrix
 
@@ -51,14 +50,15 @@ def echo(target: str, source: str, *, domain: int | None = None) -> Outcome:
     return Outcome(True, data=data, text=text)
 
 
-@app.command
-def tree(*, out: Path | None = None, domain: int | None = None) -> Outcome:
+@tf.command
+def tree(*, out: Path | None = None, domain: Domain = None) -> Outcome:
     """Show the tree of frames, and draw it.
 
     Args:
         out: A .png, .svg or .pdf to draw it in.
-        domain: ROS_DOMAIN_ID of the graph.
     """
+    from openarm_bringup.view.tree_picture import check, write
+
     if out is not None:
         check(out)
     frames = _listen(domain)
@@ -80,13 +80,10 @@ def tree(*, out: Path | None = None, domain: int | None = None) -> Outcome:
 
 
 def _listen(domain: int | None) -> Frames:
-    meet_graph(domain)
-    from openarm_bringup.ros.peer import Peer
-
-    with Peer() as peer:
+    with graph_peer(domain) as peer:
         frames = peer.frames(_LISTEN_S)
     if not frames.edges:
-        raise OpenArmError(Code.NO_TRANSFORM, "nothing on /tf and /tf_static: no node that is heard tells of frames")
+        raise OpenArmError(Code.NO_TRANSFORM, "nothing on /tf and /tf_static: no discovered node publishes frames")
     return frames
 
 
@@ -106,20 +103,21 @@ def _to_root(edges: Edges, frame: str) -> NDArray[np.float64]:
 
 
 def _grouped(clashes: Mapping[str, str]) -> list[str]:
-    """One sentence for each thing that is wrong, with the frames that it is wrong with."""
+    """Return one sentence for each fault, with the frames that have it."""
     frames: dict[str, list[str]] = {}
     for name, what in sorted(clashes.items()):
         frames.setdefault(what, []).append(name)
     said: list[str] = []
     for what, names in frames.items():
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        each = "each of " if len(names) > 1 else ""
-        said.append(f"{each}{', '.join(names[:_NAMED])}{more} {what}")
+        said.append(f"{'each of ' if len(names) > 1 else ''}{', '.join(names[:_NAMED])}{more} {what}")
     return said
 
 
 def _rows(edges: Edges) -> list[Row]:
-    """In the order in which a tree is written."""
+    """Return the frames in the order in which a tree is written."""
+    from openarm_bringup.view.tree_picture import Row
+
     children: dict[str, list[str]] = {}
     for child, (parent, _, _) in edges.items():
         children.setdefault(parent, []).append(child)

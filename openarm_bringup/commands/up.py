@@ -3,17 +3,18 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-from cyclopts import Parameter
+from openarm_bringup.commands.connect import Sets
+from openarm_bringup.outcome import Outcome, console, failure
+from openarm_bringup.supervision.discovery import Discovery
+from openarm_common.errors import OpenArmError
 
-from openarm_bringup.outcome import Outcome, failure
-from openarm_bringup.supervision.graph import Discovery, Graph, load_graph, set_parameter
-from openarm_bringup.view.viz import NODE, app_link, with_viz
-from openarm_common.errors import Code, OpenArmError
+if TYPE_CHECKING:
+    from openarm_bringup.supervision.graph import Graph
+    from openarm_bringup.supervision.supervisor import Event
 
 STYLES = {"ready": "green", "failed": "bold red", "backoff": "yellow", "exited": "yellow", "stopped": "dim"}
 
@@ -21,34 +22,37 @@ STYLES = {"ready": "green", "failed": "bold red", "backoff": "yellow", "exited":
 def up(
     graph: str = "sim",
     *,
-    set_: Annotated[tuple[str, ...], Parameter(name="--set")] = (),
+    set_: Sets = (),
     scene: str | None = None,
     seed: int | None = None,
     mount_seed: str | None = None,
     domain: int | None = None,
     discovery: Discovery | None = None,
-    viz: Annotated[bool, Parameter(negative=())] = False,
+    viz: bool = False,
     viz_port: int = 8765,
 ) -> Outcome:
     """Start the nodes of a graph, and stop them at Ctrl-C (a second Ctrl-C hurries).
 
     Args:
         graph: Name of a graph (sim, sim_only, perception, motion) or a file.
-        set_: A parameter, as node.param=value; may be given several times.
         scene: Name or path of a scene, or "random".
         seed: Seed of a random scene.
         mount_seed: Seed of the true camera mounts, or "none" for the nominal ones.
         domain: ROS_DOMAIN_ID; the environment's, or 0, when not given.
-        discovery: Whom the nodes meet; localhost when the graph says nothing else.
-        viz: Show every topic and service to Foxglove, at an address that is printed.
+        discovery: Reach of discovery; localhost when the graph says nothing else.
+        viz: Offer every topic and service to Foxglove, at an address that is printed.
         viz_port: TCP port for that.
     """
+    import asyncio
+
+    from openarm_bringup.supervision.graph import load_graph, set_parameter
+    from openarm_bringup.supervision.runs import new_run_dir
+    from openarm_bringup.view.viz import NODE, with_viz
+    from openarm_common.scene.scene import load_scene
+
     overrides = {"scene": scene, "seed": seed, "mount_seed": mount_seed, "domain": domain, "discovery": discovery}
     of_viz = tuple(item for item in set_ if viz and item.startswith(f"{NODE}."))
     loaded = load_graph(graph, overrides=overrides, sets=[item for item in set_ if item not in of_viz])
-    from openarm_bringup.supervision.runs import new_run_dir
-    from openarm_common.scene.scene import load_scene
-
     load_scene(loaded.scene, loaded.seed)  # a scene that does not fit is refused before anything starts
     address = ""
     if viz:
@@ -59,39 +63,35 @@ def up(
 
 
 async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
-    from rich.console import Console
-
     from openarm_bringup.supervision.environment import domain_id
     from openarm_bringup.supervision.session import running_graph
-    from openarm_bringup.supervision.supervisor import Event
+    from openarm_bringup.view.viz import app_link
 
-    console = Console(stderr=True, highlight=False)
+    shown = console()
     began = time.monotonic()
 
     def show(event: Event) -> None:
         style = STYLES.get(event.state, "")
         line = event.detail.partition("\n")[0]
-        console.print(f"[dim]{event.seconds:6.1f} s[/dim]  {event.node:<22} ", end="")
-        console.print(f"{event.state:<9}", style=style, end=" ")
-        console.print(line, markup=False, soft_wrap=True)
+        shown.print(f"[dim]{event.seconds:6.1f} s[/dim]  {event.node:<22} ", end="")
+        shown.print(f"{event.state:<9}", style=style, end=" ")
+        shown.print(line, markup=False, soft_wrap=True)
 
     data: dict[str, Any] = {"graph": graph.name, "run_dir": str(run_dir), "domain": domain_id(graph)}
     try:
         async with running_graph(graph, run_dir, show) as supervisor:
             await supervisor.wait_ready()
             data["ready_s"] = round(time.monotonic() - began, 2)
-            console.print(
+            shown.print(
                 f"[bold green]{graph.name} is ready[/bold green] after {data['ready_s']:.1f} s: "
                 f"domain {data['domain']}, logs in {run_dir / 'logs'}; Ctrl-C stops it",
                 soft_wrap=True,
             )
             if viz_address:
                 text = f"Foxglove: open the connection {viz_address}\n  or {app_link(viz_address)}"
-                console.print(text, markup=False, soft_wrap=True)
+                shown.print(text, markup=False, soft_wrap=True)
             await supervisor.wait_stop_asked()
             data["states"] = supervisor.states()
     except OpenArmError as error:
-        if error.code != Code.CANCELLED:
-            return failure(error, **data)
-        return Outcome(False, error.message, error.code, data)
+        return failure(error, **data)
     return Outcome(True, f"{graph.name} stopped; no process is left, the logs are in {run_dir / 'logs'}", data=data)

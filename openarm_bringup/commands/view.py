@@ -3,18 +3,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
-import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from openarm_bringup.commands.pick import meet_graph
-from openarm_bringup.outcome import Outcome, failure
-from openarm_bringup.view.guard import LOOPBACK
+from openarm_bringup.commands.connect import Domain, join_graph
+from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
@@ -24,31 +21,31 @@ if TYPE_CHECKING:
 def view(
     *,
     port: int = 8088,
-    host: str = LOOPBACK,
-    open_: Annotated[bool, Parameter(name="--open", negative=())] = False,
-    domain: int | None = None,
+    host: str = "127.0.0.1",
+    open_: Annotated[bool, Parameter(name="--open")] = False,
+    domain: Domain = None,
 ) -> Outcome:
-    """Serve a page that shows the graph and asks it for grasps, until Ctrl-C.
+    """Serve a page that shows the graph and requests grasps, until Ctrl-C.
 
-    The address that is printed holds a token, new each time: who knows it can move the robot.
+    The printed address holds a token, new each time: whoever has it can move the robot.
 
     Args:
         port: TCP port; 0 takes any that is free.
-        host: Address to listen on. Beyond this machine the token crosses the net in the clear; `ssh -L` keeps it in.
+        host: Address to listen on. Beyond this machine the token is sent unencrypted; prefer `ssh -L`.
         open_: Open the page in a browser.
-        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
     """
-    meet_graph(domain)
-    try:
-        address = asyncio.run(_serve(host, port, open_))
-    except OpenArmError as error:
-        return failure(error)
+    import asyncio
+
+    join_graph(domain)
+    address = asyncio.run(_serve(host, port, open_))
     return Outcome(True, f"the page at {address} is closed")
 
 
 async def _serve(host: str, port: int, show: bool) -> str:
+    import asyncio
+    import webbrowser
+
     from aiohttp import web
-    from rich.console import Console
 
     loop = asyncio.get_running_loop()
     stop: asyncio.Future[None] = loop.create_future()
@@ -71,7 +68,7 @@ async def _serve(host: str, port: int, show: bool) -> str:
             shown = f"[{host}]" if ":" in host else host
             address = f"http://{shown}:{runner.addresses[0][1]}/"
             url = f"{address}?token={server.guard.token}"
-            Console(stderr=True, highlight=False).print(f"the page is at {url}", markup=False, soft_wrap=True)
+            console().print(f"the page is at {url}", markup=False, soft_wrap=True)
             if show:
                 webbrowser.open(url)
             await stop
@@ -82,12 +79,14 @@ async def _serve(host: str, port: int, show: bool) -> str:
 
 @contextmanager
 def make_server(host: str, on_end: Callable[[BaseException], None]) -> Iterator[ViewServer]:
-    """The server of the page and the thread that looks at the graph; within a running asyncio loop.
+    """Make the server of the page and the thread that observes the graph; within a running asyncio loop.
 
     Args:
         host: Address that the server will listen on.
         on_end: Called in the loop with what ended the thread too early.
     """
+    import asyncio
+
     from openarm_bringup.view.guard import Guard
     from openarm_bringup.view.ros.page import GraphView
     from openarm_bringup.view.server import ViewServer

@@ -6,9 +6,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from openarm_bringup.doctor.checks import Finding
-from openarm_bringup.supervision.runs import RunRecord
+
+if TYPE_CHECKING:
+    from openarm_bringup.supervision.runs import RunRecord
 
 #: Topics that come at a steady rate whenever their node runs: Hz, and which node they are of.
 RATES: Mapping[str, tuple[float, str]] = {

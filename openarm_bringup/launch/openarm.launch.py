@@ -14,7 +14,8 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 
-from openarm_bringup.supervision.environment import PROFILE, node_arguments, node_environment
+from openarm_bringup.supervision.discovery import PROFILE
+from openarm_bringup.supervision.environment import node_arguments, node_environment
 from openarm_bringup.supervision.graph import graph_names, load_graph
 from openarm_bringup.supervision.runs import new_run_dir
 from openarm_common.resources import config_dir

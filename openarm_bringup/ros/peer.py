@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,10 @@ from openarm_common.ros.client import ContextNode
 from openarm_common.ros.convert import transform_to_matrix
 from openarm_common.ros.node import QOS_STATIC_TF, QOS_TF, offered_qos
 
-#: Others are known after this long without news, s; while nobody is, or one that is known to run is not, they may come.
+#: Discovery is complete after this long without a change, s, and at the latest after the second.
 _QUIET_S = 0.6
 _DISCOVERY_S = 8.0
-#: How long to wait for anybody, where no supervisor of this machine has said that there is a graph, s.
+#: Longest wait for a first node, where no supervisor of this machine has recorded a graph, s.
 _ANYBODY_S = 4.0
 #: Services that every node has.
 _OF_ALL_NODES = ("rcl_interfaces/srv/", "type_description_interfaces/srv/")
@@ -62,7 +62,7 @@ class Peer(ContextNode):
             reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
             raise OpenArmError(
                 Code.NOT_READY,
-                f"no node is heard in domain {domain} (ROS_AUTOMATIC_DISCOVERY_RANGE={reach}); start a graph with "
+                f"no node is discovered in domain {domain} (ROS_AUTOMATIC_DISCOVERY_RANGE={reach}); start a graph with "
                 "`openarm up`, or set both as they are set where it runs (--domain N says the domain, too)",
             )
         return self
@@ -76,10 +76,11 @@ class Peer(ContextNode):
         """Type by topic, without those of actions."""
         return {name: kinds[0] for name, kinds in self.node.get_topic_names_and_types() if "/_action/" not in name}
 
-    def services(self) -> dict[str, str]:
-        """Type by service, without those of actions and of nodes that are hidden, as this one."""
-        found = self.node.get_service_names_and_types()
-        return {name: kinds[0] for name, kinds in found if "/_action/" not in name and "/_openarm_cli" not in name}
+    def services(self, *, all_: bool = True) -> dict[str, str]:
+        """Type by service, without those of actions and of hidden nodes; `all_` includes those that every node has."""
+        found = {name: kinds[0] for name, kinds in self.node.get_service_names_and_types()}
+        names = [name for name in found if "/_action/" not in name and "/_openarm_cli" not in name]
+        return {name: found[name] for name in names if all_ or not found[name].startswith(_OF_ALL_NODES)}
 
     def actions(self) -> dict[str, str]:
         """Type by action."""
@@ -90,8 +91,21 @@ class Peer(ContextNode):
             if name.endswith(end)
         }
 
+    def find(self, what: Literal["node", "topic", "service", "action"], name: str) -> tuple[str, str]:
+        """Return the full name of something in the graph, and its type; the leading slash may be left out.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, with suggestions.
+        """
+        ask = {"topic": self.topics, "service": self.services, "action": self.actions}
+        known = ask[what]() if what in ask else dict.fromkeys(self.nodes(), "")
+        full = name if name.startswith("/") else f"/{name}"
+        if full not in known:
+            raise unknown(what, full, [other for other in known if not known[other].startswith(_OF_ALL_NODES)])
+        return full, known[full]
+
     def offered(self, topic: str) -> QoSProfile:
-        """The quality of service with which everything of a topic is heard."""
+        """The quality of service with which every publisher of a topic is received."""
         return offered_qos(self.node, topic, 100)
 
     def action_client(self, kind: Any, name: str) -> Any:
@@ -111,10 +125,10 @@ class Peer(ContextNode):
         Raises:
             OpenArmError: INVALID_ARGUMENT for an unknown node, NOT_READY when it does not answer.
         """
-        return ParametersOf(self, find("node", node, dict.fromkeys(self.nodes(), ""))[0])
+        return ParametersOf(self, self.find("node", node)[0])
 
     def frames(self, seconds: float) -> Frames:
-        """What is told on /tf and /tf_static within a time."""
+        """Return what is published on /tf and /tf_static within a time, s."""
         frames = Frames()
         for topic, static, qos in (("/tf_static", True, QOS_STATIC_TF), ("/tf", False, QOS_TF)):
 
@@ -127,11 +141,11 @@ class Peer(ContextNode):
 
 
 class Frames:
-    """The tree of frames as it is heard.
+    """The tree of frames as it is published.
 
     Attributes:
         edges: Parent, pose in it and whether it is fixed, of each frame.
-        clashes: What is wrong with a frame that more than one tells of, by its name.
+        clashes: What is wrong with a frame that has more than one publisher or parent, by its name.
     """
 
     def __init__(self) -> None:
@@ -140,18 +154,18 @@ class Frames:
         self._last: dict[str, int] = {}
 
     def add(self, message: TFMessage, number: int, static: bool) -> None:
-        """Take a message; `number` counts those of its publisher, so a frame that two tell of goes back in it."""
+        """Add a message; `number` counts those of its publisher: with two publishers of a frame it goes back."""
         for edge in message.transforms:
             name, parent = edge.child_frame_id, edge.header.frame_id
             T = transform_to_matrix(edge.transform)
             if name in self.edges:
                 before, T_before, was_static = self.edges[name]
                 if before != parent:
-                    self.clashes[name] = f"hangs below {before} and below {parent}"
+                    self.clashes[name] = f"has the parents {before} and {parent}"
                 elif was_static != static:
-                    self.clashes[name] = "is told on /tf and on /tf_static"
+                    self.clashes[name] = "is published on /tf and on /tf_static"
                 elif number <= self._last[name] and (not static or not np.array_equal(T, T_before)):
-                    self.clashes[name] = f"is told by two on {'/tf_static' if static else '/tf'}"
+                    self.clashes[name] = f"has two publishers on {'/tf_static' if static else '/tf'}"
             self.edges[name] = (parent, T, static)
             self._last[name] = number
 
@@ -160,7 +174,7 @@ class ParametersOf:
     """The parameters of a node that runs.
 
     Args:
-        peer: Who asks.
+        peer: Node that asks.
         node: Full name.
     """
 
@@ -172,40 +186,29 @@ class ParametersOf:
             raise OpenArmError(Code.NOT_READY, f"{node} does not answer for its parameters")
         self.names: list[str] = sorted(peer.result(self._client.list_parameters(), _ANSWER_S, node).result.names)
 
-    def check(self, name: str) -> None:
-        """Refuse a name that the node does not have.
+    def get(self, names: list[str]) -> dict[str, Any]:
+        """Values by name.
 
         Raises:
-            OpenArmError: INVALID_ARGUMENT, saying which was perhaps meant.
+            OpenArmError: INVALID_ARGUMENT, for a name that the node does not have, with suggestions.
         """
-        if name not in self.names:
-            raise unknown(f"parameter of {self.node}", name, self.names)
-
-    def get(self, names: list[str]) -> dict[str, Any]:
-        """Values by name."""
+        self._check(names)
         answer = self._peer.result(self._client.get_parameters(names), _ANSWER_S, self.node)
         values = (to_data(parameter_value_to_python(value)) for value in answer.values)
         return dict(zip(names, values, strict=True))
 
     def set(self, name: str, value: Any) -> tuple[bool, str]:
-        """Set one; returns whether the node took it, and why not."""
+        """Set one; return whether the node accepted it, and why not.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for a name that the node does not have, with suggestions.
+        """
+        self._check([name])
         future = self._client.set_parameters([Parameter(name, value=value)])
         result = self._peer.result(future, _ANSWER_S, self.node).results[0]
         return result.successful, result.reason
 
-
-def plain(known: dict[str, str]) -> dict[str, str]:
-    """Leave out the services that every node has."""
-    return {name: kind for name, kind in known.items() if not kind.startswith(_OF_ALL_NODES)}
-
-
-def find(what: str, name: str, known: dict[str, str]) -> tuple[str, str]:
-    """Return the full name of a topic, service or action, and its type; the leading slash may be left out.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, saying which was perhaps meant.
-    """
-    full = name if name.startswith("/") else f"/{name}"
-    if full not in known:
-        raise unknown(what, full, plain(known))
-    return full, known[full]
+    def _check(self, names: list[str]) -> None:
+        for name in names:
+            if name not in self.names:
+                raise unknown(f"parameter of {self.node}", name, self.names)

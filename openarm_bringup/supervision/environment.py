@@ -12,38 +12,32 @@ from pathlib import Path
 
 import yaml
 
+from openarm_bringup.supervision.discovery import ACROSS_MACHINES, LAST_DOMAIN, PROFILE, network_profile, variables
 from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 
-#: The variable that names the Fast DDS profile of a process.
-PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 #: Of one message through shared memory, MiB; a cloud of 640x480 points takes 3.7 MB.
 _LARGEST_MIB = 4
-#: Reaches of discovery that go beyond this machine.
-ACROSS_MACHINES = ("subnet", "system_default")
 
 
 def domain_id(graph: Graph, environ: Mapping[str, str] = os.environ) -> int:
     """Return the ROS domain of a graph: its own, else the environment's, else 0.
 
     Raises:
-        OpenArmError: ENVIRONMENT, when ROS_DOMAIN_ID is not a number from 0 to 232.
+        OpenArmError: ENVIRONMENT, when ROS_DOMAIN_ID is not a number of a domain.
     """
     if graph.domain is not None:
         return graph.domain
     text = environ.get("ROS_DOMAIN_ID", "") or "0"
-    if not text.isdecimal() or int(text) > 232:
-        raise OpenArmError(Code.ENVIRONMENT, f"ROS_DOMAIN_ID is {text!r}; expected a number from 0 to 232")
+    if not text.isdecimal() or int(text) > LAST_DOMAIN:
+        raise OpenArmError(Code.ENVIRONMENT, f"ROS_DOMAIN_ID is {text!r}; expected a number from 0 to {LAST_DOMAIN}")
     return int(text)
 
 
 def ros_environment(graph: Graph, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return the variables that decide whom a process of the graph can meet (for nodes and for probes)."""
-    wanted = {"ROS_DOMAIN_ID": str(domain_id(graph, environ))}
-    if graph.discovery != "system_default":
-        wanted["ROS_AUTOMATIC_DISCOVERY_RANGE"] = graph.discovery.upper()
-    return wanted
+    """Return the variables that decide which processes a node or a client of the graph meets."""
+    return variables(domain_id(graph, environ), graph.discovery)
 
 
 def node_environment(graph: Graph, name: str, run_dir: Path, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
@@ -61,11 +55,6 @@ def node_environment(graph: Graph, name: str, run_dir: Path, environ: Mapping[st
     elif graph.discovery in ACROSS_MACHINES:
         env[PROFILE] = str(network_profile())
     return {**env, **spec.env}
-
-
-def network_profile() -> Path:
-    """Return the Fast DDS profile of processes that hear images from another machine."""
-    return config_dir() / "fastdds_network.xml"
 
 
 def write_profile(spec: NodeSpec, path: Path) -> Path:

@@ -15,12 +15,12 @@ from typing import Any, Literal
 import yaml
 from pydantic import Field, model_validator
 
+from openarm_bringup.supervision.discovery import LAST_DOMAIN, Discovery
 from openarm_bringup.supervision.params import flatten, read_params, substitute
 from openarm_common.config import Config, ConfigT, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 
-Discovery = Literal["localhost", "subnet", "off", "system_default"]
 ConditionKind = Literal["topic", "message", "service", "action"]
 
 #: Values of the graph that parameters may refer to.
@@ -107,7 +107,9 @@ class Graph(Config):
     scene: str = Field(default="demo", description="name or path of a scene, or `random`")
     seed: int = Field(default=0, ge=0, description="of a random scene")
     mount_seed: int | Literal["none"] = Field(default="none", description="of the true camera mounts; none = nominal")
-    domain: int | None = Field(default=None, ge=0, le=232, description="ROS_DOMAIN_ID; null = of the environment, or 0")
+    domain: int | None = Field(
+        default=None, ge=0, le=LAST_DOMAIN, description="ROS_DOMAIN_ID; null = environment, or 0"
+    )
     discovery: Discovery = Field(default="localhost", description="ROS_AUTOMATIC_DISCOVERY_RANGE")
     nodes: dict[str, NodeSpec] = Field(min_length=1)
 

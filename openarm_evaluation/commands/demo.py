@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from openarm_bringup.outcome import Outcome
+from openarm_bringup.commands.connect import Sets
+from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from openarm_bringup.supervision.supervisor import Event
     from openarm_evaluation.demo.demo import DemoResult
     from openarm_evaluation.judging.trial import Step, Trial
@@ -27,10 +26,10 @@ def demo(
     place: tuple[float, float, float] | None = None,
     scene: str | None = None,
     graph: str = "sim",
-    set_: Annotated[tuple[str, ...], Parameter(name="--set")] = (),
-    video: bool | None = None,
+    set_: Sets = (),
+    video: Annotated[bool | None, Parameter(negative="--no-video")] = None,
     mount_seed: str | None = None,
-    uncalibrated: Annotated[bool, Parameter(negative=())] = False,
+    uncalibrated: bool = False,
     domain: int | None = None,
     accept: float = 0.9,
 ) -> Outcome:
@@ -45,7 +44,6 @@ def demo(
         place: Where to place it: x y z of the footprint centre, base frame, m (z is not read); chosen when not given.
         scene: Name or path of a scene, or "random".
         graph: Name of a graph, or a file.
-        set_: A parameter, as node.param=value.
         video: Pictures and a video; by default for a single grasp only.
         mount_seed: Of the true camera mounts, or "none" for those of the configuration. Mounts of a seed that was never
             calibrated are calibrated first, once.
@@ -79,9 +77,7 @@ class _Show:
     """Prints what happens, on stderr."""
 
     def __init__(self, *, quiet_steps: bool) -> None:
-        from rich.console import Console
-
-        self._console: Console = Console(stderr=True, highlight=False)
+        self._console = console()
         self._quiet = quiet_steps
         self._first_ns: int | None = None
         self._rows = 0

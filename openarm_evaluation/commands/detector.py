@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from cyclopts import App
 
-from openarm_bringup.outcome import Outcome
+from openarm_bringup.commands.connect import Domain, join_graph
+from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
@@ -21,12 +22,12 @@ if TYPE_CHECKING:
 
     from openarm_evaluation.detector.training.report import Evaluation
 
-app = App(name="detector", help="Make data for, train, measure and look at the network detector.")
+detector = App(name="detector", help="Make data for, train, measure and look at the network detector.")
 
 DATA, RUN = Path("runs/detector/data"), Path("runs/detector/train")
 
 
-@app.command
+@detector.command
 def data(*, out: Path = DATA, train: int = 4000, select: int = 400, report: int = 600, seed: int = 0) -> Outcome:
     """Render pictures of the suite's own world with labels in the YOLO text format; goes on where it was stopped.
 
@@ -48,7 +49,7 @@ def data(*, out: Path = DATA, train: int = 4000, select: int = 400, report: int 
     return Outcome(True, message, data={"made": made, "folder": str(out)})
 
 
-@app.command
+@detector.command
 def train(
     *,
     data: Path = DATA,
@@ -101,7 +102,7 @@ def train(
     return _told(page, results, {"steps": run.step, "cpu_s": run.cpu_s, "files": [str(file) for file in files]})
 
 
-@app.command
+@detector.command
 def report(
     *models: str, data: Path = DATA, out: Path = Path("runs/detector/report.html"), accept: float = 0.9
 ) -> Outcome:
@@ -122,25 +123,23 @@ def report(
     return _told(page, results, {"report": str(page)}, accept)
 
 
-@app.command
-def find(*words: str, domain: int | None = None, timeout: float = 20.0) -> Outcome:
+@detector.command
+def find(*words: str, domain: Domain = None, timeout: float = 20.0) -> Outcome:
     """Find the object that is asked for in words among those that the running detector sees: its label and place.
 
     `openarm detector find red cube left of the can`. Sides are the robot's: left is +y of the base frame.
 
     Args:
         words: Colour, shape, size, and how it stands to another object.
-        domain: ROS_DOMAIN_ID of the graph; found by itself when one graph runs on this machine.
         timeout: Longest wait for a detection, s.
     """
-    from openarm_bringup.commands.pick import meet_graph
-    from openarm_bringup.ros import things_client
+    join_graph(domain)
+    from openarm_bringup.ros import object_client
 
-    meet_graph(domain)
-    (thing,) = things_client.find([" ".join(words)], timeout)
-    x, y, z = (round(float(value), 4) for value in thing.position)
-    message = f"{thing.label} {thing.kind} at x {x} y {y} z {z} m"
-    return Outcome(True, message, data={"label": thing.label, "kind": thing.kind, "position": [x, y, z]})
+    (found,) = object_client.find([" ".join(words)], timeout)
+    x, y, z = (round(float(value), 4) for value in found.position)
+    message = f"{found.label} {found.kind} at x {x} y {y} z {z} m"
+    return Outcome(True, message, data={"label": found.label, "kind": found.kind, "position": [x, y, z]})
 
 
 def _require(folder: Path) -> None:
@@ -194,6 +193,4 @@ def _progress(bars: dict[str, int]) -> Iterator[Callable[[str], None]]:
 
 def _print_row(row: dict[str, float]) -> None:
     """A row of the curve on the console."""
-    from rich.console import Console
-
-    Console(stderr=True, highlight=False).print("  ".join(f"{key} {value:g}" for key, value in row.items()))
+    console().print("  ".join(f"{key} {value:g}" for key, value in row.items()))

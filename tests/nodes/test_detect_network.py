@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 
-from openarm_bringup.ros.things_client import DetectionListener
+from openarm_bringup.ros.object_client import DetectionListener
 from openarm_common.ros.convert import pose_to_matrix, stamp_to_ns
 from openarm_perception.detection.attributes import parse, resolve
 from tests.nodes.detect_bench import TABLE, Bench, FakeCamera

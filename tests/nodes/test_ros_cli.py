@@ -21,7 +21,7 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from openarm_bringup import cli
-from openarm_bringup.commands import param, ros2, tf
+from openarm_bringup.commands import ros2, tf
 from openarm_bringup.ros import peer as peer_client
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF
@@ -123,8 +123,8 @@ def test_mistakes_are_met_with_what_was_perhaps_meant(heard: list[str]) -> None:
         (lambda: ros2.call("/pause", "{pause: true}"), "did you mean paused"),
         (lambda: ros2.call("/pause", "{"), "is not YAML"),
         (lambda: ros2.send("/pikc"), "did you mean /pick"),
-        (lambda: param.get("prob", "height"), "did you mean /probe"),
-        (lambda: param.get("probe", "heigth"), "did you mean height"),
+        (lambda: ros2.param_get("prob", "height"), "did you mean /probe"),
+        (lambda: ros2.param_get("probe", "heigth"), "did you mean height"),
         (lambda: tf.echo("world", "camra"), "did you mean camera"),
     ):
         with pytest.raises(OpenArmError) as refused:
@@ -143,7 +143,7 @@ def test_where_nobody_runs_every_command_says_so(
         assert cli.run([*command, "--json"]) == 1
         answer = json.loads(capsys.readouterr().out)
         assert answer["code"] == Code.NOT_READY
-        assert f"no node is heard in domain {domain} " in answer["message"]
+        assert f"no node is discovered in domain {domain} " in answer["message"]
     bag = tmp_path / "bag"
     assert cli.run(["record", str(bag), "--duration", "0.2", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["code"] == Code.NOTHING_DETECTED
@@ -157,11 +157,11 @@ def test_nodes_and_parameters(heard: list[str]) -> None:
     assert info.data["offers"]["/pause"] == "openarm_interfaces/srv/SetPause"
     assert info.data["offers actions"] == {"/pick": "openarm_interfaces/action/Pick"}
     assert "_action" not in info.text
-    assert "height" in param.list_("probe").data["parameters"]
-    assert param.set_("probe", "height", "0.7").success
-    assert param.get("probe", "height").text == "0.7"
-    assert "ros__parameters:" in param.dump("probe").text
-    wrong = param.set_("probe", "height", "tall")
+    assert "height" in ros2.param_list("probe").data["parameters"]
+    assert ros2.param_set("probe", "height", "0.7").success
+    assert ros2.param_get("probe", "height").text == "0.7"
+    assert "ros__parameters:" in ros2.param_dump("probe").text
+    wrong = ros2.param_set("probe", "height", "tall")
     assert not wrong.success
     assert "--set probe.height=tall" in wrong.message
 
@@ -184,4 +184,4 @@ def test_a_frame_that_two_tell_of_is_named(ros, heard: list[str]) -> None:
     second.publish(TFMessage(transforms=[edge]))
     tree = tf.tree()
     assert (tree.success, list(tree.data["clashes"])) == (False, ["camera"])
-    assert "camera hangs below" in tree.message
+    assert "camera has the parents" in tree.message

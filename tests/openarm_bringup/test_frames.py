@@ -42,10 +42,10 @@ def test_one_publisher_may_tell_again_and_again() -> None:
 @pytest.mark.parametrize(
     ("second", "number", "static", "said"),
     [
-        (told("world", "arm"), 8, False, "hangs below base and below world"),
-        (told("base", "arm"), 8, True, "is told on /tf and on /tf_static"),
-        (told("base", "arm"), 7, False, "is told by two on /tf"),
-        (told("base", "arm"), 3, False, "is told by two on /tf"),
+        (told("world", "arm"), 8, False, "has the parents base and world"),
+        (told("base", "arm"), 8, True, "is published on /tf and on /tf_static"),
+        (told("base", "arm"), 7, False, "has two publishers on /tf"),
+        (told("base", "arm"), 3, False, "has two publishers on /tf"),
     ],
 )
 def test_a_second_publisher_of_a_frame_is_named(second: TFMessage, number: int, static: bool, said: str) -> None:
@@ -83,8 +83,8 @@ def test_a_picture_that_cannot_be_written_says_why(tmp_path: Path) -> None:
 
 
 def test_what_is_wrong_with_many_frames_is_said_once() -> None:
-    clashes = {f"link{i}": "is told by two on /tf" for i in range(6)} | {"eye": "hangs below a and below b"}
+    clashes = {f"link{i}": "has two publishers on /tf" for i in range(6)} | {"eye": "has the parents a and b"}
     assert tf._grouped(clashes) == [
-        "eye hangs below a and below b",
-        "each of link0, link1, link2, link3 and 2 more is told by two on /tf",
+        "eye has the parents a and b",
+        "each of link0, link1, link2, link3 and 2 more has two publishers on /tf",
     ]

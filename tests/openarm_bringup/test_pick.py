@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm pick`: requests in words, and what a dry run prints of the ways to grasp."""
+"""`openarm pick`: requests in words, and what a dry run prints of the candidates."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from openarm_bringup.commands import pick
-from openarm_bringup.ros import things_client
+from openarm_bringup.commands import connect, pick
+from openarm_bringup.ros import object_client
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import Option
@@ -26,29 +26,29 @@ OPTIONS = (
 )
 
 
-def test_each_way_to_grasp_has_a_line_with_parts_margin_and_reason() -> None:
-    head, chosen, refused, wide, _ = pick._weighed(OPTIONS).splitlines()
-    assert head.split() == ["way", "to", "grasp", "arm", "score", "tilt", "width", "margin"]
+def test_each_candidate_has_a_line_with_parts_margin_and_reason() -> None:
+    head, chosen, refused, wide, _ = pick._options_table(OPTIONS).splitlines()
+    assert head.split() == ["candidate", "arm", "score", "tilt", "width", "margin"]
     assert chosen.split() == ["red/x+/tilt0", "left", "+0.05", "+0.00", "+0.05", "29°", "chosen"]
     assert refused.endswith("IN_COLLISION: [hand] meets blue")
     assert wide.split() == ["red/y", "left", "TOO_WIDE:", "90", "mm", "wide"]
-    assert pick._weighed(()) == ""
+    assert pick._options_table(()) == ""
 
 
-def test_words_mean_the_object_that_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_words_select_the_object_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
     def find(requests: Sequence[str]) -> list[Thing]:
         asked.extend(requests)
         return [Thing("red", "box", (0.3, -0.2, 0.42), (0.05, 0.05, 0.05), 0.9)]
 
-    monkeypatch.setattr(things_client, "find", find)
-    labels, spots = pick._meant(("blue", "red cube left of the can"), ((0.1, 0.2), None))
+    monkeypatch.setattr(object_client, "find", find)
+    labels, spots = pick._resolve(("blue", "red cube left of the can"), ((0.1, 0.2), None))
     assert (labels, spots) == (["blue", "red"], [(0.1, 0.2), (0.3, -0.2)])
     assert asked == ["red cube left of the can"]
-    assert pick._meant(("blue",), (None,)) == (("blue",), (None,))
+    assert pick._resolve(("blue",), (None,)) == (("blue",), (None,))
     with pytest.raises(OpenArmError, match="leave --at out"):
-        pick._meant(("red cube",), ((0.3, -0.2),))
+        pick._resolve(("red cube",), ((0.3, -0.2),))
 
 
 def test_a_graph_without_grasping_is_named_with_one_that_has_it(
@@ -73,7 +73,7 @@ def test_a_graph_without_grasping_is_named_with_one_that_has_it(
         runs.write_record(record)
 
     def ask() -> str:
-        with pytest.raises(OpenArmError) as refused, pick.needing("grasp", "sim"):
+        with pytest.raises(OpenArmError) as refused, connect.requires_node("grasp", "sim"):
             raise OpenArmError(Code.NOT_READY, "no action")
         assert refused.value.code == Code.NOT_READY
         return refused.value.message
@@ -87,6 +87,6 @@ def test_a_graph_without_grasping_is_named_with_one_that_has_it(
 
 
 def test_json_has_no_number_for_a_margin_that_is_not_known() -> None:
-    chosen, refused, _ = json.loads(json.dumps([pick._fared(option) for option in OPTIONS], allow_nan=False))
+    chosen, refused, _ = json.loads(json.dumps([pick._option_row(option) for option in OPTIONS], allow_nan=False))
     assert (chosen["limit_margin"], chosen["code"]) == (0.5, "OK")
     assert (refused["limit_margin"], refused["parts"]) == (None, {"tilt": 0.0, "width": 0.05})

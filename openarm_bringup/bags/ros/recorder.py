@@ -26,7 +26,8 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from openarm_bringup.bags.bag import BagWriter
 from openarm_bringup.bags.losses import Arrivals
 from openarm_bringup.messages import interface
-from openarm_bringup.supervision.environment import PROFILE, profiled
+from openarm_bringup.supervision.discovery import PROFILE
+from openarm_bringup.supervision.environment import profiled
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.ros.client import ContextNode

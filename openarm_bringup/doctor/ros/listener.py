@@ -11,9 +11,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from openarm_bringup.doctor.graph import RATES, Heard
 from openarm_bringup.messages import interface
 from openarm_bringup.ros.peer import Peer
+from openarm_bringup.supervision.discovery import variables
 from openarm_bringup.supervision.runs import RunRecord
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.node import QOS_COMMAND, offered_qos
+from openarm_common.ros.node import QOS_COMMAND
 
 #: Long enough for two rounds of /diagnostics, s.
 _LISTEN_S = 2.5
@@ -30,9 +31,7 @@ def listen(run: RunRecord) -> Heard:
 
 
 def _listen(run: RunRecord) -> Heard:
-    os.environ["ROS_DOMAIN_ID"] = str(run.domain)
-    if run.discovery != "system_default":
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = run.discovery.upper()
+    os.environ.update(variables(run.domain, run.discovery))
     counts: dict[str, int] = {}
     said: dict[str, tuple[bool, str]] = {}
 
@@ -52,8 +51,7 @@ def _listen(run: RunRecord) -> Heard:
         for topic, kind in peer.topics().items():
             if topic in RATES:
                 counts[topic] = 0
-                profile = offered_qos(peer.node, topic, 200)
-                peer.node.create_subscription(interface(kind), topic, count(topic), profile, raw=True)
+                peer.node.create_subscription(interface(kind), topic, count(topic), peer.offered(topic), raw=True)
         peer.node.create_subscription(DiagnosticArray, "/diagnostics", note, QOS_COMMAND)
         began = peer.node.get_clock().now()
         peer.spin_until(lambda: False, _LISTEN_S)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the detector of a running graph sees now, as things that requests in words choose from. Base frame, m."""
+"""Objects that the detector of a running graph observes now, and requests in words for one of them. Base frame, m."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from openarm_perception.detection.attributes import Thing, parse, resolve
 
 
 class DetectionListener(BackgroundNode):
-    """Hears what the detector finds; while it listens, the detector works."""
+    """Receives detections; the detector works only while it has a subscriber."""
 
     def __init__(self) -> None:
-        self._heard: queue.Queue[Detection3DArray] = queue.Queue()
+        self._received: queue.Queue[Detection3DArray] = queue.Queue()
         super().__init__("detection_listener")
-        self._node.create_subscription(Detection3DArray, "/detections_3d", self._heard.put, reliable(5))
+        self._node.create_subscription(Detection3DArray, "/detections_3d", self._received.put, reliable(5))
 
     def next(self, timeout: float) -> list[Thing]:
-        """The measured objects of the next answer that has any, or of the last one.
+        """Return the measured objects of the next message that has any, or of the last one.
 
         Raises:
-            OpenArmError: TIMEOUT, when no answer comes.
+            OpenArmError: TIMEOUT, when no message comes.
         """
         deadline = time.monotonic() + timeout
         found: list[Thing] | None = None
         while not found and (left := deadline - time.monotonic()) > 0.0:
             try:
-                found = things(self._heard.get(timeout=left))
+                found = objects(self._received.get(timeout=left))
             except queue.Empty:
                 break
         if found is None:
@@ -45,23 +45,23 @@ class DetectionListener(BackgroundNode):
 
 
 def find(requests: Sequence[str], timeout: float = 20.0) -> list[Thing]:
-    """The objects that requests in words mean, such as "red cube left of the can", as the detector sees them now.
+    """Return the objects that requests in words select, such as "red cube left of the can".
 
     Raises:
-        OpenArmError: TIMEOUT, when the detector says nothing; as `parse` and `resolve`.
+        OpenArmError: TIMEOUT, when the detector publishes nothing; as `parse` and `resolve`.
     """
     with DetectionListener() as listener:
-        seen = listener.next(timeout)
-    labels = [thing.label for thing in seen]
-    return [resolve(parse(request, labels), seen) for request in requests]
+        observed = listener.next(timeout)
+    labels = [item.label for item in observed]
+    return [resolve(parse(request, labels), observed) for request in requests]
 
 
-def things(message: Detection3DArray) -> list[Thing]:
-    """The objects of a message that were measured."""
-    return [_thing(d) for d in message.detections if d.results and d.results[0].hypothesis.score > 0.0]
+def objects(message: Detection3DArray) -> list[Thing]:
+    """Return the objects of a message that were measured."""
+    return [_object(d) for d in message.detections if d.results and d.results[0].hypothesis.score > 0.0]
 
 
-def _thing(detection: Detection3D) -> Thing:
+def _object(detection: Detection3D) -> Thing:
     names = [result.hypothesis.class_id for result in detection.results]
     position = xyz(detection.bbox.center.position)
     size = detection.bbox.size
