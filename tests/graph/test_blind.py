@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,9 @@ from openarm_common.scene.scene import load_scene
 from openarm_evaluation.judging.judge import JudgeConfig
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import wait_scene
-from openarm_grasp.ros.client import GraspClient, GraspResult
+from openarm_grasp.ros.client import GraspClient
 from openarm_motion.ros.client import MotionClient
+from tests.graph.asking import Asked
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 
@@ -30,7 +30,6 @@ only: [mujoco_bridge, calibration_publisher, detector, wrist_detector, motion, g
 nodes:
   detector: {restart: {policy: never}}
   wrist_detector: {restart: {policy: never}}
-  grasp: {params: {scene: "${scene}", detect.frame_timeout: 1.0}}
 """
 
 
@@ -43,16 +42,13 @@ def test_a_detector_that_dies_during_a_grasp_leaves_the_arm_at_rest_and_the_serv
     up = start_graph(str(graph))
     pids = {name: node["pid"] for name, node in up.wait_ready()["nodes"].items()}
     monkeypatch.setenv("ROS_DOMAIN_ID", str(up.domain))
-    results: list[GraspResult] = []
     with Observer(up.domain) as observer, GraspClient() as client, MotionClient() as motion:
         wait_scene(observer, load_scene("demo"), 0, JudgeConfig())
-        asking = threading.Thread(target=lambda: results.append(client.pick("red")))
-        asking.start()
-        observer.wait(lambda: any(step.state == "MOVE_TO_PREGRASP" for step in observer.steps()), 60.0, "the approach")
+        request = Asked(observer, lambda: client.pick("red"))
+        request.wait_state("MOVE_TO_PREGRASP")
         for eye in ("detector", "wrist_detector"):
             os.kill(pids[eye], signal.SIGKILL)
-        asking.join(timeout=40.0)
-        (result,) = results
+        result = request.result(timeout=90.0)
         assert not result.success
         assert result.code in (Code.STALE_DATA, Code.NOT_READY), f"{result.code}: {result.message}"
         assert "detector" in result.message

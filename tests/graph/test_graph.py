@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,7 +25,8 @@ from openarm_evaluation.campaign.gap import LEAST_GAP, least_gap
 from openarm_evaluation.judging.judge import JudgeConfig, judge
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import run_pair, wait_scene
-from openarm_grasp.ros.client import GraspClient, GraspResult
+from openarm_grasp.ros.client import GraspClient
+from tests.graph.asking import Asked
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
 
@@ -115,16 +115,13 @@ def test_grasp_by_service_lifts_and_places_and_a_second_one_is_refused_at_once(
     wait_scene(observer, load_scene("demo"), 0, JudgeConfig())
     observer.forget()
     observer.wait(lambda: observer.track("red_cube") or None, 5.0, "ground truth")
-    answers: list[Grasp.Response] = []
-    asking = threading.Thread(target=lambda: answers.append(call_grasp(domain, label="red")))
-    asking.start()
-    observer.wait(lambda: any(step.state == "MOVE_TO_PREGRASP" for step in observer.steps()), 60.0, "motion")
+    request = Asked(observer, lambda: call_grasp(domain, label="red"))
+    request.wait_state("MOVE_TO_PREGRASP")
+    assert client.pick("blue").code == Code.BUSY  # the client has met the server now
     began = time.monotonic()
-    second = client.pick("blue")
-    assert second.code == Code.BUSY
+    assert client.pick("blue").code == Code.BUSY
     assert time.monotonic() - began < 1.0
-    asking.join(timeout=120.0)
-    (answer,) = answers
+    answer = request.result(timeout=120.0)
     assert answer.success, f"{answer.code}: {answer.message}"
     time_at_end = observer.track("red_cube")[-1].t_ns
     observer.wait(lambda: observer.track("red_cube")[-1].t_ns > time_at_end + 10**9, 20.0, "a second at rest")
@@ -156,16 +153,13 @@ def test_bridge_killed_during_a_grasp_is_a_named_code_and_the_graph_comes_back(
     after_ns = observer.reset_world("demo", 0)
     wait_scene(observer, load_scene("demo"), after_ns, JudgeConfig())
     observer.forget()
-    results: list[GraspResult] = []
-    asking = threading.Thread(target=lambda: results.append(client.pick("red")))
-    asking.start()
-    observer.wait(lambda: any(step.state == "MOVE_TO_GRASP" for step in observer.steps()), 60.0, "the approach")
     bridge = up.record()["nodes"]["mujoco_bridge"]["pid"]
+    request = Asked(observer, lambda: client.pick("red"))
+    request.wait_state("MOVE_TO_GRASP")
     os.kill(bridge, signal.SIGKILL)
     killed = time.monotonic()
-    asking.join(timeout=20.0)
+    result = request.result(timeout=20.0)
     seconds = time.monotonic() - killed
-    (result,) = results
     assert not result.success
     assert result.code in LOST, f"{result.code}: {result.message}"
     assert seconds < 2.0

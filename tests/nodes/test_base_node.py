@@ -56,7 +56,7 @@ def test_diagnostics_are_published_each_second(ros) -> None:
     ros.node.create_subscription(DiagnosticArray, "/diagnostics", got.append, QOS_COMMAND)
     node = ros.add(BaseNode("example", _Example))
     node.diagnose(True, "all is well", frames=3)
-    ros.spin_until(lambda: any(s.message == "all is well" for m in got for s in m.status), 5.0, "a status")
+    ros.spin_until(lambda: any(s.message == "all is well" for m in got for s in m.status), 20.0, "a status")
     status = got[-1].status[0]
     assert status.name == "example: status"
     assert status.level == b"\x00"

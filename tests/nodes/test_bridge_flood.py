@@ -88,12 +88,12 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_told(ros, tmp_pat
         ros.spin_until(lambda: len(published) > 400, 20.0, "four seconds of joint states")
         periods = np.diff(published) * 1e-6
         reports = len(told)
-        ros.spin_until(lambda: len(told) >= reports + 2, 5.0, "/diagnostics")
+        ros.spin_until(lambda: len(told) >= reports + 2, 20.0, "/diagnostics")
         kept = abs(periods.mean() - 10.0) < 0.2 and np.percentile(periods, 99) <= 15.0
         assert kept or (not status()["ok"] and status()["message"].startswith(("late", "slower"))), status()
         # It still listens to others.
         assert ros.call(ros.node.create_client(SetPause, "/sim/set_pause"), SetPause.Request(paused=True)).success
-        ros.spin_until(lambda: status()["message"] == "paused", 5.0, "the pause on /diagnostics")
+        ros.spin_until(lambda: status()["message"] == "paused", 20.0, "the pause on /diagnostics")
         bridge.send_signal(signal.SIGINT)
         code = bridge.wait(timeout=10.0)
         errors = (tmp_path / "log").read_text()

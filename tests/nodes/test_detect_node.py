@@ -155,7 +155,7 @@ def test_old_frames_are_dropped_not_queued(ros, bench) -> None:
     for i in range(20):
         bench.camera.publish(bench.t_ns + 10 * i * MS)
         ros.executor.spin_once(timeout_sec=0.02)
-    ros.spin_until(lambda: len(bench.watch.got) > count, 5.0, "an answer")
+    ros.spin_until(lambda: len(bench.watch.got) > count, 20.0, "an answer")
     assert len(bench.watch.got) - count <= 2
 
 
@@ -254,7 +254,7 @@ def test_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) -> None:
     t = bench.node.waiting_ns
     for offset, q in ((-8, 0.46), (12, 0.56), (400, 1.2)):
         bench.camera.joints.publish(arm(t + offset * MS, q))
-    ros.spin_until(lambda: bench.watch.got, 5.0, "the detection of the frame that waited")
+    ros.spin_until(lambda: bench.watch.got, 20.0, "the detection of the frame that waited")
     assert stamp_to_ns(bench.watch.got[0].header.stamp) == t
     (found,) = bench.watch.got[0].detections
     np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.0015)
@@ -268,10 +268,10 @@ def test_a_joint_state_just_before_the_image_is_not_enough_while_the_next_is_to_
     t = bench.node.waiting_ns
     bench.camera.joints.publish(arm(t - 3 * MS, 0.47))
     looks_again = time.monotonic() + 0.3
-    ros.spin_until(lambda: bench.watch.got or time.monotonic() > looks_again, 5.0, "time to look again")
+    ros.spin_until(lambda: bench.watch.got or time.monotonic() > looks_again, 20.0, "time to look again")
     assert not bench.watch.got
     bench.camera.joints.publish(arm(t + 12 * MS, 0.62))
-    ros.spin_until(lambda: bench.watch.got, 5.0, "the detection of the frame that waited")
+    ros.spin_until(lambda: bench.watch.got, 20.0, "the detection of the frame that waited")
     (found,) = bench.watch.got[0].detections
     np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.0015)
 
@@ -280,7 +280,7 @@ def test_a_joint_state_just_before_the_image_is_not_enough_while_the_next_is_to_
 def test_a_frame_20_ms_from_any_joint_state_is_skipped(ros) -> None:
     """Nothing within 5 ms and nothing that brackets: skipped and named, no detection, and the node goes on."""
     bench = on_arm(ros, transform_wait=0.1)
-    ros.spin_until(bench.camera.joints.get_subscription_count, 5.0, "joint states are listened to")
+    ros.spin_until(bench.camera.joints.get_subscription_count, 20.0, "joint states are listened to")
 
     def with_joints(offset_ms: int):
         def make(t_ns: int) -> CameraInfo:

@@ -91,14 +91,14 @@ def test_reset_is_visible_at_once_and_boxes_are_cleared(bench) -> None:
     bench.ros.spin_until(lambda: bench.node.idle, 10.0, "all images are in the map")
     box = BoundingBoxQuery.Request(min=Point(x=0.4, y=0.2, z=0.38), max=Point(x=0.5, y=0.3, z=0.44))
     bench.call(BoundingBoxQuery, "/octomap/clear_bbox", box)
-    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", 5.0, "the box is free")
+    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", 20.0, "the box is free")
     answer = bench.call(ClearMap, "/octomap/clear", ClearMap.Request(min=box.min, max=box.max, state="unknown"))
     assert (answer.success, answer.code, answer.cells) == (True, "OK", 6 * 6 * 4)
-    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", 5.0, "the box is unknown")
+    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", 20.0, "the box is unknown")
     answer = bench.call(ClearMap, "/octomap/clear", ClearMap.Request(min=box.min, max=box.max))
-    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", 5.0, "the box is free")
+    bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "free", 20.0, "the box is free")
     bench.call(Empty, "/octomap/reset")
-    bench.ros.spin_until(lambda: len(bench.maps[-1].data) == 0, 5.0, "the map is empty")
+    bench.ros.spin_until(lambda: len(bench.maps[-1].data) == 0, 20.0, "the map is empty")
     wrong = BoundingBoxQuery.Request(min=Point(x=1.0), max=Point(x=0.0))
     bench.call(BoundingBoxQuery, "/octomap/clear_bbox", wrong)
     for request, text in (
@@ -159,10 +159,10 @@ def test_maps_are_saved_and_loaded_and_damaged_files_leave_the_map_alone(bench, 
     for suffix in (".bt", ".ot"):
         bench.ros.spin_until(lambda: bench.node.idle, 10.0, "all images are in the map")
         bench.call(Empty, "/octomap/reset")
-        bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", 5.0, "the map is empty")
+        bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "unknown", 20.0, "the map is empty")
         answer = file("load", tmp_path / f"map{suffix}")
         assert (answer.success, answer.outside) == (True, 0)
-        bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "occupied", 5.0, "the map is back")
+        bench.ros.spin_until(lambda: bench.state(ON_TABLE) == "occupied", 20.0, "the map is back")
 
 
 @pytest.mark.requirement("P-05")
@@ -180,7 +180,7 @@ def test_the_robot_and_what_it_holds_are_not_in_the_map(bench) -> None:
     bench.held.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL), marker]))
     bench.show(sheet(tool[2, 3]), lambda: bench.state(near) != "occupied", "the held tray is cut out")
     bench.ros.spin_until(
-        lambda: int(bench.value("overhead_removed/held/left/tray") or 0) > 100, 5.0, "its pixels counted"
+        lambda: int(bench.value("overhead_removed/held/left/tray") or 0) > 100, 20.0, "its pixels counted"
     )
     bench.held.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL)]))
     bench.show(sheet(tool[2, 3]), lambda: bench.state(near) == "occupied", "it was let go")

@@ -38,6 +38,9 @@ def record(ros, path: Path, count: int, patterns: tuple[str, ...] = (".*",)) -> 
     with Recorder(int(os.environ["ROS_DOMAIN_ID"]), path, patterns, {}) as recorder:
         publishers = [chatter, latched, images] if patterns == (".*",) else [chatter]
         ros.spin_until(lambda: all(p.get_subscription_count() for p in publishers), what="the recorder subscribes")
+        # A best-effort message is lost while its reader has not met the publisher, though that has met the reader.
+        readers = [subscription for subscription, _ in recorder._readers]
+        ros.spin_until(lambda: all(reader.get_publisher_count() for reader in readers), what="it meets the publishers")
         for i in range(count):
             chatter.publish(String(data=str(i)))
             images.publish(array_to_image(picture, "rgb8", "optical", i * 33_333_333))

@@ -28,7 +28,7 @@ from openarm_common.scene.scene import load_scene
 
 QUICK = {
     "auto.search.draws": 500, "auto.search.candidates": 12, "auto.tries": 10, "auto.settle_timeout": 1.0,
-    "image_timeout": 0.5, "state_timeout": 0.5,
+    "image_timeout": 3.0, "state_timeout": 3.0,
 }  # fmt: skip
 
 

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A request that runs while a test watches what it does."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Generic, TypeVar
+
+from openarm_evaluation.judging.ros.observer import Observer
+
+T = TypeVar("T")
+
+
+class Asked(Generic[T]):
+    """A request in a thread of its own that nobody has to wait for.
+
+    Args:
+        observer: Of the graph; it has heard ground truth.
+        ask: The request; what it raises is raised where the result is read.
+    """
+
+    def __init__(self, observer: Observer, ask: Callable[[], T]) -> None:
+        truth = observer.truth()
+        assert truth is not None, "wait for ground truth first"
+        self._observer = observer
+        #: /grasp/status is latched: a new observer also hears states of grasps before this time.
+        self._since_ns = truth.t_ns
+        self._future: Future[T] = Future()
+        threading.Thread(target=self._work, args=(ask,), name="asking", daemon=True).start()
+
+    def _work(self, ask: Callable[[], T]) -> None:
+        try:
+            self._future.set_result(ask())
+        except BaseException as error:
+            self._future.set_exception(error)
+
+    def result(self, timeout: float) -> T:
+        """Return the answer."""
+        return self._future.result(timeout)
+
+    def wait_state(self, state: str, seconds: float = 60.0) -> None:
+        """Wait until the grasp has entered a state; fail at once, with the answer, when the request ends before."""
+
+        def entered() -> bool:
+            return any(step.state == state and step.t_ns >= self._since_ns for step in self._observer.steps())
+
+        self._observer.wait(lambda: entered() or self._future.done(), seconds, f"the state {state}")
+        assert entered(), f"the request ended before {state}: {self._future.result()}"
