@@ -4,17 +4,15 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from openarm_bringup.supervision import environment, runs
+from openarm_bringup.supervision import runs
 from openarm_bringup.supervision.graph import load_graph
-from openarm_bringup.supervision.session import in_thread, running_graph
+from openarm_bringup.supervision.session import running_graph, work_until_stopped
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
@@ -55,7 +53,7 @@ class CalibrationOptions:
 
 @dataclass
 class CalibrationListeners:
-    """Who is told what while it happens; each is called in some thread."""
+    """Callbacks while it happens; each is called in some thread."""
 
     on_event: Callable[[Event], None] = lambda event: None
     on_ready: Callable[[float], None] = lambda seconds: None
@@ -65,7 +63,7 @@ class CalibrationListeners:
 
 @dataclass
 class CalibrationRun:
-    """What came out, by camera in the order of the work; session files lie in the run folder."""
+    """Results by camera, in the order of the work; session files are in the run folder."""
 
     run_dir: Path
     results: dict[str, AutoResult] = field(default_factory=dict[str, "AutoResult"])
@@ -74,7 +72,7 @@ class CalibrationRun:
 
 
 def scene_of(camera: str) -> str:
-    """Name of the scene in which a camera is calibrated."""
+    """Return the name of the scene in which a camera is calibrated."""
     return f"calibration_{camera}"
 
 
@@ -106,29 +104,14 @@ def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners
     overrides = {"domain": domain, "scene": scene_of(cameras[0]), "mount_seed": options.mount_seed}
     graph = load_graph(GRAPH, overrides=overrides, sets=sets)
     run = CalibrationRun(runs.new_run_dir())
-    told = listeners or CalibrationListeners()
+    listeners = listeners or CalibrationListeners()
     stop = threading.Event()
 
     async def work() -> None:
-        began = time.monotonic()
-        # Clients made in this process find the graph through the environment.
-        os.environ.update(environment.ros_environment(graph))
-        async with running_graph(graph, run.run_dir, told.on_event) as supervisor:
-            await supervisor.wait_ready()
-            run.ready_s = time.monotonic() - began
-            told.on_ready(run.ready_s)
-            job = in_thread(lambda: _all(options, cameras, run, told, stop), "calibration")
-            asked = asyncio.create_task(supervisor.wait_stop_asked())
-            await asyncio.wait([job, asked], return_when=asyncio.FIRST_COMPLETED)
-            try:
-                if not job.done():
-                    stop.set()
-                    await asyncio.wait([job], timeout=10.0)
-                    asked.result()
-                    raise OpenArmError(Code.CANCELLED, "stopped by Ctrl-C")
-                job.result()
-            finally:
-                asked.cancel()
+        async with running_graph(graph, run.run_dir, listeners.on_event) as supervisor:
+            run.ready_s = await supervisor.wait_ready()
+            listeners.on_ready(run.ready_s)
+            await work_until_stopped(supervisor, lambda: _all(options, cameras, run, listeners, stop), stop.set)
 
     try:
         asyncio.run(work())
@@ -141,7 +124,7 @@ def _all(
     options: CalibrationOptions,
     cameras: Sequence[str],
     run: CalibrationRun,
-    told: CalibrationListeners,
+    listeners: CalibrationListeners,
     stop: threading.Event,
 ) -> None:
     from openarm_bringup.ros.simulation import reset_world
@@ -149,7 +132,7 @@ def _all(
 
     with CalibrationClient() as client:
         for k, camera in enumerate(cameras):
-            told.on_camera(camera)
+            listeners.on_camera(camera)
             if k:
                 reset_world(client, scene_of(camera))
             run.results[camera] = client.auto(
@@ -159,7 +142,7 @@ def _all(
                 measure_delay=options.delay,
                 save=options.save,
                 session=str((run.run_dir / f"{camera}.npz").absolute()),
-                on_feedback=told.on_feedback,
+                on_feedback=listeners.on_feedback,
                 stop=stop,
             )
             if stop.is_set():
@@ -167,19 +150,12 @@ def _all(
 
 
 def as_row(result: AutoResult) -> dict[str, Any]:
-    """What `--json` and reports write of one camera."""
+    """Return what `--json` and reports write of one camera."""
+    names = ("success", "message", "grade", "sigma_translation", "sigma_rotation", "samples", "path", "duration")
     T = result.T_parent_link
-    return {
-        "success": result.success,
+    return {name: getattr(result, name) for name in names} | {
         "code": str(result.code),
-        "message": result.message,
-        "grade": result.grade,
         "T_parent_link": None if T is None else T.tolist(),
-        "sigma_translation": result.sigma_translation,
-        "sigma_rotation": result.sigma_rotation,
-        "samples": result.samples,
         "missed": list(result.missed),
         "delay": None if result.delay is None else {"seconds": result.delay[0], "sigma": result.delay[1]},
-        "path": result.path,
-        "duration": result.duration,
     }

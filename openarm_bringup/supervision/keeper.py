@@ -5,23 +5,22 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from enum import StrEnum
-from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol
 
 from openarm_bringup.suggest import unknown
 from openarm_bringup.supervision import environment, shm
-from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready
-from openarm_bringup.supervision.process import Haste, Ladder, NodeProcess
+from openarm_bringup.supervision.graph import Ready
+from openarm_bringup.supervision.process import NodeProcess
 from openarm_common.errors import Code, OpenArmError
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from openarm_bringup.supervision.supervisor import Supervisor
 
 
 class Probe(Protocol):
-    """What is asked of the ROS graph; see readiness_client."""
+    """Questions to the ROS graph; see `supervision.ros.readiness.ReadinessClient`."""
 
     def known(self, conditions: Sequence[Ready]) -> frozenset[str]:
         """Return what fulfils the conditions before a start."""
@@ -41,7 +40,7 @@ class Probe(Protocol):
 
 
 class NodeState(StrEnum):
-    """Where a node stands."""
+    """State of a node."""
 
     WAITING = "waiting"
     STARTING = "starting"
@@ -52,45 +51,20 @@ class NodeState(StrEnum):
     STOPPED = "stopped"
 
 
-class AskProbe(Protocol):
-    """Puts a question to the probe from the event loop."""
-
-    def __call__(self, question: Callable[[Probe], T]) -> Awaitable[T]:
-        """Return the answer."""
-        ...
-
-
-@dataclass(frozen=True)
-class Shared:
-    """What all keepers of a graph have in common."""
-
-    graph: Graph
-    run_dir: Path
-    ask: AskProbe
-    spawning: asyncio.Lock
-    stop_asked: asyncio.Event
-    haste: Haste
-    ladder: Ladder
-    poll: float
-    tell_guard: Callable[[str], None]
-    say: Callable[[str], None]
-    changed: Callable[[str, NodeState, str], None]
-
-
 class Keeper:
     """One node, from the first start to the stop."""
 
-    def __init__(self, name: str, spec: NodeSpec, shared: Shared) -> None:
+    def __init__(self, name: str, supervisor: Supervisor) -> None:
         self.name = name
-        self.spec = spec
+        self.spec = supervisor.graph.nodes[name]
         self.state = NodeState.WAITING
         self.process: NodeProcess | None = None
         self.restarts = 0
         self.ready = asyncio.Event()
-        self.log = shared.run_dir / "logs" / f"{name}.log"
+        self.log = supervisor.run_dir / "logs" / f"{name}.log"
         #: Names in /dev/shm that its processes have used.
         self.mapped: set[str] = set()
-        self._shared = shared
+        self._supervisor = supervisor
         self._was_ready = False
 
     @property
@@ -138,23 +112,23 @@ class Keeper:
         code = self.process.returncode
         if code is None:
             self.mapped |= shm.mapped_by(self.process.pid)
-            code = await self.process.stop(self._shared.haste, self._shared.ladder)
-        self._shared.tell_guard(f"-{self.process.pid}")
+            code = await self.process.stop(self._supervisor.haste, self._supervisor.ladder)
+        self._supervisor.tell_guard(f"-{self.process.pid}")
         if self.state not in (NodeState.FAILED, NodeState.EXITED):
             self._enter(NodeState.STOPPED, f"killed ({code})" if self.process.killed else f"code {code}")
 
     async def _run_once(self) -> tuple[int, str, float]:
         """Run the process until it ends; return its exit code, why it ended, and how long it was ready, s."""
-        shared, conditions = self._shared, self.spec.ready
-        argv = environment.node_arguments(shared.graph, self.name, shared.run_dir)
-        env = environment.node_environment(shared.graph, self.name, shared.run_dir)
+        supervisor, conditions = self._supervisor, self.spec.ready
+        argv = environment.node_arguments(supervisor.graph, self.name, supervisor.run_dir)
+        env = environment.node_environment(supervisor.graph, self.name, supervisor.run_dir)
         # Endpoints of a killed process linger in discovery; only those of the new one count.
-        old = await shared.ask(lambda probe: probe.known(conditions)) if self._was_ready else frozenset[str]()
-        async with shared.spawning:
-            if shared.stop_asked.is_set():
+        old = await supervisor.ask(lambda probe: probe.known(conditions)) if self._was_ready else frozenset[str]()
+        async with supervisor.spawning:
+            if supervisor.stop_asked.is_set():
                 raise asyncio.CancelledError
             self.process = process = await NodeProcess.start(argv, env, self.log)
-            shared.tell_guard(f"+{process.pid}")
+            supervisor.tell_guard(f"+{process.pid}")
         self._enter(NodeState.STARTING, f"pid {process.pid}")
         began = time.monotonic()
         ended = asyncio.create_task(process.wait())
@@ -164,8 +138,8 @@ class Keeper:
                 {ended, getting_ready}, timeout=self.spec.ready_timeout, return_when=asyncio.FIRST_COMPLETED
             )
             if not ended.done() and not getting_ready.done():
-                missing = ", ".join(await shared.ask(lambda probe: probe.unmet(conditions, old)))
-                await process.stop(shared.haste, shared.ladder)
+                missing = ", ".join(await supervisor.ask(lambda probe: probe.unmet(conditions, old)))
+                await process.stop(supervisor.haste, supervisor.ladder)
                 return 1, f"was not ready after {self.spec.ready_timeout:g} s; missing: {missing}", 0.0
             ready_at = time.monotonic()
             if getting_ready.done() and not ended.done():
@@ -180,22 +154,22 @@ class Keeper:
             ended.cancel()
         ready_s = time.monotonic() - ready_at if self.ready.is_set() else 0.0
         self.ready.clear()
-        shared.tell_guard(f"-{process.pid}")
+        supervisor.tell_guard(f"-{process.pid}")
         if code < 0 or process.killed:
             # Killed processes leave their segments behind; free them before the next start needs the space.
-            shared.say(await asyncio.to_thread(shm.clean_shm))
+            supervisor.say(await asyncio.to_thread(shm.clean_shm))
         return code, f"ended by signal {-code}" if code < 0 else f"ended with code {code}", ready_s
 
     async def _get_ready(self, old: frozenset[str]) -> None:
         conditions = self.spec.ready
-        while conditions and await self._shared.ask(lambda probe: probe.unmet(conditions, old)):
-            await asyncio.sleep(self._shared.poll)
+        while conditions and await self._supervisor.ask(lambda probe: probe.unmet(conditions, old)):
+            await asyncio.sleep(self._supervisor.poll)
         if conditions and self.spec.params and not self._was_ready:
             await self._check_parameters()
 
     async def _check_parameters(self) -> None:
         """Refuse parameters that the node does not have; ROS would ignore them silently."""
-        existing = await self._shared.ask(lambda probe: probe.parameters(self.name))
+        existing = await self._supervisor.ask(lambda probe: probe.parameters(self.name))
         for param in self.spec.params:
             if param not in existing:
                 own = [name for name in existing if not name.startswith("qos_overrides")]
@@ -207,4 +181,4 @@ class Keeper:
 
     def _enter(self, state: NodeState, detail: str) -> None:
         self.state = state
-        self._shared.changed(self.name, state, detail)
+        self._supervisor.changed(self.name, state, detail)

@@ -23,7 +23,7 @@ import psutil
 
 from openarm_bringup.supervision import environment, guard, runs, shm
 from openarm_bringup.supervision.graph import Graph
-from openarm_bringup.supervision.keeper import Keeper, NodeState, Probe, Shared
+from openarm_bringup.supervision.keeper import Keeper, NodeState, Probe
 from openarm_bringup.supervision.process import Haste, Ladder
 from openarm_common.errors import Code, OpenArmError
 
@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Event:
-    """A change of one node, for whoever shows it."""
+    """A change of the state of a node."""
 
     seconds: float
     node: str
@@ -47,9 +47,9 @@ class Supervisor:
         graph: What to run.
         run_dir: Gets `logs/<node>.log`, `logs/supervisor.log` and `params/`.
         probe: Makes the probe; called in a thread, because it imports rclpy.
-        listener: Is told every change of state.
-        ladder: Patience with nodes at the end.
-        poll: s between two looks at a node that is not ready.
+        listener: Is called with every change of state.
+        ladder: Longest waits for nodes to end.
+        poll: Period at which a node that is not ready is checked, s.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Supervisor:
         ladder: Ladder | None = None,
         poll: float = 0.1,
     ) -> None:
-        self.graph = graph = shm.with_room(graph)
+        self.graph = shm.with_room(graph)
         self.run_dir = run_dir
         self._make_probe = probe
         self._probe: asyncio.Future[Probe] | None = None
@@ -73,20 +73,10 @@ class Supervisor:
         self._threads = ThreadPoolExecutor(max_workers=1, thread_name_prefix="probe")
         self._watchers: list[asyncio.Task[None]] = []
         self._guard: asyncio.subprocess.Process | None = None
-        self._shared = Shared(
-            graph=graph,
-            run_dir=run_dir,
-            ask=self._ask,
-            spawning=asyncio.Lock(),
-            stop_asked=asyncio.Event(),
-            haste=Haste(),
-            ladder=ladder or Ladder(),
-            poll=poll,
-            tell_guard=self._tell_guard,
-            say=self._say,
-            changed=self._changed,
-        )
-        self._keepers = {name: Keeper(name, spec, self._shared) for name, spec in graph.nodes.items()}
+        self.spawning = asyncio.Lock()
+        self.stop_asked = asyncio.Event()
+        self.haste, self.ladder, self.poll = Haste(), ladder or Ladder(), poll
+        self._keepers = {name: Keeper(name, self) for name in self.graph.nodes}
 
     async def start(self) -> None:
         """Begin to start the nodes; returns at once.
@@ -115,14 +105,14 @@ class Supervisor:
             self._watchers.append(watcher)
         self._record()
 
-    async def wait_ready(self) -> None:
-        """Wait until every node is ready.
+    async def wait_ready(self) -> float:
+        """Wait until every node is ready; return how long that took since the supervisor was made, s.
 
         Raises:
             OpenArmError: what kept a node from it (with the end of its log); CANCELLED when asked to stop meanwhile.
         """
         ready = asyncio.create_task(self._all_ready())
-        stopping = asyncio.create_task(self._shared.stop_asked.wait())
+        stopping = asyncio.create_task(self.stop_asked.wait())
         await asyncio.wait([ready, stopping, self._trouble], return_when=asyncio.FIRST_COMPLETED)
         done = ready.done()
         stopping.cancel()
@@ -132,6 +122,7 @@ class Supervisor:
         if not done:
             raise OpenArmError(Code.CANCELLED, "asked to stop before the graph was ready")
         self._record()
+        return time.monotonic() - self._began
 
     async def wait_stop_asked(self) -> None:
         """Wait for `ask_stop`, or until a node was given up.
@@ -139,7 +130,7 @@ class Supervisor:
         Raises:
             OpenArmError: why a node was given up that the graph can't do without.
         """
-        stopping = asyncio.create_task(self._shared.stop_asked.wait())
+        stopping = asyncio.create_task(self.stop_asked.wait())
         await asyncio.wait([stopping, self._trouble], return_when=asyncio.FIRST_COMPLETED)
         stopping.cancel()
         if self._trouble.done():
@@ -147,14 +138,14 @@ class Supervisor:
 
     def ask_stop(self) -> None:
         """Ask for the end; a second time: hurry (the next signal at once)."""
-        if self._shared.stop_asked.is_set():
-            self._shared.haste.hurry()
-        self._shared.stop_asked.set()
+        if self.stop_asked.is_set():
+            self.haste.hurry()
+        self.stop_asked.set()
 
     async def stop(self) -> None:
         """Stop every node, dependents before their needs, and leave nothing behind."""
-        self._shared.stop_asked.set()
-        async with self._shared.spawning:  # a process that is being started is known before its watcher is cancelled
+        self.stop_asked.set()
+        async with self.spawning:  # a process that is being started is known before its watcher is cancelled
             for watcher in self._watchers:
                 watcher.cancel()
         await asyncio.gather(*self._watchers, return_exceptions=True)
@@ -166,11 +157,11 @@ class Supervisor:
             await asyncio.wait(tasks, timeout=1.0)
         await asyncio.gather(*stops)
         if self._probe is not None and (await asyncio.wait([self._probe])) and self._probe.exception() is None:
-            await self._ask(lambda probe: probe.close())
+            await self.ask(lambda probe: probe.close())
         self._threads.shutdown()
         mapped = set().union(*(keeper.mapped for keeper in self._keepers.values()))
         swept = await asyncio.to_thread(lambda: shm.sweep(mapped | shm.names_of(environment.domain_id(self.graph))))
-        self._say(f"removed from /dev/shm: {', '.join(swept) or 'nothing'}")
+        self.say(f"removed from /dev/shm: {', '.join(swept) or 'nothing'}")
         await self._dismiss_guard()
         runs.remove_record(os.getpid())
 
@@ -194,42 +185,46 @@ class Supervisor:
         if error is None:
             return
         keeper.state = NodeState.FAILED
-        told = error.message if isinstance(error, OpenArmError) else repr(error)
+        text = error.message if isinstance(error, OpenArmError) else repr(error)
         if keeper.dispensable and isinstance(error, OpenArmError):
-            self._changed(keeper.name, NodeState.FAILED, f"the graph goes on without it: {told}")
+            self.changed(keeper.name, NodeState.FAILED, f"the graph goes on without it: {text}")
             return
-        self._changed(keeper.name, NodeState.FAILED, told)
+        self.changed(keeper.name, NodeState.FAILED, text)
         if not self._trouble.done():
             self._trouble.set_exception(error)
-            self._trouble.exception()  # marked as seen: nobody may be waiting
+            self._trouble.exception()  # marked as retrieved: it may not be awaited
 
     async def _all_ready(self) -> None:
         for keeper in self._keepers.values():
             await keeper.ready.wait()
 
-    async def _ask(self, question: Callable[[Probe], T]) -> T:
+    async def ask(self, question: Callable[[Probe], T]) -> T:
+        """Put a question to the probe, in its thread."""
         if self._probe is None:
             raise OpenArmError(Code.INTERNAL, "the supervisor was not started")
         probe = await asyncio.shield(self._probe)
         return await asyncio.get_running_loop().run_in_executor(self._threads, question, probe)
 
-    def _tell_guard(self, line: str) -> None:
+    def tell_guard(self, line: str) -> None:
+        """Send a line to the guard process."""
         if self._guard is not None and self._guard.stdin is not None and self._guard.returncode is None:
             self._guard.stdin.write(f"{line}\n".encode())
 
     async def _dismiss_guard(self) -> None:
-        self._tell_guard("bye")
+        self.tell_guard("bye")
         if self._guard is not None and self._guard.stdin is not None:
             self._guard.stdin.close()
             await self._guard.wait()
 
-    def _changed(self, node: str, state: NodeState, detail: str) -> None:
-        self._say(f"{node}: {state}: {detail}")
+    def changed(self, node: str, state: NodeState, detail: str) -> None:
+        """Log, record and publish a change of a node."""
+        self.say(f"{node}: {state}: {detail}")
         self._record()
         if self._listener is not None:
             self._listener(Event(time.monotonic() - self._began, node, state, detail))
 
-    def _say(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Write a line to the supervisor's log."""
         with (self.run_dir / "logs" / "supervisor.log").open("a", encoding="utf-8") as log:
             log.write(f"{datetime.now().isoformat(sep=' ', timespec='milliseconds')} {text}\n")
 

@@ -12,7 +12,7 @@ import json
 import mimetypes
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from aiohttp import WSCloseCode, WSMsgType, web
 from pydantic import Field, ValidationError
@@ -20,6 +20,9 @@ from pydantic import Field, ValidationError
 from openarm_bringup.view.guard import Guard
 from openarm_common.config import Config, describe_faults
 from openarm_common.errors import Code, OpenArmError
+
+if TYPE_CHECKING:
+    from openarm_bringup.view.ros.page import GraphView
 
 PAGE = Path(__file__).parent / "page"
 #: What every page gets while it is open.
@@ -74,31 +77,6 @@ class Item(NamedTuple):
         return cls(layer, f"fault:{layer}", json.dumps({"kind": "fault", "layer": layer, "text": text}))
 
 
-class View(Protocol):
-    """What the server needs of the graph; its methods but `want` block, and are called in threads."""
-
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Names of all that can be looked at."""
-        ...
-
-    def want(self, layers: frozenset[str]) -> None:
-        """Look at these layers from now on."""
-        ...
-
-    def pick(self, order: Order) -> dict[str, Any]:
-        """Grasp something; returns the fields of the result."""
-        ...
-
-    def cancel(self) -> tuple[bool, str]:
-        """End the grasp that runs; returns whether there was one, and a sentence."""
-        ...
-
-    def reset(self, order: Reset) -> tuple[bool, str]:
-        """Put the simulation back; returns whether it was, and a sentence."""
-        ...
-
-
 class _Page:
     """One open page."""
 
@@ -118,10 +96,10 @@ class ViewServer:
     Args:
         guard: Decides who may.
         hello: What a page is told first: the robot, the cameras, the states of a grasp.
-        view: Looks at the graph.
+        view: Observes the graph; its methods but `want` block, and are called in threads.
     """
 
-    def __init__(self, guard: Guard, hello: Mapping[str, Any], view: View) -> None:
+    def __init__(self, guard: Guard, hello: Mapping[str, Any], view: GraphView) -> None:
         self.guard = guard
         self._view = view
         self._hello = json.dumps({"kind": "hello", **hello})

@@ -40,11 +40,16 @@ class Campaign:
     resumed: int = 0
 
 
+#: Runs seeds of a campaign in its folder, and hands on each row.
+Runner = Callable[[CampaignOptions, Sequence[int], Path, Callable[[Row], None]], None]
+
+
 def run_campaign(
     options: CampaignOptions,
     folder: Path,
     on_row: Callable[[Row], None] = lambda row: None,
     on_begin: Callable[[int], None] = lambda done: None,
+    runner: Runner | None = None,
 ) -> Campaign:
     """Run all seeds that the folder has no row of, and write the reports; Ctrl-C keeps what is done.
 
@@ -53,6 +58,7 @@ def run_campaign(
         folder: Of the campaign.
         on_row: Called with each new row.
         on_begin: Called with the number of rows that are there already.
+        runner: Runs the seeds; None does it in this process, or in processes of this or other machines.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for an unknown set, or a folder with rows of other settings; what a fault of
@@ -64,24 +70,27 @@ def run_campaign(
     campaign.resumed = len(campaign.rows)
     on_begin(campaign.resumed)
     done = {row["seed"] for row in campaign.rows}
-    left = [seed for seed in options.seeds if seed not in done]
+
+    def keep(row: Row) -> None:
+        with (folder / ROWS).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row, default=str) + "\n")
+        campaign.rows.append(row)
+        on_row(row)
+
     began = time.monotonic()
     try:
-        with contextlib.closing(_rows(options, left, folder)) as new:
-            for row in new:
-                keep_row(campaign, row)
-                on_row(row)
+        (runner or run_in_processes)(options, [seed for seed in options.seeds if seed not in done], folder, keep)
     finally:
         campaign.wall_s = time.monotonic() - began
         write_reports(campaign)
     return campaign
 
 
-def keep_row(campaign: Campaign, row: Row) -> None:
-    """Take a row that has come, and write it down at once."""
-    with (campaign.folder / ROWS).open("a", encoding="utf-8") as file:
-        file.write(json.dumps(row, default=str) + "\n")
-    campaign.rows.append(row)
+def run_in_processes(options: CampaignOptions, seeds: Sequence[int], folder: Path, keep: Callable[[Row], None]) -> None:
+    """Run seeds without DDS, in this process or in several; see `Runner`."""
+    with contextlib.closing(_rows(options, seeds, folder)) as rows:
+        for row in rows:
+            keep(row)
 
 
 def read_rows(folder: Path, options: CampaignOptions) -> list[Row]:

@@ -45,6 +45,14 @@ class CampaignOptions:
             **({"detector": self.detector} if self.detector != "color" else {}),
         }
 
+    def graph_parameters(self) -> tuple[str, ...]:
+        """Return the parameters of the graph that the options stand for, as `node.param=value`."""
+        return (
+            f"mujoco_bridge.depth_noise.enabled={str(self.noise).lower()}",
+            f"grasp.held.use_effort={str(self.use_effort).lower()}",
+            *(f"{node}.detector={self.detector}" for node in ("detector", "wrist_detector")),
+        )
+
     def command(self, seed: int) -> str:
         """The command that runs one row again."""
         parts = [

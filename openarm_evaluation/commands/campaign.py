@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from openarm_bringup.outcome import Outcome
+from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code
 
 if TYPE_CHECKING:
@@ -74,16 +74,14 @@ def campaign(
 def _run(
     options: CampaignOptions, folder: Path, accept: float, *, graph: bool, others: Sequence[Mapping[str, Any]]
 ) -> Outcome:
-    from rich.console import Console
-
     from openarm_evaluation.campaign.agree import compare, text_of
     from openarm_evaluation.campaign.campaign import run_campaign, write_reports
     from openarm_evaluation.campaign.progress import Watch
     from openarm_evaluation.campaign.report import figures
-    from openarm_evaluation.campaign.ros.graph import run_graph_campaign
+    from openarm_evaluation.campaign.ros.graph import rows_of_graph
 
-    with Watch(len(options.seeds), Console(stderr=True, highlight=False)) as watch:
-        result = (run_graph_campaign if graph else run_campaign)(options, folder, watch.show, watch.begin)
+    with Watch(len(options.seeds), console()) as watch:
+        result = run_campaign(options, folder, watch.show, watch.begin, rows_of_graph if graph else None)
     data = write_reports(result)
     text = "\n".join(f"{name:<44} {value}" for name, value in figures(data))
     good = sum(bool(row["as_expected"]) for row in result.rows)

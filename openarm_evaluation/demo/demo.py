@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from openarm_bringup.supervision import environment, runs
 from openarm_bringup.supervision.graph import Graph, load_graph
-from openarm_bringup.supervision.session import in_thread, running_graph
+from openarm_bringup.supervision.session import running_graph, work_until_stopped
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import load_scene
@@ -110,12 +108,8 @@ def run_demo(options: DemoOptions, listeners: Listeners | None = None) -> DemoRe
 
 
 async def _demo(options: DemoOptions, graph: Graph, result: DemoResult, listeners: Listeners) -> None:
-    began = time.monotonic()
-    # Clients made in this process find the graph through the environment.
-    os.environ.update(environment.ros_environment(graph))
     async with running_graph(graph, result.run_dir, listeners.on_event) as supervisor:
-        await supervisor.wait_ready()
-        result.ready_s = time.monotonic() - began
+        result.ready_s = await supervisor.wait_ready()
         listeners.on_ready(result.ready_s)
         from openarm_evaluation.judging.ros.observer import Observer
         from openarm_grasp.ros.client import GraspClient
@@ -130,18 +124,13 @@ async def _demo(options: DemoOptions, graph: Graph, result: DemoResult, listener
         with Observer(environment.domain_id(graph), on_step) as observer, GraspClient() as client:
             if studio is not None:
                 studio.observer = observer
-            work = in_thread(lambda: _trials(options, graph, observer, client, studio, result, listeners), "trials")
-            stop = asyncio.create_task(supervisor.wait_stop_asked())
-            await asyncio.wait([work, stop], return_when=asyncio.FIRST_COMPLETED)
             try:
-                if not work.done():
-                    client.cancel()
-                    await asyncio.wait([work], timeout=5.0)
-                    stop.result()
-                    raise OpenArmError(Code.CANCELLED, "stopped by Ctrl-C")
-                work.result()
+                await work_until_stopped(
+                    supervisor,
+                    lambda: _trials(options, graph, observer, client, studio, result, listeners),
+                    client.cancel,
+                )
             finally:
-                stop.cancel()
                 if studio is not None:
                     studio.finish()
 
