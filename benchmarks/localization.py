@@ -37,7 +37,7 @@ from openarm_common.robot.description import SIDES, RobotDescription
 from openarm_common.scene.scene import Scene, random_scene
 from openarm_common.scene.types import SceneObject, Table
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.detection.localize import Detection3D, Localizer, LocalizerConfig
+from openarm_perception.detection.localize import Localizer, LocalizerConfig, LocatedObject
 from openarm_perception.detection.pipeline import Perceived, Pipeline
 from openarm_perception.geometry.depth import DepthLimits
 from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
@@ -134,9 +134,9 @@ class Studio:
         self._renderer.close()
 
 
-def errors(place: Detection3D, item: SceneObject, table: Table) -> tuple[float, float, float]:
+def errors(place: LocatedObject, item: SceneObject, table: Table) -> tuple[float, float, float]:
     """Errors of position and size, mm, and of the yaw, degrees; the yaw of a cylinder is never wrong."""
-    position = float(np.linalg.norm(place.position - item.centre(table))) * 1e3
+    position = float(np.linalg.norm(place.p_base - item.centre(table))) * 1e3
     size = float(np.abs(np.array(place.size) - (*sorted(item.size[:2]), item.size[2])).max()) * 1e3
     if item.shape == "cylinder":
         return position, size, 0.0

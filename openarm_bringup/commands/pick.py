@@ -114,7 +114,7 @@ def _resolve(
     for i, item in zip(worded, object_client.find([labels[i] for i in worded]), strict=True):
         if places[i] is not None:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"{labels[i]!r} says where it is; leave --at out")
-        names[i], places[i] = item.label, (float(item.position[0]), float(item.position[1]))
+        names[i], places[i] = item.label, (float(item.p_base[0]), float(item.p_base[1]))
     return names, places
 
 

@@ -7,13 +7,14 @@ import queue
 import time
 from collections.abc import Sequence
 
-from vision_msgs.msg import Detection3D, Detection3DArray
+from vision_msgs.msg import Detection3DArray
 
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
-from openarm_common.ros.convert import xyz
+from openarm_common.ros.detections import detections_from_msg
 from openarm_common.ros.node import reliable
-from openarm_perception.detection.attributes import Thing, parse, resolve
+from openarm_perception.detection.attributes import parse, resolve
 
 
 class DetectionListener(BackgroundNode):
@@ -24,14 +25,14 @@ class DetectionListener(BackgroundNode):
         super().__init__("detection_listener")
         self._node.create_subscription(Detection3DArray, "/detections_3d", self._received.put, reliable(5))
 
-    def next(self, timeout: float) -> list[Thing]:
+    def next(self, timeout: float) -> list[Detection]:
         """Return the measured objects of the next message that has any, or of the last one.
 
         Raises:
             OpenArmError: TIMEOUT, when no message comes.
         """
         deadline = time.monotonic() + timeout
-        found: list[Thing] | None = None
+        found: list[Detection] | None = None
         while not found and (left := deadline - time.monotonic()) > 0.0:
             try:
                 found = objects(self._received.get(timeout=left))
@@ -44,7 +45,7 @@ class DetectionListener(BackgroundNode):
         return found
 
 
-def find(requests: Sequence[str], timeout: float = 20.0) -> list[Thing]:
+def find(requests: Sequence[str], timeout: float = 20.0) -> list[Detection]:
     """Return the objects that requests in words select, such as "red cube left of the can".
 
     Raises:
@@ -56,14 +57,6 @@ def find(requests: Sequence[str], timeout: float = 20.0) -> list[Thing]:
     return [resolve(parse(request, labels), observed) for request in requests]
 
 
-def objects(message: Detection3DArray) -> list[Thing]:
+def objects(message: Detection3DArray) -> list[Detection]:
     """Return the objects of a message that were measured."""
-    return [_object(d) for d in message.detections if d.results and d.results[0].hypothesis.score > 0.0]
-
-
-def _object(detection: Detection3D) -> Thing:
-    names = [result.hypothesis.class_id for result in detection.results]
-    position = xyz(detection.bbox.center.position)
-    size = detection.bbox.size
-    kind = names[1] if len(names) > 1 else names[0]
-    return Thing(names[0], kind, position, (size.x, size.y, size.z), detection.results[0].hypothesis.score)
+    return [detection for detection in detections_from_msg(message) if detection.measured]

@@ -137,7 +137,7 @@ def find(*words: str, domain: Domain = None, timeout: float = 20.0) -> Outcome:
     from openarm_bringup.ros import object_client
 
     (found,) = object_client.find([" ".join(words)], timeout)
-    x, y, z = (round(float(value), 4) for value in found.position)
+    x, y, z = (round(float(value), 4) for value in found.p_base)
     message = f"{found.label} {found.kind} at x {x} y {y} z {z} m"
     return Outcome(True, message, data={"label": found.label, "kind": found.kind, "position": [x, y, z]})
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests in words: "red cube left of the can", "the largest box", "anything blue nearest to the left cylinder".
 
-A request is attributes (colour, shape, size, side) of one object, and how it stands to another that is told of in the
+A request is attributes (colour, shape, size, side) of one object, and its relation to another that is described in the
 same way. Sides are those of the robot's view: left is +y of the base frame, right -y, behind +x, in front -x.
 """
 
@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 
 #: Words for shapes, and the kinds that each fits.
@@ -38,19 +38,6 @@ _RELATIONS = {
     "beside": None,
     "nearest to": None,
 }
-#: A cube is a box whose edges differ by less; a can is a cylinder at least this many times as tall as wide.
-CUBE_RATIO, CAN_RATIO = 1.15, 1.5
-
-
-@dataclass(frozen=True)
-class Thing:
-    """An object to choose from: label (its colour, or its class), kind, position (3,), m, extents, m, and score."""
-
-    label: str
-    kind: str
-    position: NDArray[np.float64]
-    size: tuple[float, float, float]
-    score: float
 
 
 @dataclass(frozen=True)
@@ -62,27 +49,18 @@ class Request:
     other: Request | None = None
 
 
-def kind_of(shape: str, size: tuple[float, float, float]) -> str:
-    """The name for a shape (box, cylinder, sphere) of measured extents, m, the last the height: also cube or can."""
-    if shape == "box":
-        return "cube" if max(size) <= CUBE_RATIO * min(size) else "box"
-    if shape == "cylinder":
-        return "can" if size[2] >= CAN_RATIO * max(size[:2]) else "cylinder"
-    return shape
-
-
-_CHOICES: Mapping[str, Callable[[Thing], float]] = {
-    "largest": lambda thing: -float(np.prod(thing.size)),
-    "biggest": lambda thing: -float(np.prod(thing.size)),
-    "smallest": lambda thing: float(np.prod(thing.size)),
-    "tallest": lambda thing: -thing.size[2],
-    "lowest": lambda thing: thing.size[2],
-    "leftmost": lambda thing: -float(thing.position[1]),
-    "left": lambda thing: -float(thing.position[1]),
-    "rightmost": lambda thing: float(thing.position[1]),
-    "right": lambda thing: float(thing.position[1]),
-    "nearest": lambda thing: float(np.hypot(*thing.position[:2])),
-    "farthest": lambda thing: -float(np.hypot(*thing.position[:2])),
+_CHOICES: Mapping[str, Callable[[Detection], float]] = {
+    "largest": lambda one: -float(np.prod(one.size)),
+    "biggest": lambda one: -float(np.prod(one.size)),
+    "smallest": lambda one: float(np.prod(one.size)),
+    "tallest": lambda one: -one.size[2],
+    "lowest": lambda one: one.size[2],
+    "leftmost": lambda one: -float(one.p_base[1]),
+    "left": lambda one: -float(one.p_base[1]),
+    "rightmost": lambda one: float(one.p_base[1]),
+    "right": lambda one: float(one.p_base[1]),
+    "nearest": lambda one: float(np.hypot(*one.p_base[:2])),
+    "farthest": lambda one: -float(np.hypot(*one.p_base[:2])),
 }
 
 
@@ -96,11 +74,11 @@ def parse(text: str, labels: Sequence[str]) -> Request:
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the word that is not known, and those that are.
     """
-    told = " ".join(re.findall(r"[a-z0-9_]+", text.lower())).replace("closest", "nearest")
-    told = told.replace("to the left of", "left of")
-    told = told.replace("to the right of", "right of")
-    match = re.search(rf"\b({'|'.join(_RELATIONS)})\b", told)
-    head, relation, tail = (told[: match.start()], match[1], told[match.end() :]) if match else (told, "", "")
+    spoken = " ".join(re.findall(r"[a-z0-9_]+", text.lower())).replace("closest", "nearest")
+    spoken = spoken.replace("to the left of", "left of")
+    spoken = spoken.replace("to the right of", "right of")
+    match = re.search(rf"\b({'|'.join(_RELATIONS)})\b", spoken)
+    head, relation, tail = (spoken[: match.start()], match[1], spoken[match.end() :]) if match else (spoken, "", "")
     words = tuple(word for word in head.split() if word not in _FILLERS)
     known = {*labels, *SHAPE_WORDS, *ANY_WORDS, *_CHOICES}
     for word in words:
@@ -115,49 +93,49 @@ def parse(text: str, labels: Sequence[str]) -> Request:
     return Request(words, relation, parse(tail, labels) if match else None)
 
 
-def resolve(request: Request, things: Sequence[Thing]) -> Thing:
-    """The object that is asked for: of those that fit, the nearest to the other one, else the most certain.
+def resolve(request: Request, detections: Sequence[Detection]) -> Detection:
+    """Return the object that is asked for: of those that fit, the nearest to the other one, else the most certain.
 
     Raises:
         OpenArmError: NOTHING_DETECTED, naming what fits no object, and the objects that there are.
     """
-    return _select(request, things)[0]
+    return _select(request, detections)[0]
 
 
-def _select(request: Request, things: Sequence[Thing]) -> list[Thing]:
-    """What fits, best first; never empty."""
-    fitting = sorted((thing for thing in things if _fits(thing, request.words)), key=lambda thing: -thing.score)
+def _select(request: Request, detections: Sequence[Detection]) -> list[Detection]:
+    """Return what fits, best first; never empty."""
+    fitting = sorted((one for one in detections if _fits(one, request.words)), key=lambda one: -one.score)
     if request.other is not None:
-        others = _select(request.other, things)
-        reach = {id(thing): _reach(thing, others, _RELATIONS[request.relation]) for thing in fitting}
-        fitting = sorted((t for t in fitting if math.isfinite(reach[id(t)])), key=lambda thing: reach[id(thing)])
+        others = _select(request.other, detections)
+        reach = {id(one): _reach(one, others, _RELATIONS[request.relation]) for one in fitting}
+        fitting = sorted((t for t in fitting if math.isfinite(reach[id(t)])), key=lambda one: reach[id(one)])
     for word in request.words:
         if word in _CHOICES:
             fitting.sort(key=_CHOICES[word])
     if not fitting:
-        there = ", ".join(f"{t.label} {t.kind}".strip() for t in things) or "nothing"
+        there = ", ".join(f"{t.label} {t.kind}".strip() for t in detections) or "nothing"
         asked = " ".join(request.words) + (f" {request.relation} …" if request.relation else "")
         raise OpenArmError(Code.NOTHING_DETECTED, f"no object is {asked!r}; in view: {there}")
     return fitting
 
 
-def _reach(thing: Thing, others: Sequence[Thing], side: tuple[float, float] | None) -> float:
-    """Distance to the nearest of the others to which it stands as asked, m; infinite without one."""
+def _reach(one: Detection, others: Sequence[Detection], side: tuple[float, float] | None) -> float:
+    """Return the distance to the nearest of the others in the relation, m; infinite without one."""
     best = math.inf
     for other in others:
-        step = (thing.position - other.position)[:2]
+        step = (one.p_base - other.p_base)[:2]
         distance = float(np.linalg.norm(step))
         # more to that side than to any other
-        if thing is not other and (side is None or float(step @ side) >= math.cos(math.pi / 4.0) * distance):
+        if one is not other and (side is None or float(step @ side) >= math.cos(math.pi / 4.0) * distance):
             best = min(best, distance)
     return best
 
 
-def _fits(thing: Thing, words: Sequence[str]) -> bool:
+def _fits(one: Detection, words: Sequence[str]) -> bool:
     for word in words:
         if word in SHAPE_WORDS:
-            if thing.kind not in SHAPE_WORDS[word] and thing.label != word:
+            if one.kind not in SHAPE_WORDS[word] and one.label != word:
                 return False
-        elif word not in ANY_WORDS and word not in _CHOICES and word not in (thing.label, thing.kind):
+        elif word not in ANY_WORDS and word not in _CHOICES and word not in (one.label, one.kind):
             return False
     return True

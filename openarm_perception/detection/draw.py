@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_perception.detection.detector import Detection2D
-from openarm_perception.detection.localize import Detection3D
+from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.detection.pipeline import Perceived
 
 Image = NDArray[np.uint8]
@@ -46,11 +46,11 @@ def _color(located: bool) -> tuple[int, int, int]:
     return _LOCATED if located else _REFUSED
 
 
-def _lines(found: Detection2D, place: Detection3D | None) -> list[str]:
+def _lines(found: Detection2D, place: LocatedObject | None) -> list[str]:
     title = f"{found.label} {found.score:.2f}"
     if place is None:
         return [title, "not located"]
-    x, y, _ = place.position
+    x, y, _ = place.p_base
     a, b, c = (edge * 1e3 for edge in place.size)
     turned = "" if place.method == "circle" else f" {math.degrees(place.yaw):+.0f} deg"
     return [title, f"x {x:.3f} y {y:+.3f} m{turned}", f"{a:.0f} x {b:.0f} x {c:.0f} mm"]

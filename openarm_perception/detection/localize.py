@@ -23,6 +23,7 @@ from pydantic import Field, model_validator
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config, metres_by_name
+from openarm_common.detection import Detection, kind_of
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_perception.detection.detector import Detection2D, Mask
@@ -64,46 +65,25 @@ class LocalizerConfig(Config):
         return metres_by_name(self.heights, "heights", "red=0.05", 0.005, 0.5)
 
 
-@dataclass(frozen=True)
-class Detection3D:
-    """An object in the base frame.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LocatedObject(Detection):
+    """A detection and how it was located; x along the smaller horizontal edge.
 
     Attributes:
         source: The detection in the image.
-        score: How certain, 0 to 1; less for what is partly hidden.
-        T_base_object: (4, 4); origin in the middle of the object, x along the smaller horizontal extent, z up.
-        size: Smaller and larger horizontal extent, height, m.
         covariance: (6, 6) of x, y, z, roll, pitch, yaw in the base frame, m and rad.
         points: Pixels with depth that were used.
         visible: Share of the outline of the top that was in view, 0 to 1.
         method: `rectangle` or `circle` through the outline of the top; `bound`: rectangle around all points.
-        measured: Whether depth was measured; else the height is what the configuration says.
+        from_depth: Whether the height was measured by depth; else it is what the configuration says.
     """
 
     source: Detection2D
-    score: float
-    T_base_object: Array
-    size: tuple[float, float, float]
     covariance: Array
     points: int
     visible: float
     method: footprint.Kind
-    measured: bool = True
-
-    @property
-    def label(self) -> str:
-        """What it is."""
-        return self.source.label
-
-    @property
-    def position(self) -> Array:
-        """(3,) middle of the object in the base frame, m."""
-        return self.T_base_object[:3, 3].copy()
-
-    @property
-    def yaw(self) -> float:
-        """Direction of the smaller horizontal extent, rad in (-pi/2, pi/2]."""
-        return float(np.arctan2(self.T_base_object[1, 0], self.T_base_object[0, 0]))
+    from_depth: bool = True
 
 
 class Localizer:
@@ -147,7 +127,7 @@ class Localizer:
         ray = patch.rays[int(np.median(v)), int(np.median(u))]
         return patch.T_base_camera[:3, 3] + ray * float(np.median(patch.z[v, u]))
 
-    def locate(self, patch: Patch) -> Detection3D:
+    def locate(self, patch: Patch) -> LocatedObject:
         """The object of a detection.
 
         Raises:
@@ -180,8 +160,8 @@ class Localizer:
             raise OpenArmError(error.code, f"{where}: {error.message}") from error
         return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
 
-    def enclose(self, patch: Patch) -> Detection3D:
-        """A box around what is seen of a detection that cannot be measured: in the way at least there. Its score is 0.
+    def enclose(self, patch: Patch) -> LocatedObject:
+        """Enclose what is visible of a detection that cannot be measured, an obstacle. It is marked as not measured.
 
         Errors as for `locate`; what is hidden or beyond the border of the image is not in the box.
         """
@@ -191,11 +171,12 @@ class Localizer:
         points = patch.points[inner if inner.any() else solid]
         top = self._top_height(points[:, 2], patch.band)
         shape = footprint.bound(points[:, :2], 3.0 * float(np.median(patch.z[solid])) / patch.intrinsics.fx)
-        return replace(self._detection(patch.found, shape, top, len(points), 0.0), score=0.0)
+        around = self._detection(patch.found, shape, top, len(points), 0.0)
+        return replace(around, score=0.0, kind=kind_of(patch.found.kind, around.size), measured=False)
 
     def locate_on_plane(
         self, found: Detection2D, height: float, intrinsics: Intrinsics, T_base_camera: Array
-    ) -> Detection3D:
+    ) -> LocatedObject:
         """The object of a detection without depth: an upright convex prism of known height on the table.
 
         Args:
@@ -223,7 +204,7 @@ class Localizer:
         stds = (math.hypot(shape.centre_std[0], lean), math.hypot(shape.centre_std[1], lean))
         located = self._detection(found, replace(shape, centre_std=stds), top, 0, 1.0)
         located.covariance[2, 2] = (0.5 * self.config.height_std) ** 2
-        return replace(located, measured=False)
+        return replace(located, from_depth=False)
 
     @staticmethod
     def _valid(patch: Patch) -> Mask:
@@ -311,7 +292,7 @@ class Localizer:
 
     def _detection(
         self, found: Detection2D, shape: footprint.Footprint, top: float, count: int, visible: float
-    ) -> Detection3D:
+    ) -> LocatedObject:
         height = top - self.table_height
         R = se3.rot_z(shape.yaw)
         T = se3.make(R, (*shape.centre, self.table_height + height / 2.0))
@@ -319,8 +300,19 @@ class Localizer:
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = R @ np.diag(std**2) @ R.T
         covariance[5, 5] = shape.yaw_std**2
-        size = (*shape.size, height)
-        return Detection3D(found, found.score * visible, T, size, covariance, count, visible, shape.kind)
+        size = np.array([*shape.size, height])
+        kind = kind_of(_shape(found, shape.kind), size)
+        return LocatedObject(
+            found.label, found.score * visible, T, size, shape.kind == "circle", kind,
+            source=found, covariance=covariance, points=count, visible=visible, method=shape.kind,
+        )  # fmt: skip
+
+
+def _shape(found: Detection2D, method: footprint.Kind) -> str:
+    """Name the shape: as a network says, else by the outline."""
+    outline = {"rectangle": "box", "circle": "cylinder"}.get(method, "")
+    # no box has a round outline; that of a cylinder that lies is a rectangle
+    return outline if found.kind == "" or (found.kind, outline) == ("box", "cylinder") else found.kind
 
 
 def _pixel(found: Detection2D) -> str:

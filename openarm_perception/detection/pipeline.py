@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import OpenArmError
 from openarm_perception.detection.detector import Detection2D, Detector, Mask, Policy, rank
-from openarm_perception.detection.localize import Detection3D, Localizer
+from openarm_perception.detection.localize import Localizer, LocatedObject
 from openarm_perception.detection.view import Seen, View
 from openarm_perception.geometry.depth import DepthImage, check_size, unit_scale
 
@@ -30,13 +30,13 @@ class Perceived:
     """
 
     found: tuple[Detection2D, ...]
-    located: tuple[Detection3D, ...]
+    located: tuple[LocatedObject, ...]
     refused: tuple[str, ...]
     robot: Mask | None = None
-    unmeasured: tuple[Detection3D, ...] = ()
+    unmeasured: tuple[LocatedObject, ...] = ()
 
     @property
-    def boxes(self) -> tuple[Detection3D, ...]:
+    def boxes(self) -> tuple[LocatedObject, ...]:
         """Everything that stands there, what could be measured first."""
         return (*self.located, *self.unmeasured)
 
@@ -83,9 +83,9 @@ class Pipeline:
         size = (intrinsics.width, intrinsics.height)
         seen = self.look(View(rgb, depth, intrinsics, T_base_camera, robot))
         found = rank(seen.found, self.policy, size, self.label)
-        located: list[Detection3D] = []
+        located: list[LocatedObject] = []
         refused: list[str] = []
-        unmeasured: list[Detection3D] = []
+        unmeasured: list[LocatedObject] = []
         for detection in found:
             patch = self.localizer.cut(detection, depth, intrinsics, T_base_camera, robot)
             try:

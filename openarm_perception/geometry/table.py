@@ -12,7 +12,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_perception.detection.localize import Detection3D
+from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.geometry.depth import Deprojector, DepthImage, DepthLimits
 
 #: How far from the expected height the table is looked for, m.
@@ -87,7 +87,7 @@ def measure_table(
     return TableMeasurement(float(middle[2]), rms, math.acos(min(1.0, abs(float(normal[2])))), len(used))
 
 
-def of_block(place: Detection3D, block_height: float) -> TableMeasurement:
+def of_block(place: LocatedObject, block_height: float) -> TableMeasurement:
     """The table under a block of known height: its measured top less that height.
 
     Raises:
@@ -95,5 +95,5 @@ def of_block(place: Detection3D, block_height: float) -> TableMeasurement:
     """
     if not 0.005 <= block_height <= 0.5:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"block_height is {block_height:g} m; expected 0, or 0.005 .. 0.5")
-    top = float(place.position[2]) + place.size[2] / 2.0
+    top = float(place.p_base[2]) + place.size[2] / 2.0
     return TableMeasurement(top - block_height, math.sqrt(float(place.covariance[2, 2])), 0.0, place.points)

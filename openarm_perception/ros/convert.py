@@ -6,26 +6,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from geometry_msgs.msg import Pose, PoseWithCovariance
+from geometry_msgs.msg import Pose
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 from std_msgs.msg import ColorRGBA, Header
-from vision_msgs.msg import (
-    BoundingBox2D,
-    BoundingBox3D,
-    Detection2DArray,
-    Detection3DArray,
-    ObjectHypothesis,
-    ObjectHypothesisWithPose,
-)
+from vision_msgs.msg import BoundingBox2D, Detection2DArray
 from vision_msgs.msg import Detection2D as Detection2DMsg
-from vision_msgs.msg import Detection3D as Detection3DMsg
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, vector
-from openarm_perception.detection.attributes import kind_of
+from openarm_common.ros.detections import hypothesis, numbered
 from openarm_perception.detection.detector import Detection2D
-from openarm_perception.detection.localize import Detection3D
+from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.detection.pipeline import Perceived
 
 #: Markers of objects vanish this long after the last frame that showed them, s.
@@ -40,44 +32,13 @@ def header(frame_id: str, t_ns: int) -> Header:
 def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Detection2DArray:
     """Boxes by their centre, pixels: the label, and what a network calls its shape; a box in an image has no pose."""
     message = Detection2DArray(header=header(frame_id, t_ns))
-    for name, detection in zip(_names(found), found, strict=True):
+    for name, detection in zip(numbered([d.label for d in found]), found, strict=True):
         box = BoundingBox2D(size_x=float(detection.size[0]), size_y=float(detection.size[1]))
         box.center.position.x, box.center.position.y = detection.centre
         also = (detection.kind,) if detection.kind not in ("", detection.label) else ()
-        results = [_hypothesis(name, detection.score) for name in (detection.label, *also)]
+        results = [hypothesis(name, detection.score) for name in (detection.label, *also)]
         message.detections.append(Detection2DMsg(header=message.header, results=results, bbox=box, id=name))
     return message
-
-
-def detections_3d(located: Sequence[Detection3D], frame_id: str, t_ns: int) -> Detection3DArray:
-    """Upright boxes: x along the smaller horizontal extent, z up, full edges, m.
-
-    The first hypothesis is the label; others of the same score name the shape (box, cylinder, sphere, cube, can).
-    """
-    message = Detection3DArray(header=header(frame_id, t_ns))
-    for name, detection in zip(_names(located), located, strict=True):
-        pose = matrix_to_pose(detection.T_base_object)
-        uncertain = PoseWithCovariance(pose=pose, covariance=detection.covariance.ravel())
-        results = [_hypothesis(name, detection.score, uncertain) for name in names_of(detection)]
-        box = BoundingBox3D(center=pose, size=vector(detection.size))
-        message.detections.append(Detection3DMsg(header=message.header, results=results, bbox=box, id=name))
-    return message
-
-
-def names_of(detection: Detection3D) -> tuple[str, ...]:
-    """What an object may be called, its label first, then its shape: told by a network, else by its outline."""
-    shape = detection.source.kind
-    if detection.score > 0.0:
-        outline = {"rectangle": "box", "circle": "cylinder"}.get(detection.method, "")
-        # no box has a round outline; that of a cylinder that lies is a rectangle
-        shape = outline if shape == "" or (shape, outline) == ("box", "cylinder") else shape
-    names = (detection.label, kind_of(shape, detection.size), shape)
-    return tuple(dict.fromkeys(name for name in names if name))
-
-
-def _hypothesis(name: str, score: float, pose: PoseWithCovariance | None = None) -> ObjectHypothesisWithPose:
-    hypothesis = ObjectHypothesis(class_id=name, score=score)
-    return ObjectHypothesisWithPose(hypothesis=hypothesis, pose=pose or PoseWithCovariance())
 
 
 def mask_image(perceived: Perceived, shape: tuple[int, int]) -> NDArray[np.uint8]:
@@ -96,13 +57,13 @@ def mask_image(perceived: Perceived, shape: tuple[int, int]) -> NDArray[np.uint8
     return image
 
 
-def markers(located: Sequence[Detection3D], frame_id: str, t_ns: int) -> MarkerArray:
+def markers(located: Sequence[LocatedObject], frame_id: str, t_ns: int) -> MarkerArray:
     """A transparent body and a text for each object."""
     message = MarkerArray(markers=[Marker(header=header(frame_id, t_ns), action=Marker.DELETEALL)])
     lifetime = Duration(seconds=MARKER_LIFETIME).to_msg()
     for i, detection in enumerate(located):
         body = Marker(header=header(frame_id, t_ns), ns="objects", id=i, lifetime=lifetime)
-        body.type = Marker.CYLINDER if detection.method == "circle" else Marker.CUBE
+        body.type = Marker.CYLINDER if detection.round else Marker.CUBE
         body.pose = matrix_to_pose(detection.T_base_object)
         body.scale = vector(detection.size)
         body.color = ColorRGBA(r=0.2, g=0.9, b=0.9, a=0.45)
@@ -116,13 +77,3 @@ def markers(located: Sequence[Detection3D], frame_id: str, t_ns: int) -> MarkerA
         text.color = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
         message.markers += [body, text]
     return message
-
-
-def _names(detections: Sequence[Detection2D] | Sequence[Detection3D]) -> list[str]:
-    """Ids: the label, with a number from the second of a label on."""
-    seen: dict[str, int] = {}
-    names: list[str] = []
-    for detection in detections:
-        count = seen[detection.label] = seen.get(detection.label, 0) + 1
-        names.append(detection.label if count == 1 else f"{detection.label}_{count}")
-    return names

@@ -46,7 +46,7 @@ def _measure(request: MeasureTable.Request, newest: View | None, pipeline: Pipel
         visible = depth if robot is None else np.where(robot, depth.dtype.type(0), depth)
         return measure_table(visible, intrinsics, T_base_camera, localizer.limits, localizer.table_height)
     found = pipeline.run(newest.rgb, depth, intrinsics, T_base_camera, robot).located
-    blocks = [place for place in found if request.label in ("", place.label) and place.measured]
+    blocks = [place for place in found if request.label in ("", place.label) and place.from_depth]
     if len(blocks) != 1:
         view = ", ".join(place.label for place in found) or "nothing"
         raise OpenArmError(

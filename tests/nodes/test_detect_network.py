@@ -157,5 +157,5 @@ def test_requests_in_words_are_answered_by_the_running_detector(ros, camera, mod
     things = answer.result()
     found = resolve(parse("the leftmost red box", [thing.label for thing in things]), things)
     assert (found.label, found.kind) == ("red", "box")
-    np.testing.assert_allclose(found.position, (0.30, -0.20, TABLE + 0.025), atol=0.002)
+    np.testing.assert_allclose(found.p_base, (0.30, -0.20, TABLE + 0.025), atol=0.002)
     np.testing.assert_allclose(found.size, (0.04, 0.06, 0.05), atol=0.0025)

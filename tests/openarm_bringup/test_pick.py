@@ -7,15 +7,17 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
 from openarm_bringup.commands import connect, pick
 from openarm_bringup.ros import object_client
 from openarm_bringup.supervision import runs
+from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import Option
-from openarm_perception.detection.attributes import Thing
 
 OPTIONS = (
     Option("red/x+/tilt0", "left", 0.05, {"tilt": -0.0, "width": 0.05}, 0.5, Code.OK, "chosen"),
@@ -38,9 +40,9 @@ def test_each_candidate_has_a_line_with_parts_margin_and_reason() -> None:
 def test_words_select_the_object_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
-    def find(requests: Sequence[str]) -> list[Thing]:
+    def find(requests: Sequence[str]) -> list[Detection]:
         asked.extend(requests)
-        return [Thing("red", "box", (0.3, -0.2, 0.42), (0.05, 0.05, 0.05), 0.9)]
+        return [Detection("red", 0.9, se3.make(None, (0.3, -0.2, 0.42)), np.full(3, 0.05), kind="box")]
 
     monkeypatch.setattr(object_client, "find", find)
     labels, spots = pick._resolve(("blue", "red cube left of the can"), ((0.1, 0.2), None))

@@ -6,14 +6,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from openarm_common import se3
+from openarm_common.detection import Detection, kind_of
 from openarm_common.errors import Code, OpenArmError
-from openarm_perception.detection.attributes import Thing, kind_of, parse, resolve
+from openarm_perception.detection.attributes import parse, resolve
 
 LABELS = ("red", "green", "blue", "box")
 
 
-def thing(label: str, kind: str, x: float, y: float, size=(0.05, 0.05, 0.05), score: float = 0.9) -> Thing:
-    return Thing(label, kind, np.array([x, y, 0.43]), size, score)
+def thing(label: str, kind: str, x: float, y: float, size=(0.05, 0.05, 0.05), score: float = 0.9) -> Detection:
+    return Detection(label, score, se3.make(None, (x, y, 0.43)), np.array(size), kind=kind)
 
 
 THINGS = (

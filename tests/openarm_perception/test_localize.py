@@ -58,7 +58,7 @@ def errors(thing, found) -> dict[str, float]:
     """Differences from the truth: mm, and degrees of yaw where the object has one."""
     width, depth, height = thing.size
     size = np.abs(np.array(found.size) - (min(width, depth), max(width, depth), height))
-    out = {"position": float(np.linalg.norm(found.position - thing.position)) * 1e3, "size": float(size.max()) * 1e3}
+    out = {"position": float(np.linalg.norm(found.p_base - thing.position)) * 1e3, "size": float(size.max()) * 1e3}
     if thing.kind == "box":
         expected = thing.yaw if width <= depth else thing.yaw + math.pi / 2
         period = math.pi / 2 if width == depth else math.pi
@@ -141,7 +141,7 @@ def test_what_is_no_prism_is_bounded_and_says_so(tabletop, detector, localizer) 
     can = tabletop.Thing("blue", "cylinder", (0.066, 0.066, 0.115), 0.27, 0.1, 0.5, lying=True)
     found = locate(localizer, detector, tabletop.render([can]), "blue")
     assert found.method == "bound"
-    assert np.linalg.norm(found.position[:2] - can.position[:2]) < 0.012
+    assert np.linalg.norm(found.p_base[:2] - can.position[:2]) < 0.012
     assert found.size == pytest.approx((0.066, 0.115, 0.066), abs=0.012)
     assert math.degrees(found.yaw) == pytest.approx(math.degrees(0.5 - math.pi / 2), abs=5.0)
     assert math.sqrt(found.covariance[0, 0]) > 0.003

@@ -10,6 +10,7 @@ import pytest
 
 from openarm_common.config import load_config
 from openarm_common.resources import config_dir
+from openarm_common.ros.detections import class_ids
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
@@ -17,7 +18,6 @@ from openarm_perception.detection.looking import make_pipeline
 from openarm_perception.detection.network import NetworkConfig
 from openarm_perception.detection.pipeline import Perceived, Pipeline
 from openarm_perception.geometry.depth import DepthLimits
-from openarm_perception.ros.convert import names_of
 from tests.openarm_perception.onnx_file import boxes, write_network
 
 LIMITS = DepthLimits(near=0.07)
@@ -69,16 +69,16 @@ def test_boxes_of_a_network_become_objects_in_place(tabletop, perceive, shift: f
     found = {place.label: place for place in seen.located}
     assert sorted(found) == ["blue", "box", "red"]
     for thing, label in zip(things, ("red", "blue", "box"), strict=True):
-        assert np.abs(found[label].position - thing.position).max() < 0.003
+        assert np.abs(found[label].p_base - thing.position).max() < 0.003
         assert np.abs(np.array(found[label].size) - [*sorted(thing.size[:2]), thing.size[2]]).max() < 0.004
-    assert names_of(found["red"]) == ("red", "box")
-    assert names_of(found["blue"]) == ("blue", "can", "cylinder")
-    assert names_of(found["box"]) == ("box", "cube")
+    assert class_ids(found["red"]) == ("red", "box")
+    assert class_ids(found["blue"]) == ("blue", "can", "cylinder")
+    assert class_ids(found["box"]) == ("box", "cube")
 
 
 def test_a_round_outline_in_depth_is_no_box_whatever_the_network_says(tabletop, perceive) -> None:
     seen = perceive("network", three(tabletop), {0: (1, 0.9, 0.0), 1: (0, 0.9, 0.0)})
-    found = {place.label: names_of(place) for place in seen.located}
+    found = {place.label: class_ids(place) for place in seen.located}
     assert found["blue"] == ("blue", "can", "cylinder")
     assert found["red"] == ("red", "cylinder")  # it may lie
 
@@ -145,7 +145,7 @@ def test_a_large_neighbour_in_the_box_is_no_part_of_the_object(tabletop, perceiv
     seen = perceive("network", things, {0: (0, 0.9, 0.0, 30.0)})
     (found,) = seen.located
     assert found.label == "red"
-    assert np.abs(found.position - things[0].position).max() < 0.003
+    assert np.abs(found.p_base - things[0].position).max() < 0.003
 
 
 def test_one_object_named_twice_is_one_object(tabletop, perceive) -> None:
@@ -164,7 +164,7 @@ def test_anything_finds_what_no_detector_knows_by_depth_alone(tabletop, perceive
     seen = perceive("anything", things, {})
     assert [place.label for place in seen.located] == ["anything"] * 3
     for thing in things:
-        assert min(np.abs(place.position - thing.position).max() for place in seen.located) < 0.003
+        assert min(np.abs(place.p_base - thing.position).max() for place in seen.located) < 0.003
 
 
 def test_anything_parts_what_stands_behind_another_and_leaves_the_robot_out(tabletop, perceive) -> None:

@@ -57,7 +57,7 @@ def test_what_cannot_be_measured_is_still_in_the_way(tabletop, pipeline) -> None
     built_in = boxes["blue"]
     assert built_in not in perceived.located
     assert built_in.score == 0.0
-    assert built_in.position[:2] == pytest.approx((0.27, 0.0), abs=0.006)
+    assert built_in.p_base[:2] == pytest.approx((0.27, 0.0), abs=0.006)
     assert built_in.size == pytest.approx((0.05, 0.05, 0.05), abs=0.008)
 
 

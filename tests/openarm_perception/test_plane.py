@@ -14,7 +14,7 @@ from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.detection.localize import Detection3D, Localizer, LocalizerConfig
+from openarm_perception.detection.localize import Localizer, LocalizerConfig, LocatedObject
 from openarm_perception.geometry import plane
 from openarm_perception.geometry.depth import DepthLimits
 
@@ -61,7 +61,7 @@ def blind(tabletop, height: float) -> Localizer:
     return Localizer(LocalizerConfig(heights=(f"red={height}",)), DepthLimits(near=0.07), tabletop.table_height)
 
 
-def without_depth(localizer: Localizer, found, seen) -> Detection3D:
+def without_depth(localizer: Localizer, found, seen) -> LocatedObject:
     """The object of a detection in a view whose depth image is empty."""
     return localizer.locate(localizer.cut(found, np.zeros_like(seen.depth), seen.intrinsics, seen.T_base_camera))
 
@@ -87,8 +87,8 @@ def test_objects_of_known_height_are_within_five_millimetres_without_depth(table
             seen = tabletop.render([thing], T)
             (found,) = detector.detect(seen.rgb)
             place = without_depth(blind(tabletop, size[2]), found, seen)
-            assert not place.measured
-            assert np.linalg.norm(place.position - thing.position) <= 0.005, (thing, place.position)
+            assert not place.from_depth
+            assert np.linalg.norm(place.p_base - thing.position) <= 0.005, (thing, place.p_base)
             assert np.abs(np.array(place.size) - (min(size[:2]), max(size[:2]), size[2])).max() <= 0.006
             if kind == "box":
                 period = np.pi / 2 if size[0] == size[1] else np.pi
@@ -105,7 +105,7 @@ def test_a_wrong_height_stays_within_the_stated_uncertainty(tabletop, detector) 
     config = LocalizerConfig(heights=("red=0.055",), height_std=0.005)
     localizer = Localizer(config, DepthLimits(near=0.07), tabletop.table_height)
     place = without_depth(localizer, found, seen)
-    error = np.linalg.norm((place.position - thing.position)[:2])
+    error = np.linalg.norm((place.p_base - thing.position)[:2])
     assert 0.0005 < error < 3.0 * np.sqrt(place.covariance[0, 0] + place.covariance[1, 1])
 
 

@@ -34,7 +34,7 @@ from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.grid import DepthScan
 from openarm_octomap.mapper import Frame, Mapper
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
-from openarm_perception.detection.localize import Detection3D, Localizer, LocalizerConfig
+from openarm_perception.detection.localize import Localizer, LocalizerConfig, LocatedObject
 from openarm_perception.detection.pipeline import Pipeline
 from openarm_perception.geometry.depth import DepthLimits
 
@@ -60,7 +60,7 @@ class _Found:
 
     frames: int = 0
     skipped: int = 0
-    objects: dict[str, list[Detection3D]] = field(default_factory=lambda: defaultdict[str, list[Detection3D]](list))
+    objects: dict[str, list[LocatedObject]] = field(default_factory=lambda: defaultdict[str, list[LocatedObject]](list))
     boards: dict[str, list[float]] = field(default_factory=lambda: defaultdict[str, list[float]](list))
 
 
