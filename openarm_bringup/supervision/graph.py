@@ -9,6 +9,7 @@ the graph's own top-level values.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any, Literal
 
@@ -115,12 +116,13 @@ class Graph(Config):
 
     def levels(self) -> tuple[tuple[str, ...], ...]:
         """Return the node names by depth of dependency: the first needs nothing, each needs only earlier ones."""
-        depth: dict[str, int] = {}
-        while len(depth) < len(self.nodes):
-            for name, spec in self.nodes.items():
-                if name not in depth and all(need in depth for need in spec.needs):
-                    depth[name] = 1 + max((depth[need] for need in spec.needs), default=-1)
-        return tuple(tuple(n for n, d in depth.items() if d == level) for level in range(max(depth.values()) + 1))
+        sorter = TopologicalSorter({name: spec.needs for name, spec in self.nodes.items()})
+        sorter.prepare()
+        levels: list[tuple[str, ...]] = []
+        while ready := sorter.get_ready():
+            levels.append(tuple(name for name in self.nodes if name in ready))
+            sorter.done(*ready)
+        return tuple(levels)
 
     def node(self, name: str) -> NodeSpec:
         """Return one node.
@@ -289,24 +291,13 @@ def _check_needs(graph: Graph, where: str) -> None:
                     Code.CONFIG_INVALID,
                     f"{where}:nodes.{node}.needs: unknown node {need!r}; nodes are {', '.join(graph.nodes)}",
                 )
-    for start in graph.nodes:
-        trail: list[str] = [start]
-        circle = _circle(graph, start, trail)
-        if circle:
-            raise OpenArmError(
-                Code.CONFIG_INVALID, f"{where}:nodes.{start}.needs: {' → '.join(circle)} is a circle; remove one need"
-            )
-
-
-def _circle(graph: Graph, node: str, trail: list[str]) -> list[str] | None:
-    for need in graph.nodes[node].needs:
-        if need == trail[0]:
-            return [*trail, need]
-        if need not in trail:
-            found = _circle(graph, need, [*trail, need])
-            if found:
-                return found
-    return None
+    try:
+        graph.levels()
+    except CycleError as error:
+        circle: list[str] = error.args[1][::-1]
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"{where}:nodes.{circle[0]}.needs: {' → '.join(circle)} is a circle; remove one need"
+        ) from error
 
 
 def _node_params(node: str, spec: NodeSpec, graph_file: Path, variables: Mapping[str, Any]) -> dict[str, Any]:

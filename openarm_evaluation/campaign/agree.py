@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_evaluation.campaign.report import interval
+from openarm_evaluation.judging.statistics import interval
 
 Row = Mapping[str, Any]
 

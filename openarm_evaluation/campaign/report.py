@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import csv
-import statistics
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from openarm_common.figures import render_page
-from openarm_evaluation.judging.provenance import wilson_low
+from openarm_evaluation.judging.statistics import interval, rate_of, spread
 
 Row = Mapping[str, Any]
 
@@ -21,48 +20,40 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def interval(successes: int, n: int) -> dict[str, Any]:
-    """A rate with its 95 % Wilson interval, %."""
-    low, high = wilson_low(successes, n), 1.0 - wilson_low(n - successes, n)
-    rate = successes / n if n else 0.0
-    return {"n": n, "count": successes, "rate": round(rate, 4), "low": round(low, 4), "high": round(high, 4)}
-
-
 def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """What a campaign came to; times in simulated s.
+    """Sum up a campaign; times in simulated s.
 
-    `possible` are scenes that must be placed; those that may also be refused by name stand in `kinds` alone. `success`
-    counts scenes in which all that was asked for was placed, and `refused_right` impossible ones that were
-    refused with an expected code; `first_attempt` counts scenes that needed one attempt an object.
+    `possible` are scenes that must be placed; those that may also be refused by name are in `kinds` only. `success`
+    counts scenes in which all requested objects were placed, and `refused_right` impossible ones that were refused
+    with an expected code; `first_attempt` counts scenes that needed one attempt an object.
     """
     possible = [row for row in rows if row["expected"] == ["placed"]]
     impossible = [row for row in rows if "placed" not in row["expected"]]
     placed = [row for row in possible if row["placed"]]
     grasps = [grasp for row in rows for grasp in row["grasps"]]
     done = [grasp for grasp in grasps if grasp["placed"]]
-    errors = sorted(float(grasp["place_error_mm"]) for grasp in done)
-    times = sorted(float(grasp["sim_s"]) for grasp in done)
     failed = [row for row in rows if not row["as_expected"]]
-    low, high = (interval(len(placed), len(possible))[key] for key in ("low", "high"))
+    success = interval(len(placed), len(possible))
+    first = sum(row["attempts"] == 1 for row in placed)
     return {
         "n": len(rows),
         "success": len(placed),
         "possible": len(possible),
-        "success_rate": interval(len(placed), len(possible)),
-        "first_attempt": sum(row["attempts"] == 1 for row in placed),
-        "first_attempt_rate": interval(sum(row["attempts"] == 1 for row in placed), len(possible)),
-        "refused_right": interval(sum(bool(row["as_expected"]) for row in impossible), len(impossible)),
+        "success_rate": success,
+        "first_attempt": first,
+        "first_attempt_rate": interval(first, len(possible)),
+        "refused_right": rate_of(row["as_expected"] for row in impossible),
         "false_success": sum(bool(row["false_success"]) for row in rows),
-        "false_success_high": interval(sum(bool(row["false_success"]) for row in rows), len(rows))["high"],
-        "wilson_low": low,
-        "wilson_high": high,
+        "false_success_high": rate_of(row["false_success"] for row in rows)["high"],
+        "wilson_low": success["low"],
+        "wilson_high": success["high"],
         "objects": interval(len(done), len(grasps)),
         "attempts": dict(sorted(Counter(int(row["attempts"]) for row in placed).items())),
         "causes": dict(Counter(_cause(row) for row in failed).most_common()),
         "kinds": _kinds(rows),
         "arms": _arms(grasps),
-        "place_error_mm": _spread(errors, 2),
-        "cycle_s": _spread(times, 2),
+        "place_error_mm": spread(grasp["place_error_mm"] for grasp in done),
+        "cycle_s": spread(grasp["sim_s"] for grasp in done),
         "state_s": _states(done),
     }
 
@@ -81,7 +72,7 @@ def _kinds(rows: Sequence[Row]) -> dict[str, Any]:
     return {
         kind: {
             "expected": " or ".join(mine[0]["expected"]),
-            **interval(sum(bool(row["as_expected"]) for row in mine), len(mine)),
+            **rate_of(row["as_expected"] for row in mine),
             "codes": dict(Counter(row["code"] for row in mine).most_common()),
         }
         for kind, mine in sorted(kinds.items())
@@ -89,10 +80,7 @@ def _kinds(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _arms(grasps: Sequence[Row]) -> dict[str, Any]:
-    return {
-        arm: interval(sum(bool(g["placed"]) for g in grasps if g["arm"] == arm), sum(g["arm"] == arm for g in grasps))
-        for arm in ("left", "right")
-    }
+    return {arm: rate_of(g["placed"] for g in grasps if g["arm"] == arm) for arm in ("left", "right")}
 
 
 def _states(grasps: Sequence[Row]) -> dict[str, float]:
@@ -102,17 +90,6 @@ def _states(grasps: Sequence[Row]) -> dict[str, float]:
         for step in grasp["states"]:
             total[step["state"]] += float(step["seconds"])
     return {state: round(seconds / len(grasps), 2) for state, seconds in total.items()}
-
-
-def _spread(ordered: Sequence[float], digits: int) -> dict[str, float] | None:
-    if not ordered:
-        return None
-    p95 = ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))]
-    return {
-        "median": round(statistics.median(ordered), digits),
-        "p95": round(p95, digits),
-        "max": round(ordered[-1], digits),
-    }
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:

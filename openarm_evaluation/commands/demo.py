@@ -121,7 +121,7 @@ class _Show:
 
 
 def _outcome(result: DemoResult, seeds: tuple[int, ...], accept: float) -> Outcome:
-    from openarm_evaluation.judging.provenance import summarise
+    from openarm_evaluation.judging.statistics import summarise
 
     rows: list[dict[str, Any]] = [trial.as_row() for trial in result.trials]
     summary = summarise(rows)

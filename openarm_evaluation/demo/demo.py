@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.demo import mounts
 from openarm_evaluation.judging import provenance
+from openarm_evaluation.judging.statistics import summarise
 from openarm_evaluation.judging.trial import Ask, Step, Trial, choose_target, run_trial
 
 if TYPE_CHECKING:
@@ -144,18 +145,21 @@ def _trials(
     result: DemoResult,
     listeners: Listeners,
 ) -> None:
-    before = studio.begin if studio is not None else None
-    if not options.seeds:
-        seed = graph.seed if graph.scene == "random" else None
-        scene = load_scene(graph.scene, graph.seed)
-        trial = run_trial(observer, client, scene, options.ask, seed=seed, before=before)
-        result.trials.append(trial)
-        listeners.on_trial(trial)
-        return
-    for seed in options.seeds:
-        after_ns = observer.reset_world("random", seed)
-        scene = load_scene("random", seed)
-        trial = run_trial(observer, client, scene, options.ask, seed=seed, after_ns=after_ns, before=before)
+    if options.seeds:
+        rounds: list[tuple[str, int | None]] = [("random", seed) for seed in options.seeds]
+    else:
+        rounds = [(graph.scene, graph.seed if graph.scene == "random" else None)]
+    for name, seed in rounds:
+        after_ns = observer.reset_world(name, seed or 0) if options.seeds else 0
+        trial = run_trial(
+            observer,
+            client,
+            load_scene(name, graph.seed if seed is None else seed),
+            options.ask,
+            seed=seed,
+            after_ns=after_ns,
+            before=studio.begin if studio is not None else None,
+        )
         result.trials.append(trial)
         listeners.on_trial(trial)
 
@@ -234,7 +238,7 @@ def write_report(options: DemoOptions, graph: Graph, result: DemoResult) -> dict
         "mounts": result.mounts,
         "seeds": list(options.seeds),
         "ready_s": round(result.ready_s, 2),
-        "summary": provenance.summarise(rows),
+        "summary": summarise(rows),
         "rows": rows,
         "error": {"code": str(result.error.code), "message": result.error.message} if result.error else None,
         "pictures": result.pictures,
@@ -259,8 +263,3 @@ def parse_seeds(text: str) -> tuple[int, ...]:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"--seeds {text}: expected numbers such as 0-19, 3 or 1,4,7-9")
         seeds += range(int(low), int(high if dash else low) + 1)
     return tuple(seeds)
-
-
-def failures(trials: Sequence[Trial]) -> list[Trial]:
-    """Return the trials that were not judged as placed."""
-    return [trial for trial in trials if not trial.placed]

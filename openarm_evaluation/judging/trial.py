@@ -218,7 +218,7 @@ def run_trial(
     wall_s = time.monotonic() - began
     _wait_rest(observer, item.name, rules)
     _wait_idle(observer)
-    return _judged(observer, scene, item, result, ask, observer.steps(), wall_s, seed, rules)
+    return _judged(observer, scene, item, result, observer.steps(), wall_s, seed, rules, ask.place)
 
 
 def run_pair(
@@ -250,21 +250,11 @@ def run_pair(
     for item in items:
         _wait_rest(observer, item.name, rules)
     _wait_idle(observer)
-    steps = observer.steps()
-    return [
-        _judged(
-            observer,
-            scene,
-            item,
-            result,
-            Ask(item.label),
-            [step for step in steps if step.label == item.label],
-            wall_s,
-            seed,
-            rules,
-        )
-        for item, result in zip(items, results, strict=True)
-    ]
+    trials: list[Trial] = []
+    for item, result in zip(items, results, strict=True):
+        steps = [step for step in observer.steps() if step.label == item.label]
+        trials.append(_judged(observer, scene, item, result, steps, wall_s, seed, rules))
+    return trials
 
 
 def _judged(
@@ -272,40 +262,35 @@ def _judged(
     scene: Scene,
     item: SceneObject,
     result: GraspResult | OpenArmError,
-    ask: Ask,
     steps: Sequence[Step],
     wall_s: float,
     seed: int | None,
     rules: JudgeConfig,
+    place: tuple[float, float] | None = None,
 ) -> Trial:
-    claimed = not isinstance(result, OpenArmError) and result.success
-    verdict = judge(observer.track(item.name), _target(result, ask), claimed=claimed, config=rules)
+    """Judge an object by where it was to be placed: as requested, else as the grasp chose."""
+    done = None if isinstance(result, OpenArmError) else result
+    if place is None:
+        chosen = done.place_position if done is not None and any(done.place_position) else (math.nan, math.nan)
+        place = (chosen[0], chosen[1])
+    claimed = done is not None and done.success
     return Trial(
         seed=seed,
         scene=scene.name,
         scene_hash=scene_hash(scene),
         target=item.name,
         label=item.label,
-        arm="" if isinstance(result, OpenArmError) else result.arm,
-        attempts=0 if isinstance(result, OpenArmError) else result.attempts,
+        arm=done.arm if done else "",
+        attempts=done.attempts if done else 0,
         claimed=claimed,
         code=str(result.code),
         message=result.message,
-        verdict=verdict,
+        verdict=judge(observer.track(item.name), place, claimed=claimed, config=rules),
         states=durations(steps),
         sim_s=(steps[-1].t_ns - steps[0].t_ns) * 1e-9 if steps else 0.0,
         wall_s=wall_s,
-        route="" if isinstance(result, OpenArmError) else result.route,
+        route=done.route if done else "",
     )
-
-
-def _target(result: GraspResult | OpenArmError, ask: Ask) -> tuple[float, float]:
-    """Return where the object should be: as asked, else as the grasp chose; NaN when nothing was chosen."""
-    if ask.place is not None:
-        return ask.place
-    if isinstance(result, OpenArmError) or not any(result.place_position):
-        return (math.nan, math.nan)
-    return (result.place_position[0], result.place_position[1])
 
 
 def _wait_track(observer: Observer, name: str) -> None:

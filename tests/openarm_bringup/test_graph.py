@@ -108,7 +108,7 @@ def test_unknown_need_names_file_key_and_choices(tmp_path: Path) -> None:
 
 def test_circle_of_needs_is_spelled_out(tmp_path: Path) -> None:
     error = refused(tmp_path, BASE.replace("    module: toy.bridge\n", "    module: toy.bridge\n    needs: [hand]\n"))
-    assert "bridge → hand → bridge is a circle" in error.message
+    assert "bridge → hand → arm → bridge is a circle" in error.message
 
 
 def test_need_of_itself_is_a_circle(tmp_path: Path) -> None:

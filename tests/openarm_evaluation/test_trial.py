@@ -11,7 +11,8 @@ import pytest
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, load_scene
 from openarm_evaluation.judging.judge import JudgeConfig, Sample, judge
-from openarm_evaluation.judging.provenance import machine, scene_hash, summarise, versions, wilson_low
+from openarm_evaluation.judging.provenance import machine, scene_hash, versions
+from openarm_evaluation.judging.statistics import summarise, wilson_low
 from openarm_evaluation.judging.trial import Trial, choose_target, shows
 
 
@@ -82,7 +83,7 @@ def test_outcomes_and_their_sum() -> None:
     assert [t.outcome for t in (good, missed, lied)] == ["placed", "failed", "false success"]
     summary = summarise([t.as_row() for t in (good, missed, lied)])
     assert (summary["n"], summary["success"], summary["first_attempt"], summary["false_success"]) == (3, 1, 1, 1)
-    assert summary["place_error_mm"] == {"median": 2.0, "max": 2.0}
+    assert summary["place_error_mm"] == {"median": 2.0, "p95": 2.0, "max": 2.0}
     assert summarise([])["place_error_mm"] is None
 
 
