@@ -138,7 +138,7 @@ class SimRobot:
     def _note(self) -> None:
         state = self.world.read_joints()
         self.trace.append((state.t_ns, state.position.copy(), state.effort.copy()))
-        if self.world_faults.tells_joints(state.t_ns):
+        if self.world_faults.publishes_joints(state.t_ns):
             self.states.add_joint_state(state.t_ns, self.world.joint_names, state.position.tolist())
             self.efforts = dict(zip(self.world.joint_names, state.effort.tolist(), strict=True))
             self._told_ns = state.t_ns

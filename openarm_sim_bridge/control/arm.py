@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Following joint trajectories with one arm, the way joint_trajectory_controller does.
+"""Following joint trajectories with one arm, like joint_trajectory_controller.
 
-Positions are rad, velocities rad/s, arrays (k,) in the order of the group's joints; times are simulated time. A
-follower is asked once a control tick for the actuator targets of the coming tick. Whatever happens, it has a command:
-at rest it holds, and no new target makes it jump.
+Positions are rad, velocities rad/s, arrays (k,) in the order of the group's joints; times are simulated time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Literal
 
 import numpy as np
@@ -20,7 +17,7 @@ from pydantic import Field
 from openarm_common.config import Config
 from openarm_common.errors import Code
 from openarm_common.types import Array
-from openarm_sim_bridge.control.tracker import Tracker
+from openarm_sim_bridge.control.follower import End, Follower, Tracker
 from openarm_sim_bridge.control.trajectory import (
     JointGroup,
     JointSpline,
@@ -59,14 +56,6 @@ class TrajectoryConfig(Config):
     command_acceleration: float = Field(default=8.0, gt=0.0, description="and its largest acceleration, rad/s2")
 
 
-class End(StrEnum):
-    """How a goal ended, as actions know it."""
-
-    SUCCEEDED = "succeeded"
-    CANCELLED = "cancelled"
-    ABORTED = "aborted"
-
-
 @dataclass(frozen=True)
 class TrajectoryOutcome:
     """How following a trajectory ended."""
@@ -103,8 +92,8 @@ class _Goal:
     cancelled: bool = False
 
 
-class TrajectoryFollower:
-    """Makes the command of one arm. Used by the thread that steps the world; `check` by any.
+class TrajectoryFollower(Follower):
+    """Follows trajectories with one arm. Used by the thread that steps the world; `check` by any.
 
     Args:
         group: The joints.
@@ -114,12 +103,11 @@ class TrajectoryFollower:
     """
 
     def __init__(self, group: JointGroup, config: TrajectoryConfig, lead_s: ArrayLike, position: ArrayLike) -> None:
-        self.group = group
         k = len(group.names)
+        command = Tracker(position, np.full(k, config.command_velocity), np.full(k, config.command_acceleration))
+        super().__init__(group, command)
         self._config = config
         self._lead_s = np.asarray(lead_s, dtype=np.float64) * (1.0 if config.feed_forward else 0.0)
-        self._command = Tracker(position, np.full(k, config.command_velocity), np.full(k, config.command_acceleration))
-        self._target: Array = self._command.position.copy()
         self._goal: _Goal | None = None
         self.state: FollowerState | None = None
 
@@ -136,24 +124,9 @@ class TrajectoryFollower:
         """
         return checked(trajectory, self.group)
 
-    def reset(self, position: ArrayLike) -> None:
-        """Hold another position, because the world was reset; a running goal is aborted."""
-        self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, "the simulated world was reset")
-        self._hold(position)
-
     def abort(self, why: str) -> None:
         """Give up a running goal."""
         self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, why)
-
-    def set_target(self, target: Array) -> None:
-        """Go to a position (k,), NaN for joints that stay as they are; ignored while a trajectory is followed."""
-        if self._goal is None:
-            self._target = np.clip(np.where(np.isnan(target), self._target, target), self.group.lower, self.group.upper)
-
-    def halt(self) -> None:
-        """Come to rest and hold, because commands ceased; a trajectory goes on."""
-        if self._goal is None:
-            self._target = np.clip(self._command.stopping_place(), self.group.lower, self.group.upper)
 
     def start(
         self, trajectory: Trajectory, t_ns: int, measured: Array, done: Callable[[TrajectoryOutcome], None]
@@ -186,15 +159,8 @@ class TrajectoryFollower:
         if self._goal is not None:
             self._goal.cancelled = True
 
-    def update(self, t_ns: int, dt_ns: int, position: Array, velocity: Array) -> Array:
-        """Actuator targets (k,) for the tick that begins at `t_ns`.
-
-        Args:
-            t_ns: Present time.
-            dt_ns: Length of the coming tick.
-            position: (k,) measured now.
-            velocity: (k,) measured now.
-        """
+    def update(self, t_ns: int, dt_ns: int, position: Array, velocity: Array, effort: Array) -> Array:
+        """See `Follower.update`."""
         desired = self._command
         self.state = FollowerState(t_ns, desired.position, desired.velocity, position, velocity)
         if self._goal is not None:
@@ -321,10 +287,6 @@ class TrajectoryFollower:
     def _tolerances(self, given: tuple[JointTolerance, ...], default: float) -> Array:
         by_name = {tolerance.name: _or_default(tolerance.position, default) for tolerance in given}
         return np.array([by_name.get(name, default) for name in self.group.names])
-
-    def _hold(self, position: ArrayLike) -> None:
-        self._command.hold(position)
-        self._target = self._command.position.copy()
 
     def _finish(self, end: End, result: TrajectoryResult, text: str) -> None:
         if self._goal is not None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_sim_bridge.control.arm import TrajectoryConfig, TrajectoryFollower
+from openarm_sim_bridge.control.follower import Follower
 from openarm_sim_bridge.control.gripper import GripperConfig, GripperFollower
 from openarm_sim_bridge.control.trajectory import JointGroup
 from openarm_sim_bridge.world.world import JointReadout, World
@@ -24,7 +25,7 @@ _LIMIT_SLACK = 1e-4
 
 @dataclass(frozen=True)
 class PositionCommand:
-    """A checked position command: what is known of it, and the names that nothing here is called by."""
+    """A checked position command: positions by joint, and the names of unknown joints."""
 
     positions: Mapping[str, float]
     unknown: tuple[str, ...]
@@ -51,23 +52,25 @@ class RobotController:
     ) -> None:
         self._names = world.joint_names
         self._timeout_ns = round(trajectory.command_timeout * 1e9)
-        self._commanded_ns: dict[TrajectoryFollower | GripperFollower, int] = {}
+        self._commanded_ns: dict[Follower, int] = {}
         self._now_ns = world.t_ns
         self._targets = world.read_joints().position
         lead, limits = world.target_lead_s(), world.effort_limits()
-        self.arms: dict[str, TrajectoryFollower] = {}
-        self.grippers: dict[str, GripperFollower] = {}
-        self._columns: dict[str, NDArray[np.intp]] = {}
-        for side, group in arms.items():
-            at = self._columns_of(group)
-            self._columns[side] = at
-            self.arms[side] = TrajectoryFollower(group, trajectory, lead[at], self._targets[at])
-        self._fingers: dict[str, int] = {}
-        for side, group in grippers.items():
-            (finger,) = self._columns_of(group)
-            self._fingers[side] = int(finger)
-            self.grippers[side] = GripperFollower(group, gripper, float(self._targets[finger]), float(limits[finger]))
-
+        at = {
+            group: np.array([self._names.index(name) for name in group.names])
+            for group in (*arms.values(), *grippers.values())
+        }
+        self.arms = {
+            side: TrajectoryFollower(group, trajectory, lead[at[group]], self._targets[at[group]])
+            for side, group in arms.items()
+        }
+        self.grippers = {
+            side: GripperFollower(group, gripper, self._targets[at[group]], float(limits[at[group]][0]))
+            for side, group in grippers.items()
+        }
+        self._followers: list[tuple[Follower, NDArray[np.int64]]] = [
+            (follower, at[follower.group]) for follower in (*self.arms.values(), *self.grippers.values())
+        ]
         self._limits = {
             name: (float(lower), float(upper))
             for group in (*arms.values(), *grippers.values())
@@ -104,60 +107,44 @@ class RobotController:
 
     def busy(self, command: PositionCommand) -> tuple[str, ...]:
         """Joints of a command that are ignored because their arm or gripper follows a goal."""
-        following = (*self.arms.values(), *self.grippers.values())
-        return tuple(name for f in following if f.busy for name in f.group.names if name in command.positions)
+        return tuple(name for f, _ in self._followers if f.busy for name in f.group.names if name in command.positions)
 
     def command(self, command: PositionCommand) -> None:
         """Go to the positions of a checked command, with bounded speed; hold when no other follows in time."""
-        positions = command.positions
-        for arm in self.arms.values():
-            target = np.array([positions.get(name, np.nan) for name in arm.group.names])
-            if not np.all(np.isnan(target)):
-                arm.set_target(target)
-                self._commanded_ns[arm] = self._now_ns
-        for gripper in self.grippers.values():
-            if gripper.group.names[0] in positions:
-                gripper.set_target(positions[gripper.group.names[0]])
-                self._commanded_ns[gripper] = self._now_ns
+        for follower, _ in self._followers:
+            target = np.array([command.positions.get(name, np.nan) for name in follower.group.names])
+            if not np.isnan(target).all():
+                follower.set_target(target)
+                self._commanded_ns[follower] = self._now_ns
 
     def reset(self, state: JointReadout) -> None:
         """Hold the positions of a world that was reset; goals that run are aborted."""
         self._targets[:] = state.position
         self._commanded_ns.clear()
-        for side, arm in self.arms.items():
-            arm.reset(state.position[self._columns[side]])
-        for side, gripper in self.grippers.items():
-            gripper.reset(float(state.position[self._fingers[side]]))
+        for follower, at in self._followers:
+            follower.reset(state.position[at])
 
     def abort(self, why: str) -> None:
         """Give up all goals, because the world can't go on."""
-        for follower in (*self.arms.values(), *self.grippers.values()):
+        for follower, _ in self._followers:
             follower.abort(why)
 
     def update(self, state: JointReadout, dt_ns: int) -> Array:
         """Actuator targets (n,) for the tick of `dt_ns` that begins at `state`; valid until the next call."""
         self._now_ns = state.t_ns
-        self._watch(state.t_ns)
-        for side, arm in self.arms.items():
-            at = self._columns[side]
-            self._targets[at] = arm.update(state.t_ns, dt_ns, state.position[at], state.velocity[at])
-        for side, gripper in self.grippers.items():
-            i = self._fingers[side]
-            self._targets[i] = gripper.update(
-                state.t_ns, dt_ns, float(state.position[i]), float(state.velocity[i]), float(state.effort[i])
+        self._hold_where_commands_ceased()
+        for follower, at in self._followers:
+            self._targets[at] = follower.update(
+                state.t_ns, dt_ns, state.position[at], state.velocity[at], state.effort[at]
             )
         return self._targets
 
-    def _watch(self, t_ns: int) -> None:
-        """Hold where position commands have ceased."""
-        for follower, since_ns in list(self._commanded_ns.items()):
-            if t_ns - since_ns > self._timeout_ns:
-                follower.halt()
-                del self._commanded_ns[follower]
-
     def effort_limits(self) -> dict[int, float]:
         """Effort limits of the grippers by joint index, N."""
-        return {self._fingers[side]: gripper.effort_limit for side, gripper in self.grippers.items()}
+        return {int(at[0]): f.effort_limit for f, at in self._followers if isinstance(f, GripperFollower)}
 
-    def _columns_of(self, group: JointGroup) -> NDArray[np.intp]:
-        return np.array([self._names.index(name) for name in group.names], dtype=np.intp)
+    def _hold_where_commands_ceased(self) -> None:
+        for follower, since_ns in list(self._commanded_ns.items()):
+            if self._now_ns - since_ns > self._timeout_ns:
+                follower.halt()
+                del self._commanded_ns[follower]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Moving one gripper, the way parallel_gripper_action_controller does.
+"""Moving one gripper, like parallel_gripper_action_controller.
 
-Position is that of the driving finger joint, m from the middle (0 closed, 0.044 open: the gap is twice that); velocity
+Position is that of the driving finger joint, m from the middle (0 closed, 0.044 open: half of the aperture); velocity
 m/s, effort N. The command ramps to the goal and stays there, so a gripper that is stopped by an object goes on
 pressing with the effort limit.
 """
@@ -12,12 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.control.arm import End
-from openarm_sim_bridge.control.tracker import Tracker
+from openarm_common.types import Array
+from openarm_sim_bridge.control.follower import End, Follower, Tracker
 from openarm_sim_bridge.control.trajectory import JointGroup
 
 _LIMIT_SLACK = 1e-4
@@ -61,27 +62,26 @@ class GripperGoal:
     max_velocity: float = 0.0
 
 
-class GripperFollower:
-    """Makes the command of one gripper. Used by the thread that steps the world; `check` by any.
+class GripperFollower(Follower):
+    """Moves one gripper. Used by the thread that steps the world; `check` by any.
 
     Args:
         group: The one driving finger joint.
         config: Speeds and tolerances.
-        position: Where the command starts, m.
+        position: (1,) where the command starts, m.
         max_effort: Limit of the gripper, N.
     """
 
-    def __init__(self, group: JointGroup, config: GripperConfig, position: float, max_effort: float) -> None:
-        self.group = group
+    def __init__(self, group: JointGroup, config: GripperConfig, position: ArrayLike, max_effort: float) -> None:
+        super().__init__(group, Tracker(position, [config.velocity], [config.acceleration]))
         self._config = config
-        self._command = Tracker([position], [config.velocity], [config.acceleration])
-        self._target = np.array([position])
         self._velocity = config.velocity
         self._done: Callable[[GripperOutcome], None] | None = None
         self._cancelled = False
         self._still_ns = 0
         self._arrived_ns: int | None = None
         self._max_effort = max_effort
+        #: Effort that the actuator may use, N.
         self.effort_limit = max_effort
 
     @property
@@ -107,26 +107,24 @@ class GripperFollower:
             )
         return goal
 
-    def reset(self, position: float) -> None:
-        """Hold another position, because the world was reset; a running goal is aborted."""
-        self._finish(End.ABORTED, position, 0.0, "the simulated world was reset")
-        self._command.hold(position)
-        self._target[0] = position
+    def reset(self, position: ArrayLike) -> None:
+        """See `Follower.reset`; the effort limit is the gripper's again."""
+        super().reset(position)
         self.effort_limit = self._max_effort
 
     def abort(self, why: str) -> None:
-        """Give up a running goal."""
+        """See `Follower.abort`."""
         self._finish(End.ABORTED, float(self._command.position[0]), 0.0, why)
 
-    def set_target(self, position: float) -> None:
-        """Go to a position, m, with the default effort; ignored while a goal is worked on."""
-        if self._done is None:
-            self._aim(position, 0.0, 0.0)
+    def set_target(self, target: Array) -> None:
+        """See `Follower.set_target`; speed and effort are the default ones."""
+        if not self.busy:
+            self._aim(float(target[0]), 0.0, 0.0)
 
     def halt(self) -> None:
-        """Stop the ramp where it is, because commands ceased; what is held stays held, a goal goes on."""
-        if self._done is None:
-            self._target[:] = self._command.position
+        """Stop the ramp where it is, because commands ceased: a held object stays held; a goal continues."""
+        if not self.busy:
+            self._target = self._command.position.copy()
 
     def start(self, goal: GripperGoal, position: float, effort: float, done: Callable[[GripperOutcome], None]) -> None:
         """Work on a checked goal from now on; one that runs is aborted.
@@ -145,18 +143,18 @@ class GripperFollower:
         """Stop the ramp where it is; what is held stays held."""
         self._cancelled = self.busy
 
-    def update(self, t_ns: int, dt_ns: int, position: float, velocity: float, effort: float) -> float:
-        """Actuator target, m, for the tick that begins at `t_ns`; measured position, velocity and effort."""
+    def update(self, t_ns: int, dt_ns: int, position: Array, velocity: Array, effort: Array) -> Array:
+        """See `Follower.update`."""
         if self._done is not None:
-            self._judge(t_ns, dt_ns, position, velocity, effort)
+            self._judge(t_ns, dt_ns, float(position[0]), float(velocity[0]), float(effort[0]))
         if self._command.position[0] != self._target[0]:
             self._command.step(self._target, dt_ns * 1e-9, self._velocity)
-        return float(self._command.position[0])
+        return self._command.position
 
     def _judge(self, t_ns: int, dt_ns: int, position: float, velocity: float, effort: float) -> None:
         config = self._config
         if self._cancelled:
-            self._target[:] = self._command.position
+            self._target = self._command.position.copy()
             self._finish(End.CANCELLED, position, effort, "cancelled; the gripper holds")
             return
         still = abs(velocity) <= config.stall_velocity
@@ -179,7 +177,7 @@ class GripperFollower:
             )
 
     def _aim(self, position: float, velocity: float, effort: float) -> None:
-        self._target[0] = min(max(position, float(self.group.lower[0])), float(self.group.upper[0]))
+        self._target = self._within_limits(np.array([position]))
         self._velocity = velocity if velocity > 0.0 else self._config.velocity
         self.effort_limit = min(effort, self._max_effort) if effort > 0.0 else self._max_effort
 

@@ -42,7 +42,7 @@ class TrajectoryError(OpenArmError):
         self.result = result
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JointGroup:
     """The joints of one controller; arrays (k,), rad or m, rad/s or m/s."""
 

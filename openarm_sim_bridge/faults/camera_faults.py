@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of cameras, worked in the process that draws. Lengths in m, pixels as (row v, column u), stamps in ns."""
+"""Injected faults of cameras, applied where images are drawn. Lengths in m, pixels (row v, column u), stamps in ns."""
 
 from __future__ import annotations
 
 import math
 import zlib
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TypeVar
 
 import mujoco
@@ -14,26 +15,28 @@ from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
-from openarm_common.config import Config
 from openarm_sim_bridge.faults.faults import (
     CameraDelay,
     CameraDrop,
+    CameraFreeze,
     DepthPatch,
     Fault,
     IntrinsicsBias,
     LightChanged,
     MountKnocked,
+    OfCamera,
     StampOffset,
+    find,
 )
 
-ParametersT = TypeVar("ParametersT", bound=Config)
+CameraFaultT = TypeVar("CameraFaultT", bound=OfCamera)
 
 _LIGHTS = ("light_diffuse", "light_ambient", "light_specular")
 _HEADLIGHT = ("diffuse", "ambient", "specular")
 
 
 class CameraFaults:
-    """Faults that are active."""
+    """Active faults."""
 
     def __init__(self) -> None:
         self._faults: dict[str, Fault] = {}
@@ -43,7 +46,7 @@ class CameraFaults:
         self._changed = False
 
     def set(self, faults: Iterable[Fault]) -> None:
-        """Take the faults that are active from now on; one that was active already goes on."""
+        """Take the faults that are active from now on; one that was active already continues."""
         before, self._faults = self._faults, {fault.name: fault for fault in faults}
         for name, fault in self._faults.items():
             if before.get(name) != fault:
@@ -51,7 +54,7 @@ class CameraFaults:
         self._changed = True
 
     def apply(self, model: mujoco.MjModel) -> None:
-        """Put mounts and light into the model that is drawn, where they have changed."""
+        """Write changed mounts and light into the model that is drawn."""
         if model is not self._model:
             self._model = model
             self._base = {key: getattr(model, key).copy() for key in ("cam_pos", "cam_quat", *_LIGHTS)}
@@ -60,7 +63,7 @@ class CameraFaults:
         if not self._changed:
             return
         self._changed = False
-        light = self._of("light_changed", LightChanged)
+        light = find(self._faults.values(), LightChanged)
         scale = light.scale if light is not None else 1.0
         for key in _LIGHTS:
             getattr(model, key)[:] = self._base[key] * scale
@@ -71,7 +74,7 @@ class CameraFaults:
 
     def _mount(self, name: str, i: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         position, quaternion = self._base["cam_pos"][i], self._base["cam_quat"][i]
-        knock = self._of("mount_knocked", MountKnocked, name)
+        knock = self._of(MountKnocked, name)
         if knock is None:
             return position, quaternion
         rng = np.random.default_rng([self._faults["mount_knocked"].seed, zlib.crc32(name.encode())])
@@ -82,38 +85,35 @@ class CameraFaults:
         return shifted, np.roll(se3.quat_xyzw_from_matrix(rotation), 1)
 
     def drops(self, camera: str) -> bool:
-        """Whether this frame of a camera is lost; ask once a frame."""
-        drop = self._of("camera_drop", CameraDrop, camera)
+        """Whether this frame of a camera is lost; ask once per frame."""
+        drop = self._of(CameraDrop, camera)
         return drop is not None and bool(self._rngs["camera_drop"].random() < drop.share)
 
     def delay_s(self, camera: str) -> float:
         """How late frames are, s."""
-        delay = self._of("camera_delay", CameraDelay, camera)
+        delay = self._of(CameraDelay, camera)
         return delay.seconds if delay is not None else 0.0
 
     def frozen(self, camera: str) -> bool:
-        """Whether the picture stands still."""
-        fault = self._faults.get("camera_freeze")
-        return fault is not None and fault.sees(camera)
+        """Whether the picture stays the same."""
+        return self._of(CameraFreeze, camera) is not None
 
     def stamp_ns(self, camera: str, t_ns: int) -> int:
         """Stamp that a frame carries; never before zero."""
-        offset = self._of("stamp_offset", StampOffset, camera)
+        offset = self._of(StampOffset, camera)
         return max(0, t_ns + round(offset.ms * 1e6)) if offset is not None else t_ns
 
     def intrinsics(self, camera: str, true: Intrinsics) -> Intrinsics:
-        """Intrinsics that are told."""
-        bias = self._of("intrinsics_bias", IntrinsicsBias, camera)
+        """Intrinsics that are published."""
+        bias = self._of(IntrinsicsBias, camera)
         if bias is None:
             return true
-        scale = 1.0 + bias.focal
-        return Intrinsics(
-            true.width, true.height, true.fx * scale, true.fy * scale, true.cx + bias.cx, true.cy + bias.cy
-        )
+        fx, fy = true.fx * (1.0 + bias.focal), true.fy * (1.0 + bias.focal)
+        return replace(true, fx=fx, fy=fy, cx=true.cx + bias.cx, cy=true.cy + bias.cy)
 
     def spoil_depth(self, camera: str, depth: NDArray[np.generic]) -> None:
-        """Make a patch of a depth image (mm as uint16, or m as float32) wrong, in place."""
-        patch = self._of("depth_patch", DepthPatch, camera)
+        """Falsify a patch of a depth image (mm as uint16, or m as float32), in place."""
+        patch = self._of(DepthPatch, camera)
         if patch is None:
             return
         part = depth[patch.v : patch.v + patch.height, patch.u : patch.u + patch.width]
@@ -123,8 +123,6 @@ class CameraFaults:
         else:
             part[:] = np.maximum(part.astype(np.float32) + np.float32(patch.metres), np.float32(0.0))
 
-    def _of(self, name: str, model: type[ParametersT], camera: str = "") -> ParametersT | None:
-        fault = self._faults.get(name)
-        if fault is None or not (camera == "" or fault.sees(camera)) or not isinstance(fault.parameters, model):
-            return None
-        return fault.parameters
+    def _of(self, model: type[CameraFaultT], camera: str) -> CameraFaultT | None:
+        fault = find(self._faults.values(), model)
+        return fault if fault is not None and fault.hits(camera) else None

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can be made to go wrong on purpose: names, parameters and their checks.
+"""Fault injection: names, parameters and their checks.
 
-Faults of cameras are worked in the process that draws (`camera_faults`), those of robot and world in the thread that
-steps the world (`world_faults`). What is random about a fault comes from its seed alone.
+Faults of cameras are applied in the process that draws (`camera_faults`), those of robot and world in the thread that
+steps the world (`world_faults`). All randomness of a fault comes from its seed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import yaml
 from pydantic import Field
@@ -17,51 +18,67 @@ from pydantic import Field
 from openarm_common.config import Config, validate
 from openarm_common.errors import Code, OpenArmError
 
-Side = Literal["left", "right", "both"]
+ParametersT = TypeVar("ParametersT", bound=Config)
 
 
-class _OfCamera(Config):
+class OfCamera(Config):
+    """Concerns one camera, or all."""
+
     camera: str = Field(default="", description="name of a camera; empty: all")
 
+    def hits(self, camera: str) -> bool:
+        """Whether it concerns a camera."""
+        return self.camera in ("", camera)
 
-class CameraDrop(_OfCamera):
+
+class OfSide(Config):
+    """Concerns one arm and gripper, or both."""
+
+    side: Literal["left", "right", "both"] = Field(default="both", description="which arm or gripper")
+
+    def hits(self, side: str) -> bool:
+        """Whether it concerns a side of the robot."""
+        return self.side in ("both", side)
+
+
+class CameraDrop(OfCamera):
     """Frames are not published."""
 
     share: float = Field(default=0.5, ge=0.0, le=1.0, description="of the frames")
 
 
-class CameraDelay(_OfCamera):
+class CameraDelay(OfCamera):
     """Frames are published late, with their own stamps."""
 
     seconds: float = Field(default=0.2, ge=0.0, le=10.0, description="wall clock, s")
 
 
-class CameraFreeze(_OfCamera):
+class CameraFreeze(OfCamera):
     """The picture stands still while stamps go on."""
 
 
-class StampOffset(_OfCamera):
+class StampOffset(OfCamera):
     """Stamps of images and infos are off."""
 
     ms: float = Field(default=20.0, ge=-10_000.0, le=10_000.0, description="added to the stamps")
 
 
-class IntrinsicsBias(_OfCamera):
-    """CameraInfo tells wrong intrinsics."""
+class IntrinsicsBias(OfCamera):
+    """CameraInfo has wrong intrinsics."""
 
     focal: float = Field(default=0.02, gt=-0.9, le=1.0, description="error of fx and fy, as a share")
     cx: float = Field(default=0.0, ge=-500.0, le=500.0, description="error of cx, pixels")
     cy: float = Field(default=0.0, ge=-500.0, le=500.0, description="error of cy, pixels")
 
 
-class MountKnocked(_OfCamera):
-    """The camera was knocked: it stands elsewhere than told; direction and axis come from the seed."""
+class MountKnocked(OfCamera):
+    """The camera was knocked: its true pose is off the published one; direction and axis come from the seed."""
 
     mm: float = Field(default=10.0, ge=0.0, le=200.0, description="shift")
     deg: float = Field(default=1.0, ge=0.0, le=90.0, description="turn")
 
 
-class DepthPatch(_OfCamera):
+class DepthPatch(OfCamera):
     """A rectangle of the depth image is wrong."""
 
     u: int = Field(default=280, ge=0, description="left edge, pixels")
@@ -78,10 +95,10 @@ class LightChanged(Config):
 
 
 class JointStateGap(Config):
-    """Joint states fall silent once a period, at a time within it that comes from the seed."""
+    """Joint states are not published for a while once per period, at a time that comes from the seed."""
 
     ms: float = Field(default=200.0, gt=0.0, le=10_000.0, description="length of a gap")
-    every: float = Field(default=1.0, gt=0.0, le=60.0, description="period, s; no longer than a gap: silent for good")
+    every: float = Field(default=1.0, gt=0.0, le=60.0, description="period, s; no longer than a gap: none is published")
 
 
 class ObjectNudged(Config):
@@ -97,52 +114,37 @@ class FrictionLowered(Config):
     scale: float = Field(default=0.2, ge=0.0, le=1.0, description="of all friction")
 
 
-class GripperStuck(Config):
+class GripperStuck(OfSide):
     """A gripper takes no command."""
 
-    side: Side = Field(default="both", description="which gripper")
 
-
-class GripperWeak(Config):
+class GripperWeak(OfSide):
     """A gripper presses with less force."""
 
-    side: Side = Field(default="both", description="which gripper")
     share: float = Field(default=0.1, ge=0.0, le=1.0, description="of its force")
 
 
-class JointSag(Config):
+class JointSag(OfSide):
     """The arm's own weight is not compensated: it hangs below its targets."""
 
-    side: Side = Field(default="both", description="which arm")
     share: float = Field(default=0.0, ge=0.0, le=1.0, description="of the weight that is still carried")
 
 
-class JointLate(Config):
+class JointLate(OfSide):
     """Targets take effect late."""
 
-    side: Side = Field(default="both", description="which arm, with its gripper")
     ms: float = Field(default=100.0, ge=0.0, le=2_000.0, description="how late")
 
 
-CAMERA_FAULTS: Mapping[str, type[Config]] = {
-    "camera_drop": CameraDrop,
-    "camera_delay": CameraDelay,
-    "camera_freeze": CameraFreeze,
-    "stamp_offset": StampOffset,
-    "intrinsics_bias": IntrinsicsBias,
-    "mount_knocked": MountKnocked,
-    "depth_patch": DepthPatch,
-    "light_changed": LightChanged,
-}
-WORLD_FAULTS: Mapping[str, type[Config]] = {
-    "joint_state_gap": JointStateGap,
-    "object_nudged": ObjectNudged,
-    "friction_lowered": FrictionLowered,
-    "gripper_stuck": GripperStuck,
-    "gripper_weak": GripperWeak,
-    "joint_sag": JointSag,
-    "joint_late": JointLate,
-}
+def _by_name(*models: type[Config]) -> Mapping[str, type[Config]]:
+    return {re.sub(r"(?<!^)(?=[A-Z])", "_", model.__name__).lower(): model for model in models}
+
+
+CAMERA_FAULTS = _by_name(
+    CameraDrop, CameraDelay, CameraFreeze, StampOffset, IntrinsicsBias, MountKnocked, DepthPatch, LightChanged
+)
+WORLD_FAULTS = _by_name(JointStateGap, ObjectNudged, FrictionLowered, GripperStuck, GripperWeak, JointSag, JointLate)
+#: Parameters of every fault by its name.
 FAULTS: Mapping[str, type[Config]] = {**CAMERA_FAULTS, **WORLD_FAULTS}
 
 
@@ -156,21 +158,13 @@ class Fault:
 
     @property
     def of_camera(self) -> bool:
-        """Whether the process that draws works it."""
+        """Whether the process that draws applies it."""
         return self.name in CAMERA_FAULTS
 
-    @property
-    def side(self) -> str:
-        """Of the robot; both where the fault has none."""
-        return str(getattr(self.parameters, "side", "both"))
 
-    def hits(self, side: str) -> bool:
-        """Whether it concerns a side of the robot."""
-        return self.side in ("both", side)
-
-    def sees(self, camera: str) -> bool:
-        """Whether it concerns a camera."""
-        return getattr(self.parameters, "camera", "") in ("", camera)
+def find(faults: Iterable[Fault], model: type[ParametersT]) -> ParametersT | None:
+    """Return the parameters of the fault of a type; None when it is not among the faults."""
+    return next((fault.parameters for fault in faults if isinstance(fault.parameters, model)), None)
 
 
 def checked_fault(name: str, data: Mapping[str, Any], seed: int = 0) -> Fault:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of robot and world, worked by the thread that steps the world.
+"""Injected faults of robot and world, applied by the thread that steps the world.
 
 Targets (n,) and joint columns are in the order of the world's joints; times are simulated, ns.
 """
@@ -15,21 +15,25 @@ import numpy as np
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import SIDES
 from openarm_common.types import Array
 from openarm_sim_bridge.faults.faults import (
     Fault,
     FrictionLowered,
+    GripperStuck,
     GripperWeak,
     JointLate,
     JointSag,
     JointStateGap,
     ObjectNudged,
+    ParametersT,
+    find,
 )
 from openarm_sim_bridge.world.world import World
 
 
 class WorldFaults:
-    """Faults that are active in a world.
+    """Active faults of a world.
 
     Args:
         joint_names: Order of the targets; the name says the side (`left`, `right`) and whether it is a finger.
@@ -91,52 +95,50 @@ class WorldFaults:
         model = world.model
         model.geom_friction[:] = self._friction
         model.body_gravcomp[:] = self._gravcomp
-        for fault in self._faults.values():
-            parameters = fault.parameters
-            if isinstance(parameters, FrictionLowered):
-                model.geom_friction[:] *= parameters.scale
-            elif isinstance(parameters, JointSag):
-                for body in range(model.nbody):
-                    name = model.body(body).name
-                    if any(f"_{side}_" in name and fault.hits(side) for side in ("left", "right")):
-                        model.body_gravcomp[body] *= parameters.share
+        if (friction := self._of(FrictionLowered)) is not None:
+            model.geom_friction[:] *= friction.scale
+        if (sag := self._of(JointSag)) is not None:
+            for body in range(model.nbody):
+                if any(f"_{side}_" in model.body(body).name and sag.hits(side) for side in SIDES):
+                    model.body_gravcomp[body] *= sag.share
 
     def targets(self, wanted: Array) -> Array:
-        """Actuator targets (n,) that take effect, of those that are wanted."""
+        """Return the actuator targets (n,) that take effect in place of the wanted ones."""
         if not self._faults:
             return wanted
         out = wanted.copy()
-        late = self._faults.get("joint_late")
-        if late is not None and isinstance(late.parameters, JointLate):
+        if (late := self._of(JointLate)) is not None:
             self._late.append(wanted.copy())
-            ticks = round(late.parameters.ms * 1e6 / self._period_ns)
+            ticks = round(late.ms * 1e6 / self._period_ns)
             before = self._late.popleft() if len(self._late) > ticks else self._late[0]
             hit = [i for i, name in enumerate(self._names) if late.hits(_side(name))]
             out[hit] = before[hit]
-        stuck = self._faults.get("gripper_stuck")
-        if stuck is not None:
+        if (stuck := self._of(GripperStuck)) is not None:
             for i, name in enumerate(self._names):
                 if "finger" in name and stuck.hits(_side(name)):
                     out[i] = self._stuck.setdefault(i, float(out[i]))
         return out
 
     def effort_limits(self, limits: Mapping[int, float]) -> Mapping[int, float]:
-        """Effort limits by joint index that take effect."""
-        weak = self._faults.get("gripper_weak")
-        if weak is None or not isinstance(weak.parameters, GripperWeak):
+        """Return the effort limits by joint index that take effect."""
+        weak = self._of(GripperWeak)
+        if weak is None:
             return limits
-        share = weak.parameters.share
-        return {i: limit * (share if weak.hits(_side(self._names[i])) else 1.0) for i, limit in limits.items()}
+        return {i: limit * (weak.share if weak.hits(_side(self._names[i])) else 1.0) for i, limit in limits.items()}
 
-    def tells_joints(self, t_ns: int) -> bool:
+    def publishes_joints(self, t_ns: int) -> bool:
         """Whether the joint state of a tick is published."""
-        gap = self._faults.get("joint_state_gap")
-        if gap is None or not isinstance(gap.parameters, JointStateGap):
+        gap = self._of(JointStateGap)
+        if gap is None:
             return True
-        every_ns, gap_ns = round(gap.parameters.every * 1e9), round(gap.parameters.ms * 1e6)
+        every_ns, gap_ns = round(gap.every * 1e9), round(gap.ms * 1e6)
         period, inside = divmod(t_ns, every_ns)
-        begin = np.random.default_rng([gap.seed, period]).uniform(0.0, max(0.0, every_ns - gap_ns))
+        seed = self._faults["joint_state_gap"].seed
+        begin = np.random.default_rng([seed, period]).uniform(0.0, max(0.0, every_ns - gap_ns))
         return not begin <= inside < begin + gap_ns
+
+    def _of(self, model: type[ParametersT]) -> ParametersT | None:
+        return find(self._faults.values(), model) if self._faults else None
 
 
 def _side(joint: str) -> str:

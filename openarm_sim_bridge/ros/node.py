@@ -127,7 +127,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
     def _observe(self, state: JointReadout) -> None:
         """End of a tick, in the thread of the simulation."""
         with until_shutdown(self.context):
-            joints = self._simulation.faults.tells_joints(state.t_ns)
+            joints = self._simulation.faults.publishes_joints(state.t_ns)
             self._states.publish(state, self._simulation.world, joints=joints)
             self._forces.publish(self._simulation.world)
             if self._images is not None:

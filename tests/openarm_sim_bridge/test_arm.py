@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from openarm_common.errors import Code
 from openarm_sim_bridge.control.arm import End, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
-from openarm_sim_bridge.control.tracker import Tracker
+from openarm_sim_bridge.control.follower import Tracker
 from openarm_sim_bridge.control.trajectory import (
     JointGroup,
     JointTolerance,
@@ -42,7 +42,7 @@ class Arm:
 
     def tick(self, n: int = 1) -> None:
         for _ in range(n):
-            target = self.follower.update(self.t_ns, 10 * MS, self.q, self.v)
+            target = self.follower.update(self.t_ns, 10 * MS, self.q, self.v, np.zeros(2))
             q = self.plant(self.q, target)
             self.v, self.q = (q - self.q) / 0.01, q
             self.t_ns += 10 * MS

@@ -20,7 +20,7 @@ class Finger:
     """A gripper follower and a finger that an object may stop at `width`; pressing on it costs `effort`."""
 
     def __init__(self, position: float = 0.044, stop: float = -1.0) -> None:
-        self.follower = GripperFollower(FINGER, GripperConfig(), position, 30.0)
+        self.follower = GripperFollower(FINGER, GripperConfig(), [position], 30.0)
         self.x, self.v, self.stop, self.t_ns = position, 0.0, stop, START
         self.targets: list[float] = []
         self.outcomes: list[GripperOutcome] = []
@@ -28,6 +28,10 @@ class Finger:
     def start(self, position: float, **kwargs) -> None:
         goal = self.follower.check(GripperGoal(position, **kwargs))
         self.follower.start(goal, self.x, self.effort, self.outcomes.append)
+
+    def update(self, x: float, v: float, effort: float) -> float:
+        measured = (np.array([value]) for value in (x, v, effort))
+        return float(self.follower.update(self.t_ns, 10 * MS, *measured)[0])
 
     @property
     def effort(self) -> float:
@@ -44,7 +48,7 @@ class Finger:
 
     def tick(self, n: int = 1) -> None:
         for _ in range(n):
-            self.targets.append(self.follower.update(self.t_ns, 10 * MS, self.x, self.v, self.effort))
+            self.targets.append(self.update(self.x, self.v, self.effort))
             x = max(self.targets[-1], self.stop)
             self.v, self.x = (x - self.x) / 0.01, x
             self.t_ns += 10 * MS
@@ -117,7 +121,7 @@ def test_a_finger_that_never_rests_times_out() -> None:
     finger = Finger()
     finger.start(0.02)
     for i in range(600):
-        finger.follower.update(finger.t_ns, 10 * MS, 0.03, 0.01 * (-1) ** i, 0.0)
+        finger.update(0.03, 0.01 * (-1) ** i, 0.0)
         finger.t_ns += 10 * MS
     assert [o.end for o in finger.outcomes] == [End.ABORTED]
     assert "still moves at" in finger.outcomes[0].text
