@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from benchmarks.report import Row
 from openarm_common.robot.description import RobotDescription
-from openarm_common.scene.types import Scene, Table
+from openarm_common.scene.scene import Scene, Table
 from openarm_common.types import Array
 from openarm_motion.planning.arm import Arm
 from openarm_sim_bridge.world.model import compile_model

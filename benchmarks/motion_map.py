@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.map_scene import MapScene
-from openarm_common.scene.types import PALETTE, Scene, SceneObject, Table
+from openarm_common.scene.scene import PALETTE, Scene, SceneObject, Table
 from openarm_motion.collision.seen import Known, SeenMap
 from openarm_motion.collision.solids import Box
 from openarm_motion.config import MapConfig

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ROS domain of one's own: for tests and for graphs that must not meet others on this machine."""
+"""Unused ROS domains, for tests and for graphs that must not interact with others on this machine."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _held: dict[int, socket.socket] = {}
 
 
 def reserve_domain() -> int:
-    """Return a random ROS domain that nobody on this machine uses, kept from other callers until this process ends.
+    """Return a random ROS domain that is unused on this machine, reserved until this process ends.
 
     A domain is in use when any participant holds a discovery port of it, or when another process has reserved it. Each
-    participant has a port of its own: one that an earlier owner left behind is seen, too, whatever its number.
+    participant has a port of its own: one that remains of an earlier owner is found, too, whatever its number.
 
     Raises:
         OpenArmError: ENVIRONMENT, when every domain is in use.

@@ -2,7 +2,7 @@
 """One error tree, one list of codes.
 
 The codes travel as strings in services, actions, reports and the exit messages of the command line, so that a caller
-can branch on them; the message is for people: what, which value, what was expected, what to do.
+can branch on them; the message says what, which value, what was expected, what to do.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class OpenArmError(Exception):
     """Anything that the suite refuses or could not do.
 
     Args:
-        code: What kind of failure it is; callers branch on this.
-        message: One sentence or two for people: what, which value, what was expected, what to do.
+        code: Kind of failure; callers branch on this.
+        message: One or two sentences: what, which value, what was expected, what to do.
     """
 
     def __init__(self, code: Code, message: str) -> None:
@@ -65,10 +65,10 @@ class OpenArmError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a client is told in the end; packages add what else there is to know.
+    """Outcome of a request; packages add fields.
 
     Attributes:
-        success: What was asked for was done.
+        success: The request was fulfilled.
         code: OK, or why not.
         message: What happened, in a sentence or two.
     """
@@ -78,10 +78,10 @@ class Answer:
     message: str
 
     def raise_for_code(self) -> Self:
-        """Return the answer to what was done.
+        """Return the answer where the request was fulfilled.
 
         Raises:
-            OpenArmError: With code and message, for anything else.
+            OpenArmError: With code and message, where it was not.
         """
         if not self.success:
             raise OpenArmError(self.code, self.message)

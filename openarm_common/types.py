@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array types of the suite; shape, unit and frame stand in the docstring of what uses them."""
+"""Array types of the suite; shape, unit and frame are in the docstrings of their users."""
 
 from __future__ import annotations
 

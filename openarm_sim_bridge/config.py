@@ -15,7 +15,7 @@ from openarm_sim_bridge.world.model import PhysicsConfig
 
 
 class BridgeConfig(Config):
-    """What is simulated and how it is told."""
+    """What is simulated, and how it is published."""
 
     scene: str = Field(default="demo", min_length=1, description="name or path of a scene, or random")
     seed: int = Field(default=0, ge=0, description="of a random scene")
@@ -25,14 +25,16 @@ class BridgeConfig(Config):
     cameras: str = Field(default="", description="path of a cameras YAML; empty: that of the suite")
     depth_encoding: Literal["16UC1", "32FC1"] = Field(default="16UC1", description="whole millimetres, or metres")
     images: bool = Field(default=True, description="whether there are cameras; false saves their process")
-    speed: float = Field(default=1.0, ge=0.0, le=100.0, description="simulated seconds a second; 0: as fast as it can")
+    speed: float = Field(
+        default=1.0, ge=0.0, le=100.0, description="simulated seconds per second; 0: as fast as possible"
+    )
     thread_priority: int = Field(
         default=50, ge=0, le=99, description="of the process under SCHED_FIFO, where the system allows it; 0: ordinary"
     )
-    paused: bool = Field(default=False, description="start with simulated time standing still")
+    paused: bool = Field(default=False, description="start with simulated time paused")
     tf_rate: float = Field(default=50.0, gt=0.0, le=100.0, description="of /tf, Hz of simulated time")
     ground_truth_rate: float = Field(
-        default=20.0, gt=0.0, le=100.0, description="of the judge's topic, Hz of simulated time"
+        default=20.0, gt=0.0, le=100.0, description="of /sim/ground_truth/objects, Hz of simulated time"
     )
     gripper_action: Literal["parallel", "classic"] = Field(
         default="parallel", description="type of gripper_cmd: ParallelGripperCommand, or the older GripperCommand"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeping simulated time in step with the wall clock, and saying how well it went.
+"""Pacing of simulated time by the wall clock, and how well it is kept.
 
 Nothing here reads a clock: the wall clock (monotonic, ns) is an argument.
 """
@@ -15,13 +15,13 @@ import numpy as np
 class Pacer:
     """When the next control tick is due.
 
-    After a hiccup the ticks that were missed are made up at once, so that simulated time does not fall behind; but a
-    long halt (a suspended process, an overloaded machine) is forgiven instead of raced after.
+    Missed ticks are made up at once, so that simulated time does not fall behind; but the delay of a long halt (a
+    suspended process, an overloaded machine) is dropped.
 
     Args:
         period_ns: Length of a tick in simulated time.
-        speed: Simulated seconds a wall second; 0 is as fast as the machine can.
-        max_debt_ns: How much wall time is made up at most.
+        speed: Simulated seconds per second of wall time; 0 is as fast as possible.
+        max_debt_ns: Largest wall time that is made up.
     """
 
     def __init__(self, period_ns: int, speed: float = 1.0, max_debt_ns: int = 500_000_000) -> None:
@@ -37,7 +37,7 @@ class Pacer:
         return self._due_ns - now_ns if self._step_ns else 0
 
     def ticked(self, now_ns: int) -> None:
-        """Say that a tick has begun; the next one is due a period after this one was."""
+        """Note that a tick has begun; the next one is due a period after this one was."""
         due_ns = now_ns if self._due_ns is None else self._due_ns
         debt_ns = now_ns - due_ns
         if self._step_ns and debt_ns > self._max_debt_ns:
@@ -46,7 +46,7 @@ class Pacer:
         self._due_ns = due_ns + self._step_ns
 
     def restart(self) -> None:
-        """Start anew at the next call: after a pause, nothing is made up."""
+        """Start again at the next call: after a pause, nothing is made up."""
         self._due_ns = None
 
 
@@ -54,7 +54,7 @@ class RateDivider:
     """Which control ticks to use, so that the mean rate is exact though it does not divide that of the ticks.
 
     Args:
-        rate: Uses a second of simulated time.
+        rate: Uses per second of simulated time.
     """
 
     def __init__(self, rate: float) -> None:

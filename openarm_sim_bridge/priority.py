@@ -11,7 +11,7 @@ import os
 
 
 def use_fifo(priority: int) -> str:
-    """Schedule every thread of this process as SCHED_FIFO; what they start later is ordinary.
+    """Schedule every thread of this process as SCHED_FIFO; what they start later is scheduled as usual.
 
     All of them, because a thread that may be preempted while it holds the interpreter holds up the one that may not.
 
@@ -19,7 +19,7 @@ def use_fifo(priority: int) -> str:
         priority: 1 to 99; 0 leaves everything as it is.
 
     Returns:
-        How the process is scheduled now, in words.
+        Description of how the process is scheduled now.
     """
     if priority == 0:
         return "SCHED_OTHER"

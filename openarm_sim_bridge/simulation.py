@@ -97,7 +97,7 @@ class Simulation:
 
     @property
     def paused(self) -> bool:
-        """Whether simulated time stands still."""
+        """Whether simulated time is paused."""
         return self._paused
 
     @property
@@ -127,9 +127,9 @@ class Simulation:
         return future
 
     def set_paused(self, paused: bool) -> None:
-        """Let simulated time stand still or go on. For `call`."""
+        """Pause or resume simulated time. For `call`."""
         self._paused = paused
-        self._end_stepping("the simulation was resumed" if not paused else "the simulation was paused anew")
+        self._end_stepping("the simulation was resumed" if not paused else "the simulation was paused again")
 
     def advance(self, steps: int) -> Future[int]:
         """Advance a paused world by physics steps, as fast as it can. For `call`.
@@ -192,7 +192,7 @@ class Simulation:
             self._wake.clear()
 
     def _idle(self) -> None:
-        """Report the state while simulated time stands still."""
+        """Report the state while simulated time is paused."""
         self._pacer.restart()
         self.periods.restart()
         self._observe(self.world.read_joints())

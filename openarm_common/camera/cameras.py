@@ -65,7 +65,7 @@ class Intrinsics:
 
 
 class CameraConfig(Config):
-    """One camera: where it is mounted and what it sees."""
+    """Mount and optics of a camera."""
 
     name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="prefix of topics and frames")
     parent: str = Field(description="link that carries the camera")

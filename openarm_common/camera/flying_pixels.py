@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flying pixels: depths that a sensor reports between a near and a far surface, where there is nothing.
 
-At the borders of things a pixel sees two surfaces at once, and its depth is any value between theirs. Such a pixel has
+At the borders of objects a pixel covers two surfaces, and its depth is any value between theirs. Such a pixel has
 hardly a neighbour at its own depth. One on a surface has: along a plane of slant a, seen by a camera of focal length f
 (pixels), the depth z changes by z · tan(a) / f from pixel to pixel, and by the noise of the sensor, which for a stereo
 camera grows with the square of z. Depths are planar, m.

@@ -2,9 +2,9 @@
 """Distances to the nearest obstacle, shared between processes on one machine without a copy.
 
 The field lies in a file in memory (/dev/shm) that the writer and its readers map: a header, then two slots of float32
-distances. The writer computes right into the slot that is not in use and then names it the current one; a reader looks
-at the current slot in place. What it looks at stays as it is until the writer comes to that slot again, one update
-later at the earliest; `DistanceFieldReader.intact` tells afterwards whether it did.
+distances. The writer computes into the slot that is not in use and then makes it the current one; a reader uses the
+current slot in place. It is unchanged until the writer reuses that slot, one update later at the earliest;
+`DistanceFieldReader.intact` tells afterwards whether it did.
 
 Distances are between centres of cells, m, cut at `reach`. Moments are given twice: stamps of the images (`t_ns`) and
 the machine's monotonic clock (`now_ns`), which all processes share, so that ages are right whatever the images' clock.
@@ -97,7 +97,7 @@ class DistanceField:
         return out
 
     def clearance(self, centres: NDArray[np.float64], radii: NDArray[np.float64]) -> float:
-        """Smallest gap between spheres and occupied cells, m: never more than it is, up to a cell's diagonal less.
+        """Smallest clearance between spheres and occupied cells, m; too small by a cell's diagonal at most.
 
         Args:
             centres: (n, 3) in the frame, m.
@@ -135,13 +135,13 @@ class DistanceField:
 
 
 def field_path(name: str) -> Path:
-    """Where the field of a name lies: in memory where the system has a place for that."""
+    """Path of the field of a name: in memory where the system has a file system for that."""
     shm = Path("/dev/shm")
     return (shm if shm.is_dir() else Path(tempfile.gettempdir())) / f"openarm_field_{name}"
 
 
 class DistanceFieldWriter:
-    """Owns the shared field; one at a time for a name. What an earlier one left behind is replaced.
+    """Owns the shared field; one at a time for a name. The field of an earlier one is replaced.
 
     Args:
         path: From `field_path`.
@@ -196,7 +196,7 @@ class DistanceFieldWriter:
         return self._version
 
     def begin(self) -> Floats:
-        """The slot to compute into, (nx, ny, nz); nobody is told of it until `commit`."""
+        """The slot to compute into, (nx, ny, nz); readers do not use it before `commit`."""
         slot = self._next
         self._head["slots"][slot]["version"] = 0
         return self._slots[slot]
@@ -215,7 +215,7 @@ class DistanceFieldWriter:
         return self._version
 
     def close(self) -> None:
-        """Take the field away; readers keep what they have mapped."""
+        """Remove the field; readers keep their mapping."""
         try:
             if self._path.stat().st_ino == self._inode:
                 self._path.unlink()
@@ -228,7 +228,7 @@ class DistanceFieldWriter:
 
 
 class DistanceFieldReader:
-    """Looks at the field of a name; may be made before the writer is there, and survives its restart.
+    """Reads the field of a name; may be made before the writer, and survives its restart.
 
     Args:
         path: From `field_path`.
@@ -310,7 +310,7 @@ def _slots(memory: mmap.mmap, lattice: Lattice) -> list[Floats]:
 def sphere_clearance(
     distances: Floats, lower: NDArray[np.float64], edge: float, centres: NDArray[np.float64], radii: NDArray[np.float64]
 ) -> float:
-    """Smallest gap between spheres and occupied cells, m; see `DistanceField.clearance`."""
+    """Smallest clearance between spheres and occupied cells, m; see `DistanceField.clearance`."""
     nx, ny, nz = distances.shape
     # a sphere's centre is up to half a diagonal from that of its cell, and a surface as far from that of its own
     slack = np.sqrt(3.0) * edge

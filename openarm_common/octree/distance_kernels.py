@@ -2,7 +2,7 @@
 """Numba kernels of the distance field: exact Euclidean distances between cell centres, cut at a reach.
 
 Each axis is one pass (Felzenszwalb and Huttenlocher 2012: the lower envelope of parabolas), in whole cells squared.
-Because distances are cut at `reach` cells, cells further away than that never matter: a pass looks only at the
+Because distances are cut at `reach` cells, cells further away than that never matter: a pass reads only the
 neighbours within reach, and skips lines that have nothing within it.
 """
 

@@ -29,7 +29,7 @@ Triple = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Lattice:
-    """Which cells an array stands for.
+    """Which cells an array represents.
 
     Attributes:
         resolution: Edge of a cell, m.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where every frame was at the stamp of an image: joint states over time, fixed edges, forward kinematics.
 
-A lookup is answered at the stamp asked for, never with "the latest": the joint state lies within `TOLERANCE_NS` of
+A lookup is answered at the requested stamp, never with "the latest": the joint state lies within `TOLERANCE_NS` of
 the stamp, or is interpolated between two that bracket it. What can't be answered so is refused, with the gap.
 """
 
@@ -24,7 +24,7 @@ MAX_BRACKET_NS = 100_000_000
 
 
 class RobotStateBuffer:
-    """The joint states of the last seconds and the fixed edges beside the description.
+    """The joint states of the last seconds and fixed edges in addition to the description.
 
     Args:
         description: The robot; its root is the base frame.
@@ -99,7 +99,7 @@ class RobotStateBuffer:
     def lookup(self, target: str, source: str, t_ns: int) -> Array:
         """Pose of `source` in `target` at a stamp: ``p_target = T @ p_source``.
 
-        Joint states are only asked for when a moving joint lies on the way from the base to one of the two frames.
+        Joint states are needed only when a moving joint lies between the base and one of the two frames.
 
         Raises:
             OpenArmError: NO_TRANSFORM, naming the unknown frame and the known ones; STALE_DATA, from `joints_at`.

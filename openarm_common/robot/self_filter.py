@@ -25,9 +25,9 @@ from openarm_common.types import Array, Bytes, Ints
 
 
 class SelfFilterConfig(Config):
-    """How the robot is cut out of what its cameras see."""
+    """How the robot is removed from its camera images."""
 
-    enabled: bool = Field(default=True, description="cut the robot and what it holds out of the images")
+    enabled: bool = Field(default=True, description="remove the robot and held objects from the images")
     padding: float = Field(default=0.02, ge=0.0, le=0.2, description="around every link, m")
     link_padding: tuple[str, ...] = Field(default=(), description="other paddings, as `link=metres`")
     held_padding: float = Field(default=0.02, ge=0.0, le=0.2, description="around what a hand holds, m")
@@ -134,7 +134,7 @@ class SelfFilter:
         """Find the robot in a depth image.
 
         Returns:
-            Labels (h, w): 0 surroundings, 1 robot, 2 no return where the robot may be; and the pixels that each link
+            Labels (h, w): 0 environment, 1 robot, 2 no return where the robot may be; and the pixels that each link
             took, of the links that took any.
         """
         label = np.zeros(scan.depth.shape, np.uint8)

@@ -21,9 +21,9 @@ from rclpy.task import Future
 
 from openarm_common.errors import Code, OpenArmError
 
-#: Between looks at whether the server is still there, s.
-_LOOK_S = 0.25
-#: Looks without a server before it counts as gone: discovery may lose it for a moment.
+#: Period of checks that the server is still there, s.
+_CHECK_S = 0.25
+#: Checks without a server before it counts as gone: discovery may lose it for a moment.
 _GONE = 20
 _UP = "is the graph up, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE?"
 
@@ -112,7 +112,7 @@ class BackgroundNode(ContextNode):
         """Call a service and return its response.
 
         Raises:
-            OpenArmError: NOT_READY, when nobody serves it; TIMEOUT.
+            OpenArmError: NOT_READY, when there is no server; TIMEOUT.
         """
         client = self._client(name, lambda: self._node.create_client(kind, name))
         if not client.wait_for_service(timeout_sec=self._timeout):
@@ -140,7 +140,7 @@ class BackgroundNode(ContextNode):
             stop: When it is set the goal is cancelled, and its result waited for.
 
         Raises:
-            OpenArmError: NOT_READY, when nobody serves it, or no longer; BUSY, when the goal is refused; TIMEOUT.
+            OpenArmError: NOT_READY, when there is no server, or it ends; BUSY, when the goal is refused; TIMEOUT.
         """
         client: ActionClient = self._client(name, lambda: ActionClient(self._node, kind, name))
         if not client.wait_for_server(timeout_sec=self._timeout):
@@ -157,11 +157,11 @@ class BackgroundNode(ContextNode):
             cancel = partial(self._begin, handle.cancel_goal_async)
             answer = self._wait(ended, timeout, name, there, stop, cancel, trouble)
         except BaseException:
-            # Whatever keeps the caller from waiting (a deadline, Ctrl-C): nobody would see the robot go on.
+            # Whatever keeps the caller from waiting (a deadline, Ctrl-C): the robot would continue unattended.
             _event(self._begin(handle.cancel_goal_async)).wait(2.0)
             raise
         if answer.status == GoalStatus.STATUS_UNKNOWN:
-            raise OpenArmError(Code.NOT_READY, f"{name} no longer knows the goal: its node was started anew")
+            raise OpenArmError(Code.NOT_READY, f"{name} no longer knows the goal: its node was restarted")
         return answer.result
 
     def _client(self, name: str, make: Callable[[], Any]) -> Any:
@@ -172,7 +172,7 @@ class BackgroundNode(ContextNode):
     def _begin(self, ask: Callable[..., Future], *args: Any) -> Future:
         """Send a request from the background thread; the returned future is done when the answer is there.
 
-        rclpy files a request only after it has sent it: sent from another thread, a fast answer would find nobody.
+        rclpy files a request only after it has sent it: sent from another thread, a fast answer would be lost.
         """
 
         async def exchange() -> Any:
@@ -193,7 +193,7 @@ class BackgroundNode(ContextNode):
         done = _event(future)
         deadline = time.monotonic() + timeout
         missed, stopped = 0, False
-        while not done.wait(_LOOK_S):
+        while not done.wait(_CHECK_S):
             missed = 0 if there() else missed + 1
             if missed > _GONE:
                 raise OpenArmError(Code.NOT_READY, f"the server of {name} is gone")

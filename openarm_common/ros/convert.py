@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages to numpy and back.
 
-Data fields are filled from `array.array`, which rclpy takes without looking at each element (an ndarray costs 187 ms
+Data fields are filled from `array.array`, which rclpy takes without a check of each element (an ndarray costs 187 ms
 for a 640×480 depth image, an `array.array` 0.2 ms); they are read through views without a copy.
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node that can be laid to rest and woken by ROS 2's lifecycle, for nodes whose work costs much all the time."""
+"""A node with ROS 2's lifecycle, for nodes with a high load that can be deactivated."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ RCLError: type[Exception] = rclpy_implementation.RCLError
 class ManagedNode(LifecycleNodeMixin, BaseNode[ConfigT]):
     """A node with the states of the lifecycle: unconfigured, inactive, active, finalized.
 
-    A subclass makes what it needs in its constructor, at whose end it calls `autostart`; so whoever knows nothing of
-    lifecycles has a node that works. Its services answer in every state.
+    A subclass makes what it needs in its constructor, at whose end it calls `autostart`; so a graph without a
+    lifecycle manager has a node that works. Its services answer in every state.
 
     Args:
         name: Node name.
@@ -53,30 +53,30 @@ class ManagedNode(LifecycleNodeMixin, BaseNode[ConfigT]):
 
     @abstractmethod
     def begin(self) -> None:
-        """Take the work up."""
+        """Begin the work."""
 
     @abstractmethod
     def rest(self) -> None:
-        """Lay the work down: nothing is listened to, nothing runs."""
+        """Stop the work: no subscription, no timer."""
 
     @abstractmethod
     def forget(self) -> None:
-        """Give back what the work has gathered."""
+        """Discard the results of the work."""
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin."""
         return self._change(self.begin, True)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Rest."""
+        """Stop."""
         return self._change(self.rest, False)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget."""
+        """Discard."""
         return self._change(self.forget, False)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Rest, for good."""
+        """Stop for good."""
         return self._change(self.rest, False)
 
     def _change(self, work: Callable[[], None], active: bool) -> TransitionCallbackReturn:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every node of the suite starts from: parameters, QoS, diagnostics, worker threads, orderly shutdown."""
+"""Base of every node of the suite: parameters, QoS, diagnostics, worker threads, orderly shutdown."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ ConfigT = TypeVar("ConfigT", bound=Config)
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: A node that moves something has this long to bring it to rest before the process ends, s.
+#: Time that a node has to stop motion before the process ends, s.
 _HOLD = 2.0
 _ENDING = (signal.SIGINT, signal.SIGTERM)
-#: Where poses of the suite are expressed.
+#: Frame of the poses of the suite.
 BASE_FRAME = "openarm_body_link0"
 
 
@@ -71,10 +71,10 @@ QOS_STATIC_TF = _profile(100, latched=True)
 
 
 def offered_qos(node: Node, topic: str, depth: int) -> QoSProfile:
-    """The quality of service with which everything that is published on a topic now is heard.
+    """Return the quality of service that is compatible with all present publishers of a topic.
 
     Args:
-        node: Who asks.
+        node: A node of the graph.
         topic: Absolute name; without a publisher, best effort and volatile.
         depth: Messages that may wait.
     """
@@ -113,7 +113,7 @@ class BaseNode(Node, Generic[ConfigT]):
     @property
     def default_callback_group(self) -> CallbackGroup:
         """Callbacks may overlap at their awaits: a coroutine that waits must not keep the others from running."""
-        if not hasattr(self, "_BaseNode__group"):  # asked for in the constructor of Node
+        if not hasattr(self, "_BaseNode__group"):  # used in the constructor of Node
             self.__group = ReentrantCallbackGroup()
         return self.__group
 
@@ -125,16 +125,16 @@ class BaseNode(Node, Generic[ConfigT]):
         return self.__description
 
     def diagnose(self, ok: bool, message: str, **values: object) -> None:
-        """Set what /diagnostics says of this node once a second."""
+        """Set what /diagnostics reports of this node once per second."""
         status = DiagnosticStatus(name=self.__status.name, hardware_id=self.__status.hardware_id, message=message)
         status.level = DiagnosticStatus.OK if ok else DiagnosticStatus.ERROR
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         self.__status = status
 
     def accept_changes(self, take: Callable[[ConfigT], None]) -> None:
-        """Let the parameters that are marked `AT_RUN_TIME` change: `take` gets the new configuration before it holds.
+        """Let parameters marked `AT_RUN_TIME` change: `take` gets the new configuration before it takes effect.
 
-        What the model or `take` refuse with an OpenArmError stays as it was; who asked is told why.
+        A change that the model or `take` refuses with an OpenArmError has no effect; the client gets the reason.
         """
 
         def change(parameters: list[Parameter]) -> SetParametersResult:
@@ -182,10 +182,10 @@ class BaseNode(Node, Generic[ConfigT]):
         return self.awaitable(self.__pool.submit(fn, *args, **kwargs))
 
     async def hold(self) -> None:
-        """Bring to rest what the node moves: called when the process is to end, while the graph is still there."""
+        """Stop all motion that the node commands; called before the process ends, while the graph is still there."""
 
     def close(self) -> None:
-        """Stop what the node runs beside the executor; subclasses with threads extend this."""
+        """Stop worker threads; subclasses with threads of their own extend this."""
         self.__pool.shutdown(wait=True, cancel_futures=True)
 
     def __publish_diagnostics(self) -> None:
@@ -278,7 +278,7 @@ class _Signals:
 
     They are read in a thread: the main one may be waiting in rcl, where Python's handlers don't run. And these do
     nothing: a KeyboardInterrupt could cut the shutdown short. A SIGTERM after another signal, because the end takes too
-    long, writes to stderr where every thread stands.
+    long, writes the stacks of all threads to stderr.
     """
 
     def __init__(self) -> None:

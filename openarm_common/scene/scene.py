@@ -11,52 +11,226 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, ValidationError, field_validator, model_validator
 
-from openarm_common.config import describe_faults, load_yaml
+from openarm_common import se3
+from openarm_common.config import Config, describe_faults, load_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
-from openarm_common.scene.types import (
-    DENSITY,
-    MAX_EDGE,
-    MIN_EDGE,
-    PALETTE,
-    SHAPES,
-    Array,
-    Fixture,
-    Scene,
-    SceneObject,
-    Table,
+from openarm_common.types import Array
+
+Rgba = tuple[float, float, float, float]
+
+#: Colours of objects; each lies inside one hue range of `config/params/detector.yaml`.
+PALETTE: Mapping[str, Rgba] = MappingProxyType(
+    {
+        "red": (0.80, 0.08, 0.08, 1.0),
+        "orange": (0.95, 0.45, 0.04, 1.0),
+        "yellow": (0.93, 0.82, 0.05, 1.0),
+        "green": (0.08, 0.58, 0.18, 1.0),
+        "blue": (0.06, 0.25, 0.80, 1.0),
+        "purple": (0.46, 0.10, 0.66, 1.0),
+    }
 )
-
-__all__ = [
-    "DENSITY",
-    "MAX_EDGE",
-    "MIN_EDGE",
-    "PALETTE",
-    "REGION_ABS_Y",
-    "REGION_X",
-    "SHAPES",
-    "SPACING",
-    "Fixture",
-    "Scene",
-    "SceneObject",
-    "Table",
-    "load_scene",
-    "parse_object",
-    "parse_scene",
-    "random_scene",
-]
-
+SHAPES = ("box", "cylinder", "sphere")
+RESERVED_NAMES = ("world", "floor", "table", "table_top")
+DENSITY = 700.0  # kg/m3, of an object without a mass: hard wood
+MAX_EDGE = 0.30  # m
+MIN_EDGE = 0.01  # m
+#: The front of the pedestal's column; a table that reaches further back would stand in it.
+_COLUMN_FRONT = 0.035
 #: Where an arm can grasp a cube of any yaw from above with a tilt up to 30°: x, and y to its own side.
 REGION_X = (0.16, 0.36)
 REGION_ABS_Y = (0.06, 0.42)
 #: Centre to centre in a random scene: the open fingers reach 65 mm to either side, an object up to 50 mm.
 SPACING = 0.12
 _TOUCH = 1e-4  # m; closer than this is touching, not overlapping
+
+
+class Table(Config):
+    """A table with four legs; its top is a box."""
+
+    top_z: float = Field(default=0.40, ge=0.05, le=1.2, description="height of the top, m")
+    x: tuple[float, float] = Field(default=(0.11, 0.81), description="front and back edge, m")
+    y: tuple[float, float] = Field(default=(-0.60, 0.60), description="right and left edge, m")
+    thickness: float = Field(default=0.04, gt=0.0, le=0.2, description="of the top, m")
+
+    @field_validator("x", "y")
+    @classmethod
+    def _ascending(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not value[0] < value[1]:
+            raise ValueError("expected [low, high] with low < high")
+        return value
+
+    @field_validator("x")
+    @classmethod
+    def _clear_of_pedestal(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if value[0] < _COLUMN_FRONT:
+            raise ValueError(f"the front edge would stand in the pedestal; expected at least {_COLUMN_FRONT}")
+        return value
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Middle of the top, m."""
+        return (self.x[0] + self.x[1]) / 2.0, (self.y[0] + self.y[1]) / 2.0
+
+    @property
+    def extents(self) -> tuple[float, float, float]:
+        """Edges of the top, m."""
+        return self.x[1] - self.x[0], self.y[1] - self.y[0], self.thickness
+
+
+class SceneObject(Config):
+    """A free body in one plain colour.
+
+    `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height; a
+    sphere's diameter three times.
+    `position` is x, y, or x, y, z of the centre; without z the object stands on the table.
+    """
+
+    name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")
+    label: str = Field(default="", description="what the detector calls it; the colour where it is not given")
+    shape: str = Field(description="box, cylinder or sphere")
+    size: tuple[float, float, float] = Field(description="extents, m")
+    color: str = Field(description="a colour of the palette")
+    mass: float = Field(default=0.0, ge=0.0, le=10.0, description="kg; 0 is the volume times the density of hard wood")
+    position: tuple[float, float] | tuple[float, float, float] = Field(description="of the centre, m")
+    yaw: float = Field(default=0.0, description="rad")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _label_is_color(cls, data: Any) -> Any:
+        return {"label": data.get("color", "")} | data if isinstance(data, dict) else data
+
+    @field_validator("name")
+    @classmethod
+    def _free_name(cls, value: str) -> str:
+        if value in RESERVED_NAMES or value.startswith("openarm_"):
+            reserved = ", ".join(RESERVED_NAMES)
+            raise ValueError(
+                f"reserved for the surroundings and the robot ({reserved}, openarm_…); choose another name"
+            )
+        return value
+
+    @field_validator("shape")
+    @classmethod
+    def _known_shape(cls, value: str) -> str:
+        if value not in SHAPES:
+            raise ValueError(f"unknown shape; shapes: {', '.join(SHAPES)}")
+        return value
+
+    @field_validator("color")
+    @classmethod
+    def _known_color(cls, value: str) -> str:
+        if value not in PALETTE:
+            raise ValueError(f"unknown colour; colours: {', '.join(PALETTE)}")
+        return value
+
+    @field_validator("size")
+    @classmethod
+    def _possible_size(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
+        if not all(MIN_EDGE <= edge <= MAX_EDGE for edge in value):
+            raise ValueError(f"too large or too small; expected every extent in {MIN_EDGE} .. {MAX_EDGE} m")
+        return value
+
+    @field_validator("position", "yaw")
+    @classmethod
+    def _finite(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        if not np.isfinite(value).all():
+            raise ValueError("expected finite numbers")
+        return value
+
+    @model_validator(mode="after")
+    def _round(self) -> SceneObject:
+        if self.shape == "sphere" and len(set(self.size)) > 1:
+            raise ValueError(f"a sphere has one diameter; expected three equal extents, got {self.size}")
+        return self
+
+    @property
+    def rgba(self) -> Rgba:
+        """Colour."""
+        return PALETTE[self.color]
+
+    @property
+    def volume(self) -> float:
+        """Cubic metres."""
+        x, y, z = self.size
+        return x * y * z * {"box": 1.0, "cylinder": math.pi / 4.0, "sphere": math.pi / 6.0}[self.shape]
+
+    @property
+    def mass_kg(self) -> float:
+        """Mass, kg: as given, or by volume."""
+        return self.mass or self.volume * DENSITY
+
+    def centre(self, table: Table) -> tuple[float, float, float]:
+        """Position of the centre, m; on the table where the scene gives no z."""
+        z = self.position[2] if len(self.position) == 3 else table.top_z + self.size[2] / 2.0
+        return self.position[0], self.position[1], z
+
+    def T_world_object(self, table: Table) -> Array:
+        """Pose, (4, 4)."""
+        return se3.make(se3.rot_z(self.yaw), self.centre(table))
+
+    def outline(self) -> Array:
+        """Convex outline (n, 2) of the footprint in the base frame, m."""
+        if self.shape != "box":
+            angles = np.arange(32) * (math.tau / 32.0)
+            corners = np.stack([np.cos(angles), np.sin(angles)], axis=1) * (self.size[0] / 2.0)
+        else:
+            corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (np.array(self.size[:2]) / 2.0)
+        return corners @ se3.rot_z(self.yaw)[:2, :2].T + np.array(self.position[:2])
+
+
+class Fixture(Config):
+    """Something fixed to a link of the robot or to the world, such as a calibration board: seen, but not touched.
+
+    `model` is an MJCF file with one body, whose frame is put at `position` with its z and y axis along the given
+    directions of the link.
+    """
+
+    name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")
+    model: str = Field(min_length=1, description="MJCF file in models/, or an absolute path")
+    link: str = Field(default="", description="that carries it; empty is the world")
+    position: tuple[float, float, float] = Field(description="of its origin in the frame of the link, m")
+    z_axis: tuple[float, float, float] = Field(default=(0.0, 0.0, 1.0), description="direction in the link's frame")
+    y_axis: tuple[float, float, float] = Field(default=(0.0, 1.0, 0.0), description="direction in the link's frame")
+
+    @model_validator(mode="after")
+    def _two_directions(self) -> Fixture:
+        if np.linalg.norm(np.cross(self.z_axis, self.y_axis)) < 1e-6:
+            raise ValueError(f"z_axis {self.z_axis} and y_axis {self.y_axis} are parallel or zero")
+        return self
+
+    @property
+    def T_link_fixture(self) -> Array:
+        """Pose in the frame of the link, (4, 4)."""
+        return se3.make(se3.rotation_from_z_y(self.z_axis, self.y_axis), self.position)
+
+
+class Scene(Config):
+    """A table, what is on it, and what is fixed somewhere."""
+
+    name: str = Field(default="scene", min_length=1)
+    table: Table = Table()
+    objects: tuple[SceneObject, ...] = ()
+    fixtures: tuple[Fixture, ...] = ()
+
+    def object(self, name: str) -> SceneObject:
+        """Return the object of that name.
+
+        Raises:
+            OpenArmError: UNKNOWN_OBJECT, listing the objects there are.
+        """
+        for item in self.objects:
+            if item.name == name:
+                return item
+        there = ", ".join(item.name for item in self.objects) or "none"
+        raise OpenArmError(Code.UNKNOWN_OBJECT, f"no object {name!r} in scene {self.name!r}; objects: {there}")
+
 
 ModelT = TypeVar("ModelT", Scene, SceneObject)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process that draws, as the bridge sees it: started, fed with states, started again when it dies, ended.
+"""The process that draws the cameras: started, fed with states, restarted when it dies, ended.
 
 Drawing in software takes most of a core and, in the same process, keeps the interpreter from the thread that steps the
 world; in a process of its own it can delay physics only through the scheduler of the machine.
@@ -26,16 +26,20 @@ _END_S = 3.0
 class CameraFeed:
     """Keeps a drawing process and feeds it.
 
-    It ends when the bridge closes its end of the socket, however the bridge ended. A process that says that it can't
-    draw is left alone: another one could not either.
+    It ends when the bridge closes its end of the socket, however the bridge ended. A process that reports that it can't
+    draw is not restarted: another one could not either.
 
     Args:
-        setup: What it is told first.
+        setup: First message to it.
         environ: Its environment.
         first: A state to warm up with.
-        told: Called (from `poll`) with a sentence when it died or can't draw.
-        speed: Simulated seconds a wall second. Above 1 the cameras keep their rates on the wall clock: drawing is not
-            faster because time is.
+        on_fault: Called (from `poll`) with a sentence when it died or can't draw, with "" when it draws again.
+        speed: Simulated seconds per second of wall time. Above 1 the cameras keep their rates on the wall clock.
+
+    Attributes:
+        lost: Frames that could not be handed over.
+        fault: Why there are no images.
+        report: The newest report.
     """
 
     def __init__(
@@ -43,13 +47,13 @@ class CameraFeed:
         setup: CameraSetup,
         environ: Mapping[str, str],
         first: Snapshot,
-        told: Callable[[str], None],
+        on_fault: Callable[[str], None],
         speed: float = 1.0,
     ) -> None:
         self._setup = setup
         self._environ = dict(environ)
         self._first = first
-        self._told = told
+        self._on_fault = on_fault
         self._ticks = {camera.name: RateDivider(camera.rate / max(1.0, speed)) for camera in setup.cameras}
         self._lock = threading.Lock()  # of the sender, which is exchanged when the process is started again
         self._earlier: dict[str, int] = {camera.name: 0 for camera in setup.cameras}
@@ -87,16 +91,6 @@ class CameraFeed:
             self.poll()
         return True
 
-    @property
-    def watched(self) -> tuple[str, ...]:
-        """Cameras with a subscriber, as far as is known."""
-        return self.report.watched
-
-    @property
-    def draw_ms(self) -> float:
-        """Mean time of a frame, lately."""
-        return self.report.draw_ms
-
     def set_faults(self, faults: tuple[Fault, ...]) -> None:
         """Hand over all faults that are active from now on.
 
@@ -118,7 +112,7 @@ class CameraFeed:
                     self.lost += len(names)
 
     def poll(self) -> None:
-        """Take its reports, and see whether it lives; for a timer of a few hertz."""
+        """Take its reports and restart it when it died; for a timer of a few hertz."""
         if self._died_at is not None:
             if time.monotonic() - self._died_at > _AGAIN_S:
                 self._start()
@@ -129,9 +123,9 @@ class CameraFeed:
                 self._drawn = {name: n + report.rendered.get(name, 0) for name, n in self._earlier.items()}
                 if report.fault != self.fault:
                     self.fault = report.fault
-                    self._told(report.fault)
+                    self._on_fault(report.fault)
         except EOFError:
-            self._bury()
+            self._on_death()
 
     def close(self) -> None:
         """End it."""
@@ -155,7 +149,7 @@ class CameraFeed:
         theirs.close()
         self._died_at = None
 
-    def _bury(self) -> None:
+    def _on_death(self) -> None:
         with self._lock:
             self._sender.close()
             self._earlier = dict(self._drawn)
@@ -164,7 +158,7 @@ class CameraFeed:
         code = self._wait()
         self._died_at = time.monotonic()
         self.fault = f"the process that draws ended with code {code}; it is started again"
-        self._told(self.fault)
+        self._on_fault(self.fault)
 
     def _wait(self) -> int:
         try:

@@ -1,59 +1,87 @@
 # SPDX-License-Identifier: Apache-2.0
 """Handing states of the world to the process that draws them.
 
-The bridge holds one end of a socket, the drawing process the other; when one of them dies, the other one sees the end.
-What goes over it is small: a model now and then (as an anonymous file whose descriptor rides along), for each frame
-the positions of all joints (a few hundred bytes), and back a report a few times a second. Images never go over it.
-Nothing here waits for the other side: a frame that can't be handed over is dropped and counted.
+The bridge holds one end of a socket, the drawing process the other; when one of them ends, the other one sees it. The
+messages are small (pickled): a model now and then (an anonymous file whose descriptor is passed along), for each frame
+the positions of all joints (a few hundred bytes), and back a report a few times a second; never an image. No side waits
+for the other: a frame that can't be handed over is dropped and counted.
 """
 
 from __future__ import annotations
 
-import json
 import os
+import pickle
 import select
 import socket
-import struct
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import mujoco
 import numpy as np
-from pydantic import Field
 
 from openarm_common.camera.cameras import CameraConfig
-from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
 from openarm_sim_bridge.cameras.noise import ColourNoiseConfig, DepthNoiseConfig
-from openarm_sim_bridge.faults.faults import Fault, checked_fault
+from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.world.world import Snapshot
 
-_SETUP, _MODEL, _STATE, _FAULTS = b"C", b"M", b"S", b"F"
-_STATE_HEAD = struct.Struct("<qI")  # stamp in ns, which cameras
 _MAX_BYTES = 1 << 17
 
 
-class CameraSetup(Config):
-    """What the drawing process is told first."""
+@dataclass(frozen=True)
+class CameraSetup:
+    """First message to the drawing process.
 
-    cameras: tuple[CameraConfig, ...] = Field(description="all cameras; states name them by their place here")
-    depth_encoding: Literal["16UC1", "32FC1"] = Field(description="whole millimetres, or metres")
-    depth_noise: DepthNoiseConfig = DepthNoiseConfig()
-    colour_noise: ColourNoiseConfig = ColourNoiseConfig()
-    noise_seed: int = Field(default=0, ge=0, description="of all noise")
-    topics: dict[str, str] = Field(description="name on the graph of each topic, by its name without remapping")
+    Attributes:
+        cameras: All cameras.
+        depth_encoding: Whole millimetres, or metres.
+        topics: Name on the graph of each topic, by its name without remapping.
+        depth_noise: Of depth images.
+        colour_noise: Of colour images.
+        noise_seed: Of all noise.
+    """
+
+    cameras: tuple[CameraConfig, ...]
+    depth_encoding: Literal["16UC1", "32FC1"]
+    topics: Mapping[str, str]
+    depth_noise: DepthNoiseConfig
+    colour_noise: ColourNoiseConfig
+    noise_seed: int = 0
 
 
-class CameraReport(Config):
-    """What the drawing process tells."""
+@dataclass(frozen=True)
+class CameraReport:
+    """What the drawing process reports.
 
-    ready: bool = Field(default=False, description="a frame of every camera was drawn, it can begin")
-    fault: str = Field(default="", description="why it can't draw")
-    watched: tuple[str, ...] = Field(default=(), description="cameras with a subscriber")
-    rendered: dict[str, int] = Field(default={}, description="frames drawn so far, by camera")
-    dropped: int = Field(default=0, description="frames that were replaced by newer ones before they were drawn")
-    draw_ms: float = Field(default=0.0, description="mean time of the frames drawn since the last report")
+    Attributes:
+        ready: A frame of every camera was drawn, it can begin.
+        fault: Why it can't draw.
+        watched: Cameras with a subscriber.
+        rendered: Frames drawn so far, by camera.
+        dropped: Frames that newer ones replaced before they were drawn.
+        draw_ms: Mean time of the frames drawn since the last report.
+    """
+
+    ready: bool = False
+    fault: str = ""
+    watched: tuple[str, ...] = ()
+    rendered: Mapping[str, int] = field(default_factory=dict[str, int])
+    dropped: int = 0
+    draw_ms: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Model:
+    """Comes with the descriptor of a file."""
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    t_ns: int
+    qpos: Array
+    names: frozenset[str]
 
 
 def pair() -> tuple[socket.socket, socket.socket]:
@@ -62,7 +90,7 @@ def pair() -> tuple[socket.socket, socket.socket]:
 
 
 class StateSender:
-    """The bridge's end. `offer` and `faults` want a lock where they are called by several threads.
+    """The bridge's end. `offer` and `faults` need a lock where several threads call them.
 
     Args:
         end: Socket of `pair`.
@@ -72,9 +100,8 @@ class StateSender:
     def __init__(self, end: socket.socket, setup: CameraSetup) -> None:
         self._end = end
         self._end.setblocking(False)
-        self._bit = {camera.name: 1 << i for i, camera in enumerate(setup.cameras)}
         self._model: mujoco.MjModel | None = None
-        self._end.send(_SETUP + setup.model_dump_json().encode())
+        self._send(setup)
 
     def offer(self, snapshot: Snapshot, names: Iterable[str]) -> bool:
         """Hand over a state to draw for some cameras; False when it had to be dropped."""
@@ -82,9 +109,8 @@ class StateSender:
             if self._model is not snapshot.model:
                 self._send_model(snapshot.model)
                 self._model = snapshot.model
-            mask = sum(self._bit[name] for name in names)
-            self._end.send(_STATE + _STATE_HEAD.pack(snapshot.t_ns, mask) + snapshot.qpos.tobytes())
-        except (BlockingIOError, BrokenPipeError, ConnectionError):
+            self._send(_State(snapshot.t_ns, snapshot.qpos, frozenset(names)))
+        except (BlockingIOError, ConnectionError):
             return False
         return True
 
@@ -94,9 +120,8 @@ class StateSender:
         Raises:
             OpenArmError: BUSY, when the other side does not take anything at present.
         """
-        told = [{"name": f.name, "parameters": f.parameters.model_dump(), "seed": f.seed} for f in faults]
         try:
-            self._end.send(_FAULTS + json.dumps(told).encode())
+            self._send(tuple(faults))
         except (BlockingIOError, ConnectionError) as error:
             raise OpenArmError(Code.BUSY, "the process that draws does not answer; try again") from error
 
@@ -110,11 +135,14 @@ class StateSender:
         Raises:
             EOFError: The other side has ended.
         """
-        return [CameraReport.model_validate_json(body) for body in _received(self._end)]
+        return [message for message, _ in _received(self._end)]
 
     def close(self) -> None:
-        """Let go: the other side ends."""
+        """Close this end; the other side ends."""
         self._end.close()
+
+    def _send(self, message: object, files: Sequence[int] = ()) -> None:
+        socket.send_fds(self._end, [pickle.dumps(message)], files)
 
     def _send_model(self, model: mujoco.MjModel) -> None:
         data = np.empty(mujoco.mj_sizeModel(model), np.uint8)
@@ -123,7 +151,7 @@ class StateSender:
         try:
             with open(file, "wb", closefd=False) as out:
                 out.write(data.tobytes())
-            socket.send_fds(self._end, [_MODEL], [file])
+            self._send(_Model(), [file])
         finally:
             os.close(file)
 
@@ -154,7 +182,7 @@ class StateReceiver:
         body = end.recv(_MAX_BYTES)
         if not body:
             raise EOFError
-        self.setup = CameraSetup.model_validate_json(body[1:])
+        self.setup: CameraSetup = pickle.loads(body)
         self._end.setblocking(False)
 
     def take(self, timeout_s: float) -> Work | None:
@@ -163,40 +191,25 @@ class StateReceiver:
         Raises:
             EOFError: The bridge has ended.
         """
-        ready, _, _ = select.select([self._end], [], [], timeout_s)
+        select.select([self._end], [], [], timeout_s)
         work: Work | None = None
-        while ready:
-            try:
-                body, files, _, _ = socket.recv_fds(self._end, _MAX_BYTES, 1)
-            except BlockingIOError:
-                break
-            except ConnectionError as error:
-                raise EOFError from error
-            if not body:
-                raise EOFError
-            if body[:1] == _MODEL:
+        for message, files in _received(self._end):
+            if isinstance(message, _Model):
                 self._model = _load_model(files)
-            elif body[:1] == _FAULTS:
-                self.faults = tuple(checked_fault(**told) for told in _parameters(body[1:]))
+            elif isinstance(message, tuple):
+                self.faults = message
             elif self._model is not None:
                 names = work.names if work is not None else frozenset[str]()
                 self.dropped += len(names)
-                t_ns, mask = _STATE_HEAD.unpack_from(body, 1)
-                names |= {camera.name for i, camera in enumerate(self.setup.cameras) if mask >> i & 1}
-                qpos = np.frombuffer(body, np.float64, offset=1 + _STATE_HEAD.size)
-                work = Work(Snapshot(self._model, t_ns, qpos), names)
+                work = Work(Snapshot(self._model, message.t_ns, message.qpos), names | message.names)
         return work
 
     def report(self, report: CameraReport) -> None:
-        """Tell the bridge; a report that does not fit is lost, the next one says it all again."""
+        """Send a report; one that does not fit is lost, the next one repeats it all."""
         try:
-            self._end.send(report.model_dump_json().encode())
+            self._end.send(pickle.dumps(report))
         except (BlockingIOError, ConnectionError):
             return
-
-
-def _parameters(body: bytes) -> list[dict[str, Any]]:
-    return [{"name": told["name"], "data": told["parameters"], "seed": told["seed"]} for told in json.loads(body)]
 
 
 def _load_model(files: Sequence[int]) -> mujoco.MjModel:
@@ -207,15 +220,15 @@ def _load_model(files: Sequence[int]) -> mujoco.MjModel:
         os.close(file)
 
 
-def _received(end: socket.socket) -> list[bytes]:
-    out: list[bytes] = []
+def _received(end: socket.socket) -> Iterator[tuple[Any, list[int]]]:
+    """Yield the messages that have come, with the descriptors that came along."""
     while True:
         try:
-            body = end.recv(_MAX_BYTES)
+            body, files, _, _ = socket.recv_fds(end, _MAX_BYTES, 1)
         except BlockingIOError:
-            return out
+            return
         except ConnectionError as error:
             raise EOFError from error
         if not body:
             raise EOFError
-        out.append(body)
+        yield pickle.loads(body), files

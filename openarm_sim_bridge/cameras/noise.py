@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a real camera adds to a clean picture: noise of depth as of an active stereo camera, and of colour.
+"""Noise of real cameras: of depth as of an active stereo camera, and of colour.
 
 The depth of a stereo camera is focal length × baseline / disparity. Its matcher finds the disparity with an error of
 `subpixel` and in steps of `step` pixels, so the error of depth grows with its square: z² × subpixel / (f × baseline),

@@ -169,7 +169,7 @@ def millimetres(z: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """What belongs to one model: it is made anew when the world is exchanged."""
+    """What belongs to one model: it is made again when the world is exchanged."""
 
     model: mujoco.MjModel
     data: mujoco.MjData

@@ -113,7 +113,7 @@ class TrajectoryFollower(Follower):
 
     @property
     def busy(self) -> bool:
-        """Whether a trajectory is being followed."""
+        """See `Follower.busy`."""
         return self._goal is not None
 
     def check(self, trajectory: Trajectory) -> Trajectory:
@@ -125,7 +125,7 @@ class TrajectoryFollower(Follower):
         return checked(trajectory, self.group)
 
     def abort(self, why: str) -> None:
-        """Give up a running goal."""
+        """See `Follower.abort`."""
         self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, why)
 
     def start(
@@ -187,7 +187,7 @@ class TrajectoryFollower(Follower):
                     End.ABORTED,
                     TrajectoryResult.PATH_TOLERANCE_VIOLATED,
                     f"{names[j]} is {abs(error[j]):.3f} rad off its path at {tau:.2f} s of {goal.spline.end_s:.2f},"
-                    f" tolerance {goal.path_tolerance[j]:.3f}; the arm holds where it is. Is something in its way?",
+                    f" tolerance {goal.path_tolerance[j]:.3f}; the arm holds where it is. Is something blocking it?",
                 )
         elif np.all(np.abs(error) <= goal.goal_tolerance) and np.all(np.abs(velocity) <= config.stopped_velocity):
             self._finish(End.SUCCEEDED, TrajectoryResult.SUCCESSFUL, "goal reached")
@@ -241,7 +241,7 @@ class TrajectoryFollower(Follower):
         v, a = (None if x is None else x[ahead] for x in (v, a))
         command, speed = self._command.position, self._command.velocity
         offset = np.zeros_like(command)
-        if t[0] > elapsed:  # the way to the first point is part of the curve
+        if t[0] > elapsed:  # the motion to the first point is part of the curve
             self._check_first_point(q[0], t[0] - elapsed)
             t, q = np.concatenate([[elapsed], t]), np.vstack([command, q])
             v = None if v is None else np.vstack([speed, v])

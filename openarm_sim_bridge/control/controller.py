@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Both arms and both grippers: from goals and position commands to the actuator targets of a tick.
+"""Controllers of all arms and grippers: from goals and position commands to the actuator targets of a tick.
 
 Positions are rad (finger joints: m). Called by the thread that steps the world, but for `check_command`.
 """
@@ -125,7 +125,7 @@ class RobotController:
             follower.reset(state.position[at])
 
     def abort(self, why: str) -> None:
-        """Give up all goals, because the world can't go on."""
+        """Give up all goals, because the physics diverged."""
         for follower, _ in self._followers:
             follower.abort(why)
 

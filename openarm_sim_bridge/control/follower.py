@@ -48,7 +48,7 @@ class Tracker:
         return self.position + self.velocity * np.abs(self.velocity) / (2.0 * self._a_max)
 
     def step(self, target: Array, dt: float, v_max: ArrayLike | None = None) -> None:
-        """Move on for `dt` seconds; arrives without overshoot from rest.
+        """Advance by `dt` seconds; arrives without overshoot from rest.
 
         Args:
             target: (k,) where to go.

@@ -2,7 +2,7 @@
 """Moving one gripper, like parallel_gripper_action_controller.
 
 Position is that of the driving finger joint, m from the middle (0 closed, 0.044 open: half of the aperture); velocity
-m/s, effort N. The command ramps to the goal and stays there, so a gripper that is stopped by an object goes on
+m/s, effort N. The command ramps to the goal and stays there, so a gripper that is stopped by an object keeps
 pressing with the effort limit.
 """
 
@@ -49,7 +49,7 @@ class GripperOutcome:
 
 @dataclass(frozen=True)
 class GripperGoal:
-    """Where a finger shall go.
+    """Goal of a finger.
 
     Args:
         position: m.
@@ -86,7 +86,7 @@ class GripperFollower(Follower):
 
     @property
     def busy(self) -> bool:
-        """Whether a goal is being worked on."""
+        """See `Follower.busy`."""
         return self._done is not None
 
     def check(self, goal: GripperGoal) -> GripperGoal:
@@ -127,7 +127,7 @@ class GripperFollower(Follower):
             self._target = self._command.position.copy()
 
     def start(self, goal: GripperGoal, position: float, effort: float, done: Callable[[GripperOutcome], None]) -> None:
-        """Work on a checked goal from now on; one that runs is aborted.
+        """Follow a checked goal from now on; one that runs is aborted.
 
         Args:
             goal: From `check`.

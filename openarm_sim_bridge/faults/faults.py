@@ -54,7 +54,7 @@ class CameraDelay(OfCamera):
 
 
 class CameraFreeze(OfCamera):
-    """The picture stands still while stamps go on."""
+    """The picture stays the same while stamps advance."""
 
 
 class StampOffset(OfCamera):
@@ -102,14 +102,14 @@ class JointStateGap(Config):
 
 
 class ObjectNudged(Config):
-    """An object is pushed aside, once, upright and at rest; the direction comes from the seed."""
+    """An object is displaced once, upright and without velocity; the direction comes from the seed."""
 
     object: str = Field(min_length=1, description="its name")
     mm: float = Field(default=20.0, ge=0.0, le=300.0, description="how far")
 
 
 class FrictionLowered(Config):
-    """Everything is slippery."""
+    """All friction is lowered."""
 
     scale: float = Field(default=0.2, ge=0.0, le=1.0, description="of all friction")
 
@@ -125,9 +125,9 @@ class GripperWeak(OfSide):
 
 
 class JointSag(OfSide):
-    """The arm's own weight is not compensated: it hangs below its targets."""
+    """Gravity compensation of an arm is reduced: it sags below its targets."""
 
-    share: float = Field(default=0.0, ge=0.0, le=1.0, description="of the weight that is still carried")
+    share: float = Field(default=0.0, ge=0.0, le=1.0, description="of the weight that is still compensated")
 
 
 class JointLate(OfSide):

@@ -149,7 +149,7 @@ def nudge(world: World, parameters: ObjectNudged, seed: int) -> None:
     """Push an object aside.
 
     Raises:
-        OpenArmError: INVALID_ARGUMENT, naming the objects there are; SCENE_INVALID, when something is in the way.
+        OpenArmError: INVALID_ARGUMENT, naming the objects there are; SCENE_INVALID, when it would overlap something.
     """
     there = {readout.object.name: readout for readout in world.objects()}
     if parameters.object not in there:

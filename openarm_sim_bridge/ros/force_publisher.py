@@ -20,8 +20,8 @@ from openarm_sim_bridge.world.touch import hand_link, pad_links
 from openarm_sim_bridge.world.world import World
 
 Reading = tuple[NDArray[np.float64], NDArray[np.float64]]
-#: How often it looks who listens, Hz.
-_LOOK_RATE = 5.0
+#: Rate at which subscribers are counted, Hz.
+_COUNT_RATE = 5.0
 
 
 @dataclass
@@ -33,14 +33,14 @@ class _Sensor:
 
 
 class ForcePublisher:
-    """Topics of the force sensors, each only while someone listens; 100 Hz of simulated time.
+    """Topics of the force sensors, each only while it has subscribers; 100 Hz of simulated time.
 
     Args:
         node: Owner of the publishers.
     """
 
     def __init__(self, node: Node) -> None:
-        self._look = RateDivider(_LOOK_RATE)
+        self._count = RateDivider(_COUNT_RATE)
         self._sensors: list[_Sensor] = []
         for side in SIDES:
             topic = f"/{side}_force_torque_sensor_broadcaster/wrench"
@@ -52,7 +52,7 @@ class ForcePublisher:
 
     def publish(self, world: World) -> None:
         """Publish a tick; in the thread of the simulation."""
-        if self._look.due(world.t_ns):
+        if self._count.due(world.t_ns):
             for sensor in self._sensors:
                 sensor.wanted = sensor.publisher.get_subscription_count() > 0
         for sensor in self._sensors:

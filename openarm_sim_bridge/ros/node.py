@@ -2,8 +2,8 @@
 """Node `mujoco_bridge`: a simulated robot behind the topics and actions of the real one.
 
 Threads: physics (steps the world at 100 Hz, publishes its state) and the executor (services, actions, commands). They
-share only what `Simulation.call` hands over. The cameras are drawn and published by a process of their own, the node
-`mujoco_cameras`, which is handed the states to draw (`CameraFeed`).
+share data only through `Simulation.call`. The cameras are drawn and published by a process of their own, the node
+`mujoco_cameras`, which receives the states to draw (`CameraFeed`).
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 #: Where `make` keeps the settings for large messages, which only the process of the cameras needs.
 LARGE_PROFILE = "OPENARM_LARGE_MESSAGES_PROFILE"
 REPORT_PERIOD_S = 1.0
-#: Slower than this share of the asked speed is told as a fault.
+#: Slower than this share of the requested speed is reported as a fault.
 _SLOW = 0.9
-#: Joint states that are further apart than this (p99, ms) are told as a fault.
+#: Joint states that are further apart than this (p99, ms) are reported as a fault.
 _LATE_MS = 15.0
 
 
 class MujocoBridge(BaseNode[BridgeConfig]):
-    """The simulation and everything it offers.
+    """The simulation with its topics, services and actions.
 
     Raises:
         OpenArmError: CONFIG_INVALID or SCENE_INVALID, when the world can't be made.
@@ -91,7 +91,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._sim_services = SimulationServer(self, stage, scene, self._simulation, self._on_scene)
 
         self._faults = FaultServer(
-            self, self._simulation, cameras if self._images is not None else (), self._tell_cameras
+            self, self._simulation, cameras if self._images is not None else (), self._set_camera_faults
         )
 
         self._scheduling = ""
@@ -108,15 +108,15 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._simulation.start()
         self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation is running")
 
-    def keep_time(self) -> None:
-        """Ask the system for real-time scheduling of this process, where the simulation has to wait for the clock."""
+    def use_real_time_priority(self) -> None:
+        """Request real-time scheduling of this process, where the simulation waits for the wall clock."""
         # As fast as it can, it would take a core from everything else.
         if 0.0 < self.config.speed <= 1.0:
             self._scheduling = use_fifo(self.config.thread_priority)
             self.get_logger().info(f"scheduled as {self._scheduling}")
 
     def close(self) -> None:
-        """Stop physics and drawing, then the rest."""
+        """Stop physics and drawing, then the node."""
         self._simulation.stop()
         if self._images is not None:
             self._images.close()
@@ -134,7 +134,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
                 self._images.tick(self._simulation.world)
 
     def _on_command(self, message: JointState) -> None:
-        """Position targets; a part of the joints will do."""
+        """Follow position targets of some or all joints."""
         self._commands += 1
         logger = self.get_logger()
         try:
@@ -177,7 +177,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         else:
             self.get_logger().info("images again")
 
-    def _tell_cameras(self, faults: tuple[Fault, ...]) -> None:
+    def _set_camera_faults(self, faults: tuple[Fault, ...]) -> None:
         if self._images is not None:
             self._images.set_faults(faults)
         elif faults:
@@ -189,7 +189,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self.context.try_shutdown()
 
     def _report(self) -> None:
-        """Once a second: how well the simulation keeps up."""
+        """Report once per second how well the simulation keeps time."""
         simulation, config = self._simulation, self.config
         factor, period = simulation.real_time_factor.value, simulation.periods.figures()
         self._real_time_factor.publish(Float64(data=0.0 if simulation.paused else factor))
@@ -199,7 +199,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         fault = simulation.fault or (images.fault if images is not None else "")
         slow = not simulation.paused and config.speed > 0.0 and period.n > 100 and factor < _SLOW * config.speed
         if not fault and slow:
-            fault = f"slower than asked: {factor:.2f} simulated seconds a second, expected {config.speed:g}"
+            fault = f"slower than requested: {factor:.2f} simulated seconds per second, expected {config.speed:g}"
         commands, self._commands = self._commands, 0
         if not fault and not simulation.paused and period.n > 100 and period.p99_ms > _LATE_MS:
             fault = (
@@ -218,8 +218,8 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             wall_time_skipped_s=f"{simulation.skipped_s:.2f}",
             faults_active=" ".join(self._faults.active),
             frames_dropped=images.dropped if images is not None else 0,
-            draw_ms=f"{images.draw_ms:.1f}" if images is not None else "",
-            watched=" ".join(sorted(images.watched)) if images is not None else "",
+            draw_ms=f"{images.report.draw_ms:.1f}" if images is not None else "",
+            watched=" ".join(sorted(images.report.watched)) if images is not None else "",
             **{f"frames_{name}": count - before[name] for name, count in drawn.items()},
         )
 
@@ -233,7 +233,7 @@ def make() -> MujocoBridge:
         os.environ[PROFILE] = str(config_dir() / "fastdds_small.xml")
     node = MujocoBridge()
     mujoco.set_mju_user_warning(lambda text: node.get_logger().warning(f"MuJoCo: {text}"))  # not into a file
-    node.keep_time()
+    node.use_real_time_priority()
     gc.collect()
     gc.freeze()  # what is there now stays; later collections are short
     return node

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the simulation tells at every tick: /clock, /joint_states, /tf, and the judge's ground truth.
+"""Publishers of the state at every tick: /clock, /joint_states, /tf, and the ground truth for judges.
 
 `StatePublisher.publish` runs in the thread of the simulation, with messages that are made once and filled in place.
 """
@@ -29,7 +29,7 @@ from openarm_sim_bridge.world.edges import MovingEdges
 from openarm_sim_bridge.world.world import JointReadout, ObjectReadout, World
 
 WORLD_FRAME = "world"
-#: Joint states come at least so often, paused or not: a subscriber that asks for this deadline is told of any gap.
+#: Longest period of joint states, paused or not: a subscriber that requests this deadline is notified of any gap.
 JOINT_STATE_DEADLINE = Duration(nanoseconds=200_000_000)
 
 
@@ -96,7 +96,7 @@ class StatePublisher:
         self._tf_static.publish(TFMessage(transforms=[matrix_to_transform(*edge, 0) for edge in edges]))
 
     def publish(self, state: JointReadout, world: World, *, joints: bool = True) -> None:
-        """Publish a tick, without its joint state where that is a gap on purpose."""
+        """Publish a tick; `joints` is False in an injected gap of the joint states."""
         stamp = ns_to_stamp(state.t_ns)
         self._clock_message.clock = stamp
         self._clock.publish(self._clock_message)

@@ -22,7 +22,7 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class TrackedObject:
-    """A free body that the judge is told about."""
+    """A free body whose true pose is reported."""
 
     name: str
     label: str
@@ -31,7 +31,7 @@ class TrackedObject:
 
 @dataclass(frozen=True)
 class CompiledWorld:
-    """Model and addresses; joint vectors (n,) are in the order of the actuated joints asked for."""
+    """Model and addresses; joint vectors (n,) are in the order of the requested actuated joints."""
 
     model: mujoco.MjModel
     timestep_ns: int
@@ -53,10 +53,10 @@ def compile_world(
     objects: Sequence[TrackedObject],
     period_ns: int,
 ) -> CompiledWorld:
-    """Compile a model and look up what the world needs.
+    """Compile a model and look up its addresses.
 
     Args:
-        spec: The model. Its automatic reset is switched off: a diverged simulation that silently starts anew would be
+        spec: The model. Its automatic reset is switched off: a diverged simulation that silently restarts would be
             a teleport; the world reports it instead.
         joint_names: Actuated joints; each needs one actuator.
         home: Start position of joints by name, rad or m; joints coupled by an equality follow.

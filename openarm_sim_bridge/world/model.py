@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """From the robot description and a scene to a MuJoCo model.
 
-The URDF goes through MuJoCo's own importer, links and names kept; what a URDF cannot say is added: actuators,
+The URDF is read by MuJoCo's importer, links and names kept; what a URDF cannot express is added: actuators,
 armature, finger coupling, gravity compensation, pad friction, pairs without contact, sites; and what is not the robot:
-cameras, table, objects, lights. World frame: x forward, y left, z up; SI units. Geom groups: 0 surroundings, 1 objects,
-2 looks of the robot, 3 its collision shapes (not drawn).
+cameras, table, objects, lights. World frame: x forward, y left, z up; SI units. Geom groups: 0 environment,
+1 objects, 2 visual geometry of the robot, 3 its collision geometry (not drawn).
 """
 
 from __future__ import annotations
@@ -30,21 +30,10 @@ Positive = Annotated[float, Field(gt=0.0)]
 Seven = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive]
 Friction = tuple[Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)]]
 
-_INTEGRATORS = {
-    "euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-}
-_CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
-_JACOBIANS = {
-    "dense": mujoco.mjtJacobian.mjJAC_DENSE,
-    "sparse": mujoco.mjtJacobian.mjJAC_SPARSE,
-    "auto": mujoco.mjtJacobian.mjJAC_AUTO,
-}
 #: Specular and shininess of the materials that are not matt.
 _GLOSS = {"silver": (0.45, 0.45), "steel": (0.35, 0.4), "finger_grey": (0.3, 0.4)}
 _MATT = (0.12, 0.15)
-_SHAPES_GROUP, _LOOKS_GROUP = 3, 2
+_COLLISION_GROUP, _VISUAL_GROUP = 3, 2
 
 
 class PhysicsConfig(Config):
@@ -87,7 +76,7 @@ class PhysicsConfig(Config):
     finger_force: float = Field(default=30.0, gt=0.0, description="N; each pad presses with half of it")
     finger_armature: float = Field(default=0.05, ge=0.0, description="kg")
     gravity_compensation: float = Field(
-        default=1.0, ge=0.0, le=1.0, description="share of the arms' own weight that is carried"
+        default=1.0, ge=0.0, le=1.0, description="share of the arms' weight that is compensated"
     )
 
 
@@ -104,22 +93,22 @@ def build_spec(
     Args:
         description: The robot, from `RobotDescription.load()`.
         scene: Table and objects.
-        cameras: By name; those of a mount with an error stand where `mount_seed` puts them.
+        cameras: By name; mounts with an error are placed by `mount_seed`.
         mount_seed: Of the mount errors; None is the nominal mounts.
         physics: None is the defaults.
-        robot: Of `robot_spec` with the same physics, to spare the reading of the URDF; it stays as it is.
+        robot: Of `robot_spec` with the same physics, which saves reading the URDF; not changed.
 
     Returns:
         An editable model: bodies are named like links, joints and actuators like joints, objects by their names.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, when what carries a camera or a fixture is not a link, or MuJoCo does not read the
-            URDF or a fixture.
+        OpenArmError: CONFIG_INVALID, when the parent of a camera or a fixture is not a link, or MuJoCo does not read
+            the URDF or a fixture.
     """
     settings = physics or PhysicsConfig()
     spec = robot_spec(description, settings) if robot is None else robot.copy()
     contact = contact_of(settings)
-    scenery.add_surroundings(spec, contact)
+    scenery.add_environment(spec, contact)
     scenery.add_table(spec, scene.table, contact)
     for item in scene.objects:
         scenery.add_object(spec, item, scene.table, contact, settings.object_condim)
@@ -161,7 +150,7 @@ def robot_spec(description: RobotDescription, physics: PhysicsConfig) -> mujoco.
     """
     spec = _import_urdf(description)
     _set_options(spec, physics)
-    _dress(spec, description)
+    _sort_geoms(spec, description)
     for side in SIDES:
         _actuate_arm(spec, description, side, physics)
         _actuate_gripper(spec, description, side, physics)
@@ -175,7 +164,7 @@ def robot_spec(description: RobotDescription, physics: PhysicsConfig) -> mujoco.
 
 def _import_urdf(description: RobotDescription) -> mujoco.MjSpec:
     root = ET.fromstring(description.urdf)
-    # By default the importer merges links that are fixed to each other, with their names, and drops the looks.
+    # By default the importer merges links that are fixed to each other, with their names, and drops visual geometry.
     extension = ET.SubElement(root, "mujoco")
     ET.SubElement(extension, "compiler", fusestatic="false", discardvisual="false")
     try:
@@ -190,21 +179,19 @@ def _import_urdf(description: RobotDescription) -> mujoco.MjSpec:
 
 def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     option = spec.option
-    option.timestep = physics.timestep
-    option.integrator = _INTEGRATORS[physics.integrator]
-    option.cone = _CONES[physics.cone]
-    option.impratio = physics.impratio
-    option.iterations = physics.iterations
-    option.noslip_iterations = physics.noslip_iterations
-    option.jacobian = _JACOBIANS[physics.jacobian]
+    for key in ("timestep", "impratio", "iterations", "noslip_iterations"):
+        setattr(option, key, getattr(physics, key))
+    option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{physics.integrator.upper()}")
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{physics.cone.upper()}")
+    option.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{physics.jacobian.upper()}")
 
 
-def _dress(spec: mujoco.MjSpec, description: RobotDescription) -> None:
-    """Sort the geoms into looks and shapes, and give the looks materials (URDF materials have a colour only)."""
+def _sort_geoms(spec: mujoco.MjSpec, description: RobotDescription) -> None:
+    """Sort the geoms into visual and collision geometry, and give materials to the former (URDF has colours only)."""
     for link in description.links.values():
         for primitive in link.visual:
             geom = spec.geom(primitive.name)
-            geom.group = _LOOKS_GROUP
+            geom.group = _VISUAL_GROUP
             geom.mass = 0.0
             if primitive.material and primitive.rgba is not None:
                 if spec.material(primitive.material) is None:
@@ -216,7 +203,7 @@ def _dress(spec: mujoco.MjSpec, description: RobotDescription) -> None:
                 geom.rgba = (0.5, 0.5, 0.5, 1.0)  # the default: anything else would override the material
         for primitive in link.collision:
             geom = spec.geom(primitive.name)
-            geom.group = _SHAPES_GROUP
+            geom.group = _COLLISION_GROUP
             geom.mass = 0.0  # masses are those of the URDF
 
 

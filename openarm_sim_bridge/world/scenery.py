@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands around the robot in MuJoCo: floor, light, table, objects, cameras.
+"""The environment of the robot in MuJoCo: floor, light, table, objects, cameras.
 
 World frame: x forward, y left, z up; metres. Everything but the objects is without a hue, so that the colour detector
-sees objects only, and no light throws a shadow: an arm's would wander over the object region, and shadows double the
+finds objects only, and no light throws a shadow: an arm's would wander over the object region, and shadows double the
 cost of an image.
 """
 
@@ -34,7 +34,7 @@ NEAR, FAR = 0.02, 20.0
 _T_OPTICAL_MUJOCO = se3.make(se3.rot_x(math.pi))
 
 
-def add_surroundings(spec: mujoco.MjSpec, contact: Mapping[str, Any]) -> None:
+def add_environment(spec: mujoco.MjSpec, contact: Mapping[str, Any]) -> None:
     """Floor, sky and light."""
     visual = spec.visual
     visual.headlight.ambient = (0.38, 0.38, 0.38)
@@ -119,7 +119,7 @@ def add_object(spec: mujoco.MjSpec, item: SceneObject, table: Table, contact: Ma
         kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, (x / 2.0, z / 2.0, 0.0)
     elif item.shape == "sphere":
         kind, size = mujoco.mjtGeom.mjGEOM_SPHERE, (x / 2.0, 0.0, 0.0)
-        spec.visual.quality.numstacks = _ROUND  # the facets of `add_surroundings` would make a double cone of it
+        spec.visual.quality.numstacks = _ROUND  # the facets of `add_environment` would make a double cone of it
     else:
         kind, size = mujoco.mjtGeom.mjGEOM_BOX, (x / 2.0, y / 2.0, z / 2.0)
     body.add_geom(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which world is simulated: the robot and its cameras in a scene that can be exchanged and added to."""
+"""Making worlds: the robot and its cameras in a scene that can be exchanged and extended."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Stage:
         return {side: self._group((self._description.finger_joint(side),)) for side in SIDES}
 
     def world(self, scene: Scene) -> World:
-        """Make a world; the robot stands in its home posture, grippers closed.
+        """Make a world with the robot in its home posture, grippers closed.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the model can't be built.
@@ -64,7 +64,7 @@ class Stage:
         return World(self._spec(scene), joint_names=self.joint_names, home=self.home, objects=tracked(scene))
 
     def compile(self, world: World, scene: Scene) -> CompiledWorld:
-        """Compile another scene for a world to take; slow, changes nothing.
+        """Compile another scene for `World.exchange` or `World.extend`; slow, changes nothing.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the model can't be built.
@@ -94,12 +94,12 @@ class Stage:
 
 
 def tracked(scene: Scene) -> tuple[TrackedObject, ...]:
-    """What the judge is told of a scene."""
+    """Objects of a scene whose true poses are reported."""
     return tuple(TrackedObject(item.name, item.label, item.size) for item in scene.objects)
 
 
 def without_object(scene: Scene, name: str) -> Scene:
-    """Return the scene with one object less.
+    """Return the scene without an object.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the objects that exist.

@@ -25,7 +25,7 @@ def pad_links(side: str) -> tuple[str, str]:
 
 
 def add_wrist_sensor(spec: mujoco.MjSpec, body: str) -> None:
-    """Let a body feel how the arm holds it and all beyond it: sensors `{body}_force` and `{body}_torque`."""
+    """Add a force-torque sensor to a body: `{body}_force` and `{body}_torque`."""
     site = f"{body}_wrench"
     spec.body(body).add_site(name=site, size=(0.004, 0.004, 0.004), group=4)
     for kind, what in ((mujoco.mjtSensor.mjSENS_FORCE, "force"), (mujoco.mjtSensor.mjSENS_TORQUE, "torque")):

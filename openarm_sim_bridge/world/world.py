@@ -27,7 +27,7 @@ _DIVERGED = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
     mujoco.mjtWarning.mjWARN_BADQACC,
-    mujoco.mjtWarning.mjWARN_BADCTRL,  # MuJoCo would go on with all targets zero
+    mujoco.mjtWarning.mjWARN_BADCTRL,  # MuJoCo would continue with all targets zero
 )
 #: Something that is put into a running world may touch what is there by this much, m.
 _OVERLAP_ALLOWED = 1e-3
@@ -139,7 +139,7 @@ class World:
             self._effort_limits = dict(limits)
             self._apply_effort_limits()
 
-    # --- what can be read
+    # --- readings
     def read_joints(self) -> JointReadout:
         """Positions, velocities and actuator efforts of the actuated joints."""
         c, d = self._compiled, self.data
@@ -170,7 +170,7 @@ class World:
         return se3.make(self.data.xmat[body].reshape(3, 3), self.data.xpos[body])
 
     def objects(self) -> tuple[ObjectReadout, ...]:
-        """Pose and twist of every tracked object. For judges: nothing that controls the robot may use it."""
+        """Pose and twist of every tracked object: ground truth, for judges alone, never for what controls the robot."""
         c, d = self._compiled, self.data
         out: list[ObjectReadout] = []
         for tracked, q, v in zip(c.objects, c.object_qpos, c.object_dof, strict=True):
@@ -195,7 +195,7 @@ class World:
 
     # --- reset and exchange
     def reset(self, joints: Mapping[str, float] | None = None, objects: Mapping[str, Array] | None = None) -> None:
-        """Put robot and objects back to their start, at rest; simulated time goes on.
+        """Put robot and objects back to their start, at rest; simulated time continues.
 
         Args:
             joints: Start positions by name of joints that do not start at home, rad or m.
@@ -275,7 +275,7 @@ class World:
             raise OpenArmError(Code.SCENE_INVALID, overlap)
 
     def move_object(self, name: str, T_world_object: Array) -> None:
-        """Put a tracked object elsewhere, at rest, as a hand from outside would; everything else goes on.
+        """Put a tracked object elsewhere, at rest, as a person would; everything else continues.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, naming the objects that exist; SCENE_INVALID, when something else is there

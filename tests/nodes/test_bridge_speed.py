@@ -23,7 +23,7 @@ def test_the_speed_that_was_asked_for_shows_on_the_wire_or_it_says_why_not(bridg
     # After a hiccup of the machine time is made up, so for a moment it may go faster than asked.
     assert np.median([factor.data for factor in factors]) < 1.5 * speed
     reached = min(factor.data for factor in factors[-2:]) > 0.8 * speed
-    assert reached or "slower than asked" in " ".join(report.status[0].message for report in told)
+    assert reached or "slower than requested" in " ".join(report.status[0].message for report in told)
     values = {item.key: item.value for item in told[-1].status[0].values}
     assert values["real_time_factor"] in {f"{factor.data:.3f}" for factor in factors}
     # Heard from the stamps themselves, at no more than 100 Hz of wall clock however fast time is.

@@ -12,6 +12,7 @@ import pytest
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_sim_bridge.cameras.handover import CameraReport, CameraSetup, StateReceiver, StateSender, pair
+from openarm_sim_bridge.cameras.noise import ColourNoiseConfig, DepthNoiseConfig
 from openarm_sim_bridge.world.world import Snapshot
 
 MODEL = """<mujoco><worldbody><body name="{0}"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
@@ -21,7 +22,7 @@ def camera(name: str) -> CameraConfig:
     return CameraConfig(name=name, parent="world", position=(0, 0, 1), forward=(0, 0, -1), image_right=(0, -1, 0))
 
 
-SETUP = CameraSetup(cameras=(camera("a"), camera("b")), depth_encoding="16UC1", topics={})
+SETUP = CameraSetup((camera("a"), camera("b")), "16UC1", {}, DepthNoiseConfig(), ColourNoiseConfig())
 
 
 def snapshot(t_ns: int, model: mujoco.MjModel) -> Snapshot:
