@@ -32,9 +32,10 @@ def test_the_wheel_holds_packages_models_and_parameters_and_nothing_of_colcon(tm
         missing = [str(path) for path in files if f"{shared}/{path.relative_to(_ROOT)}" not in names]
         assert not missing
     assert {f"{package}/__init__.py" for package in _PACKAGES} <= names
-    page = {str(path.relative_to(_ROOT)) for path in (_ROOT / "openarm_bringup" / "view" / "page").iterdir()}
-    assert page
-    assert page <= names
+    pages = [path for path in (_ROOT / "openarm_bringup" / "view" / "page").rglob("*") if path.is_file()]
+    pages += [path for package in _PACKAGES for path in (_ROOT / package).rglob("*.html")]
+    assert len(pages) > 10
+    assert {str(path.relative_to(_ROOT)) for path in pages} <= names
     colcon = re.compile(r"(^|/)(setup\.py|setup\.cfg|package\.xml|resource/.*)$")
     assert not [name for name in names if colcon.search(name)]
 

@@ -106,7 +106,7 @@ class ViewServer:
         self._pages: set[_Page] = set()
         self._kept: dict[str, Item] = {}
         self._picking: asyncio.Task[None] | None = None
-        self._files = {path.name: path.read_bytes() for path in sorted(PAGE.iterdir()) if path.is_file()}
+        self._files = {str(path.relative_to(PAGE)): path.read_bytes() for path in PAGE.rglob("*.*")}
 
     def app(self) -> web.Application:
         """The aiohttp application."""
@@ -116,7 +116,7 @@ class ViewServer:
         app.router.add_post("/pick", self._pick)
         app.router.add_post("/cancel", self._cancel)
         app.router.add_post("/reset", self._reset)
-        app.router.add_get("/{name}", self._file)
+        app.router.add_get("/{name:.+}", self._file)
         return app
 
     def put(self, item: Item) -> None:

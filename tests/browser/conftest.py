@@ -81,12 +81,23 @@ class Tab:
         element = f"document.querySelector({selector!r})"
         return await self.js(f"({element}.scrollIntoViewIfNeeded(), {element}.getBoundingClientRect().toJSON())")
 
-    async def click(self, selector: str) -> None:
-        """Click the middle of an element, as a mouse does."""
+    async def click(self, selector: str, *, count: int = 1) -> None:
+        """Click the middle of an element, as a mouse does; twice for a double click."""
+        x, y = await self._middle(selector)
+        for number in range(1, count + 1):
+            for kind in ("mousePressed", "mouseReleased"):
+                await self.do("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=number)
+
+    async def drag(self, selector: str, right: float, down: float) -> None:
+        """Press the left button in the middle of an element, move by so many pixels, and release it."""
+        x, y = await self._middle(selector)
+        for kind, share in (("mousePressed", 0.0), ("mouseMoved", 0.5), ("mouseMoved", 1.0), ("mouseReleased", 1.0)):
+            where = {"x": x + share * right, "y": y + share * down}
+            await self.do("Input.dispatchMouseEvent", type=kind, **where, button="left", buttons=1, clickCount=1)
+
+    async def _middle(self, selector: str) -> tuple[float, float]:
         box = await self.box(selector)
-        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-        for kind in ("mousePressed", "mouseReleased"):
-            await self.do("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
     async def picture(self, path: Path) -> None:
         """Save what the page looks like."""

@@ -44,6 +44,7 @@ class StandIns:
         from rclpy.executors import MultiThreadedExecutor
         from sensor_msgs.msg import Image, JointState
         from vision_msgs.msg import Detection3DArray
+        from visualization_msgs.msg import MarkerArray
 
         from openarm_common.octree.codec import encode_states
         from openarm_common.octree.lattice import Lattice
@@ -83,6 +84,8 @@ class StandIns:
             (publisher(Detection3DArray, "/detections_3d", QOS_COMMAND), _detections("blue", NASTY)),
             (publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND), diagnostics),
             (publisher(Octomap, "/octomap_binary", QOS_LATCHED), octree),
+            (publisher(MarkerArray, "/motion/preview", QOS_LATCHED), _plan()),
+            (publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED), _held("openarm_body_link0")),
         ]
         self.image = sent[1][0]
         self.detections = sent[2][1]
@@ -133,6 +136,26 @@ def _detections(*labels: str) -> Any:
         one.bbox.size.x = one.bbox.size.y = one.bbox.size.z = 0.06
         message.detections.append(one)
     return message
+
+
+def _plan() -> Any:
+    """Return forty lines through the picture: a line is a pixel wide."""
+    from geometry_msgs.msg import Point
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    ends = [Point(x=0.6, y=y, z=0.1 + 0.02 * i) for i in range(20) for y in (-0.5, 0.5)]
+    return MarkerArray(markers=[Marker(type=Marker.LINE_STRIP, points=ends)])
+
+
+def _held(link: str) -> Any:
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    box = Marker(ns="held", type=Marker.CUBE)
+    box.header.frame_id = link
+    box.pose.position.x, box.pose.position.y, box.pose.position.z = 0.2, 0.6, 0.3
+    box.pose.orientation.w = 1.0
+    box.scale.x = box.scale.y = box.scale.z = 0.3
+    return MarkerArray(markers=[box])
 
 
 @pytest.fixture
@@ -200,8 +223,11 @@ def test_the_page_shows_the_graph_and_asks_it(stand_ins: StandIns, open_tab: Any
         await tab.until("document.querySelector('[data-camera=overhead] img').naturalWidth === 64")
         await tab.until("document.querySelector('#fault-cloud')?.textContent.includes('/overhead/depth/image_raw')")
 
-        # the robot, much of which is black; then the map, which is blue below
+        # the robot, much of which is black; the plan, orange lines; a held box, of glass; then the map, blue below
         await seen(tab, lambda image: (image.max(axis=2) < 75).sum(), 4000)
+        await seen(tab, lambda image: ((image[..., 2] > image[..., 0] + 100) & (image[..., 1] > 80)).sum(), 1500)
+        await seen(tab, lambda image: (image[..., 0] > image[..., 2] + 30).sum(), 15000)
+        await tab.click("#layers button:nth-child(4)")
         await tab.click("#layers button:nth-child(3)")
         await seen(tab, lambda image: (image[..., 0] > image[..., 2] + 40).sum(), 4000)
         await shoot(tab, "light")
@@ -210,6 +236,17 @@ def test_the_page_shows_the_graph_and_asks_it(stand_ins: StandIns, open_tab: Any
         await shoot(tab, "dark")
         assert await tab.js(_TOO_WIDE) == []
         await tab.size(1440, 900)
+
+        # the view: a drag turns it, a wheel comes closer, a double click is the start again
+        label = "document.querySelector('#labels button').style.transform"
+        start = await tab.js(label)
+        await tab.drag("#scene", 120, 40)
+        await tab.until(f"{label} !== {start!r}")
+        turned = await tab.js(label)
+        await tab.do("Input.dispatchMouseEvent", type="mouseWheel", x=600, y=650, deltaX=0, deltaY=-200)
+        await tab.until(f"{label} !== {turned!r}")
+        await tab.click("#scene", count=2)
+        await tab.until(f"{label} === {start!r}")
 
         # pick: as the mouse does it
         await tab.click("#choices button[aria-checked='false']")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 import re
 import threading
@@ -205,11 +206,20 @@ def test_every_answer_forbids_scripts_of_others() -> None:
 def test_labels_can_only_become_text() -> None:
     """Data of the graph reaches the page through textContent and attributes; nothing makes markup or code of it."""
     scripts = [path.read_text(encoding="utf-8") for path in PAGE.glob("*.js")]
-    assert len(scripts) >= 4
+    assert len(scripts) == 3
     for text in scripts:
         assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|new Function", text)
     page = (PAGE / "index.html").read_text(encoding="utf-8")
     assert not re.search(r"<script(?![^>]*\bsrc=)|\son\w+=|\sstyle=|https?://", page)
+
+
+def test_vendored_files_are_those_that_are_named() -> None:
+    """What came unchanged from the package has the sum that stands beside it."""
+    said = (PAGE / "vendor" / "README.md").read_text(encoding="utf-8")
+    for name in ("three.module.min.js", "three.core.min.js"):
+        data = (PAGE / "vendor" / name).read_bytes()
+        assert re.search(rf"`build/{name}` \(sha256\s+{hashlib.sha256(data).hexdigest()}\)", said), name
+    assert "MIT" in (PAGE / "vendor" / "LICENSE").read_text(encoding="utf-8")
 
 
 # --- what is shown
@@ -307,8 +317,17 @@ def test_what_the_graph_refuses_is_said() -> None:
 
 def test_files_outside_of_the_page_are_not_there() -> None:
     async def test(bench: Bench) -> None:
-        for path in ("/../server.py", "/%2e%2e/server.py", "/page/../server.py", "/index.html", "/nothing"):
+        wrong = (
+            "/../server.py",
+            "/%2e%2e/server.py",
+            "/page/../server.py",
+            "/vendor/../../server.py",
+            "/vendor",
+            "/vendor/",
+        )
+        for path in (*wrong, "/index.html", "/nothing"):
             assert (await bench.get(path))[0] == 404, path
-        assert (await bench.get("/view.js"))[0] == 200
+        for path in ("/view.js", "/vendor/three.module.min.js"):
+            assert (await bench.get(path))[0] == 200, path
 
     with_bench(test)

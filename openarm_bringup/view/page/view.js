@@ -1,10 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // The page: a websocket brings what is wanted, the scene and the panel show it, requests ask the robot.
 
-import { boxEdges } from "./meshes.js";
-import { multiply, scaled } from "./matrix.js";
 import { AskPanel, GraspPanel, HealthPanel, element } from "./panel.js";
-import { INSTANCE, Scene } from "./scene.js";
+import { Scene, boxEdges, cubes, group, lines, place, points, solid } from "./scene.js";
 
 const $ = (id) => document.getElementById(id);
 const token = new URLSearchParams(location.search).get("token") ?? "";
@@ -17,33 +15,37 @@ const asking = new AskPanel(ask, markChosen);
 const health = new HealthPanel();
 
 let socket = null;
-let robot = null; // links, and shapes by mesh with their pose in the link
-let poses = null; // of the links, as they came
+let links = new Map(); // of the robot, with what hangs on them
 let held = [];
 let boxes = [];
 
 const handlers = {
   hello(message) {
-    robot = { links: message.robot.links, shapes: sorted(message.robot.shapes) };
+    showRobot(message.robot);
     grasp.setStates(message.states);
     if (!$("cameras").children.length) makeCameras(message.cameras);
     drawFloor();
     want();
   },
   robot(_, body) {
-    poses = new Float32Array(body);
-    drawRobot();
+    [...links.values()].forEach((link, i) => place(link, new Float32Array(body, 64 * i, 16)).visible = true);
+    scene.redraw();
   },
   held(message) {
-    held = message.boxes.filter((box) => robot.links.includes(box.link));
-    if (poses) drawRobot();
+    held.forEach((box) => box.removeFromParent());
+    held = message.boxes.filter((box) => links.has(box.link)).map((box) => {
+      const made = solid("box", box.pose, box.size, GLASS, 0.45);
+      links.get(box.link).add(made);
+      return made;
+    });
+    scene.redraw();
   },
   cloud(head, body) {
-    const end = 12 * head.count;
-    scene.setPoints("cloud", new Float32Array(body, 0, 3 * head.count), new Uint8Array(body, end), 3, 0.011);
+    const colors = new Uint8Array(body, 12 * head.count);
+    scene.set("cloud", points(new Float32Array(body, 0, 3 * head.count), colors, 0.011));
   },
-  map(head, body) {
-    drawMap(new Float32Array(body), head.count);
+  map(_, body) {
+    scene.set("map", cubes(new Float32Array(body), heightColor));
   },
   detections(message) {
     boxes = message.boxes;
@@ -52,7 +54,7 @@ const handlers = {
   },
   plan(message) {
     const ends = message.ways.flatMap((way) => way.slice(1).flatMap((point, i) => [way[i], point]));
-    drawLines("plan", ends, [224, 138, 40, 255]);
+    scene.set("plan", lines(ends, ends.map(() => [224, 138, 40, 255])));
   },
   image(head, body) {
     const image = document.querySelector(`#cameras figure[data-camera="${CSS.escape(head.camera)}"] img`);
@@ -126,31 +128,17 @@ function showFault({ layer, text }) {
 }
 
 // --- what is drawn
-function sorted(shapes) {
-  const by = { box: [], cylinder: [], sphere: [] };
-  for (const { link, kind, size, pose, color } of shapes) {
-    const [x, y, z] = kind === "box" ? size : kind === "cylinder" ? [2 * size[0], 2 * size[0], size[1]] : Array(3).fill(2 * size[0]);
-    by[kind].push({ link, local: scaled(pose, x, y, z), color });
-  }
-  return by;
-}
+const GLASS = [0.31, 0.7, 0.75];
 
-function drawRobot() {
-  for (const [mesh, shapes] of Object.entries(robot.shapes)) {
-    if (!shapes.length) continue;
-    const data = new Float32Array(INSTANCE * shapes.length);
-    shapes.forEach(({ link, local, color }, i) => {
-      multiply(poses, local, data, INSTANCE * i, 16 * link);
-      data.set(color, INSTANCE * i + 16);
-    });
-    scene.setSolids(`robot ${mesh}`, mesh, data);
+function showRobot(robot) {
+  links = new Map(robot.links.map((name) => [name, group()]));
+  const all = [...links.values()];
+  for (const { link, kind, size, pose, color } of robot.shapes) {
+    const [a, b] = [2 * size[0], size[1]];
+    all[link].add(solid(kind, pose, { box: size, cylinder: [a, a, b], sphere: [a, a, a] }[kind], color.slice(0, 3)));
   }
-  const data = new Float32Array(INSTANCE * held.length);
-  held.forEach((box, i) => {
-    multiply(poses, scaled(box.pose, ...box.size), data, INSTANCE * i, 16 * robot.links.indexOf(box.link));
-    data.set([0.31, 0.7, 0.75, 0.45], INSTANCE * i + 16);
-  });
-  scene.setSolids("held", "box", data, { glass: true });
+  all.forEach((link) => (link.visible = false)); // until it is known where it is
+  scene.set("robot", ...all);
 }
 
 /** From the floor over the table top (0.4 m) and what stands on it to what is above. */
@@ -163,26 +151,8 @@ function heightColor(z) {
   return a.map((v, i) => v + u * (b[i] - v));
 }
 
-function drawMap(cells, count) {
-  const data = new Float32Array(INSTANCE * count);
-  for (let i = 0; i < count; i++) {
-    const [x, y, z, edge] = cells.subarray(4 * i, 4 * i + 4);
-    const size = 0.94 * edge;
-    data.set([size, 0, 0, 0, 0, size, 0, 0, 0, 0, size, 0, x, y, z, 1, ...heightColor(z), 1], INSTANCE * i);
-  }
-  scene.setSolids("map", "box", data);
-}
-
 function drawDetections() {
-  const glass = new Float32Array(INSTANCE * boxes.length);
-  const ends = [];
-  boxes.forEach((box, i) => {
-    glass.set(scaled(box.pose, ...box.size), INSTANCE * i);
-    glass.set([0.31, 0.7, 0.75, 0.18], INSTANCE * i + 16);
-    ends.push(...boxEdges(box.pose, box.size));
-  });
-  scene.setSolids("detections", "box", glass, { glass: true });
-  drawLines("detection edges", ends, [79, 179, 191, 255]);
+  scene.set("detections", ...boxes.flatMap(({ pose, size }) => [solid("box", pose, size, GLASS, 0.18), boxEdges(pose, size, GLASS)]));
   // In place: a label that is made anew between press and release is not clicked.
   const labels = $("labels");
   while (labels.children.length > boxes.length) labels.lastChild.remove();
@@ -216,15 +186,11 @@ function placeLabels() {
   });
 }
 
-function drawLines(name, ends, color) {
-  scene.setLines(name, new Float32Array(ends.flat()), Uint8Array.from(ends.flatMap(() => color)));
-}
-
 function drawFloor() {
   const dark = matchMedia("(prefers-color-scheme: dark)").matches;
-  scene.theme = dark
+  scene.setTheme(dark
     ? { background: [0.06, 0.078, 0.086], sky: [0.6, 0.64, 0.66], ground: [0.34, 0.34, 0.36] }
-    : { background: [0.914, 0.933, 0.941], sky: [0.68, 0.7, 0.71], ground: [0.44, 0.43, 0.42] };
+    : { background: [0.914, 0.933, 0.941], sky: [0.68, 0.7, 0.71], ground: [0.44, 0.43, 0.42] });
   const [ends, colors] = [[], []];
   const line = (a, b) => {
     for (let k = 0; k < 20; k++) {
@@ -232,7 +198,7 @@ function drawFloor() {
         const point = a.map((v, i) => v + u * (b[i] - v));
         const fade = Math.max(0, 1 - Math.hypot(point[0] - 0.3, point[1]) / 1.9);
         ends.push(point);
-        colors.push(...(dark ? [150, 170, 178] : [90, 110, 118]), 110 * fade);
+        colors.push([...(dark ? [150, 170, 178] : [90, 110, 118]), 110 * fade]);
       }
     }
   };
@@ -240,7 +206,7 @@ function drawFloor() {
     line([k / 4 + 0.25, -2, 0], [k / 4 + 0.25, 2, 0]);
     line([-1.75, k / 4, 0], [2.25, k / 4, 0]);
   }
-  scene.setLines("floor", new Float32Array(ends.flat()), Uint8Array.from(colors));
+  scene.set("floor", lines(ends, colors));
 }
 
 // --- what can be chosen
@@ -249,8 +215,7 @@ function toggle(layer, on) {
   want();
   if (on) return;
   showFault({ layer, text: "" });
-  const drawn = { detections: ["detections", "detection edges"] }[layer] ?? [layer];
-  drawn.forEach((name) => scene.remove(name));
+  scene.remove(layer);
   if (layer === "detections") $("labels").replaceChildren();
 }
 
