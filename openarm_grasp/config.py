@@ -246,9 +246,6 @@ class GraspConfig(Config):
     )
     home_tolerance: float = Field(default=0.05, gt=0.0, le=0.5, description="joints this near to home are home, rad")
     camera: str = Field(default="overhead", description="that the detections come from; named by the drift alarm")
-    transitions: str = Field(
-        default="", description="YAML of the state machine; empty: config/params/grasp_transitions.yaml"
-    )
     velocity_scale: float = Field(
         default=0.0, ge=0.0, le=1.0, description="of the motion limits; 0 = the planner's default"
     )

@@ -210,7 +210,7 @@ def order(
         each: Most objects of one label.
         timeout: Longest wait for one object, s.
     """
-    from openarm_grasp.strategy.orders import Order, load_bins
+    from openarm_grasp.strategies.orders import Order, load_bins
 
     work = Order(labels, load_bins(bins) if bins is not None else None, each)
     join_graph(domain)

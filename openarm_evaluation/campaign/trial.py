@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One task of a campaign in this process: the grasp's machine and performer on a `SimRobot`, judged by its truth."""
+"""One task of a campaign in this process: the strategies of the grasp on a `SimRobot`, judged by its truth."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ from openarm_evaluation.judging.judge import JudgeConfig, Sample, Verdict, at_re
 from openarm_evaluation.judging.provenance import scene_hash
 from openarm_evaluation.judging.trial import Step, Trial
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.context import GraspContext
 from openarm_grasp.planning.routing import ARMS
-from openarm_grasp.strategy.effects import GraspOutcome, GraspRequest
-from openarm_grasp.strategy.legs import run_task
+from openarm_grasp.robot.skills import Skills
+from openarm_grasp.strategies.orders import Ask, Order
+from openarm_grasp.strategies.pair import Pair
+from openarm_grasp.strategies.registry import carry_out, carry_out_pair
+from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
+from openarm_grasp.strategies.task import GraspSession, Status
+from openarm_grasp.strategies.task import Task as GraspTask
 from openarm_grasp.strategy.link import Link
-from openarm_grasp.strategy.machine import GraspMachine
-from openarm_grasp.strategy.memory import Surroundings
-from openarm_grasp.strategy.orders import Ask, Order
-from openarm_grasp.strategy.pair import PairRunner
-from openarm_grasp.strategy.performer import Performer
 from openarm_sim_bridge.faults.faults import checked_fault
 
 _SETTLE_S = 0.5
@@ -69,8 +70,8 @@ class Trials:
             task.scene, senses, mount_seed=task.mount_seed, mounts=mounts, seed=task.seed, posture=task.posture
         )
         self.link = DirectLink(self.robot, config)
-        self.performer = Performer(self.link, config)
-        self.machine = GraspMachine(Surroundings.of(config, task.scene.table, self.robot.description))
+        self.skills = Skills(self.link, config)
+        self.session = GraspSession(GraspContext.of(config, task.scene.table, self.robot.description))
         self.steps: list[Step] = []
         self._rules = JudgeConfig()
         self._keep = record.Keeper(self.robot, folder) if folder is not None else None
@@ -121,7 +122,7 @@ class Trials:
         request = GraspRequest(ask.label, task.arm, task.place, leave=ask.leave)
         result: GraspOutcome | OpenArmError
         try:
-            result = self.link.run(run_task(self.machine, self.performer, request, self._tell))
+            result = self.link.run(carry_out(self.grasp_task(request)))
         except OpenArmError as error:
             result = error
         wall_s = time.monotonic() - began
@@ -133,23 +134,27 @@ class Trials:
         """Ask for two objects at once, of both arms."""
         robot, task = self.robot, self._task
         began = time.monotonic()
-        second = GraspMachine(self.machine.around)
-        steps: dict[int, list[Step]] = {id(self.machine): [], id(second): []}
+        steps: tuple[list[Step], list[Step]] = ([], [])
 
-        def tell(machine: GraspMachine) -> None:
-            self._tell(machine)
-            steps[id(machine)].append(self.steps[-1])
+        def report(status: Status) -> None:
+            self._report(status)
+            steps[status.request].append(self.steps[-1])
 
-        links: dict[Side, Link] = {arm: self.link.beside(self._config.limits.beside_wait) for arm in ARMS}
-        pair = PairRunner((self.machine, second), links, self.performer, tell)
+        robots: dict[Side, Link] = {arm: self.link.beside(self._config.limits.beside_wait) for arm in ARMS}
+        requests = (GraspRequest(task.labels[0]), GraspRequest(task.labels[1]))
+        pair = Pair(self.session, self.skills, robots, requests, report, carry_out)
         robot.pass_time(0.1)
         outcomes: Sequence[GraspOutcome]
         try:
-            outcomes = self.link.run(pair.run((GraspRequest(task.labels[0]), GraspRequest(task.labels[1])))).answers
+            outcomes = self.link.run(carry_out_pair(pair)).answers
         except OpenArmError as error:
             outcomes = [GraspOutcome(error.code, error.message, label) for label in task.labels]
         wall_s = 0.5 * (time.monotonic() - began)
-        return [self._trial(outcome, mine, wall_s) for outcome, mine in zip(outcomes, steps.values(), strict=True)]
+        return [self._trial(outcome, mine, wall_s) for outcome, mine in zip(outcomes, steps, strict=True)]
+
+    def grasp_task(self, request: GraspRequest) -> GraspTask:
+        """A request, to be carried out by a strategy."""
+        return GraspTask(self.session, self.skills, request, self._report)
 
     def _trial(self, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
         """What came of a request, judged."""
@@ -179,28 +184,27 @@ class Trials:
         )
 
     # --- while it runs
-    def _tell(self, machine: GraspMachine | None = None) -> None:
-        machine = machine or self.machine
+    def _report(self, status: Status) -> None:
         step = Step(
             self.robot.t_ns,
-            machine.state.value,
-            machine.previous.value,
-            machine.reason,
-            machine.attempt,
-            machine.label,
-            machine.arm,
+            status.state.value,
+            status.previous.value,
+            status.reason,
+            status.attempt,
+            status.label,
+            status.arm,
         )
         self.steps.append(step)
         if self._keep is not None:
-            self._keep.step(step.state, failed=bool(machine.memory and machine.memory.failure))
+            self._keep.step(step.state, failed=status.failed)
         fault = self._task.fault
         if fault is None:
             return
-        if self._faulty and fault.until_attempt and machine.attempt >= fault.until_attempt:
+        if self._faulty and fault.until_attempt and status.attempt >= fault.until_attempt:
             self._faulty = False
             self.robot.world_faults.clear()
             self.robot.camera_faults.set(())
-        elif machine.attempt == 1:
+        elif status.attempt == 1:
             self._begin_fault(step.state)
 
     def _begin_fault(self, state: str) -> None:

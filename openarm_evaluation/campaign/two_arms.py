@@ -20,7 +20,7 @@ from openarm_evaluation.campaign.tasks import Task
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.observation import Detection
 from openarm_grasp.planning.candidates import propose, target_box
-from openarm_grasp.planning.rehearsal import NO_WAY
+from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.strategy.effects import PlanGrasp
 from openarm_motion.planning.approach import plan_approach
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,6 +74,18 @@ _GRIP_CODES = {
 }
 
 
+class GripVerdict(NamedTuple):
+    """What the hand holds, and the reason with values and limits."""
+
+    grip: Grip
+    reason: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether it holds the object."""
+        return self.grip is Grip.HELD
+
+
 class Sight(Enum):
     """What the camera says of an object after its lift."""
 
@@ -81,6 +94,18 @@ class Sight(Enum):
     STILL_THERE = "still there"
     ASKEW = "held elsewhere than planned"
     BLIND = "no frame"
+
+
+class SightVerdict(NamedTuple):
+    """What the camera says of an object after its lift, and the reason."""
+
+    sight: Sight
+    reason: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the object has left its place."""
+        return self.sight in (Sight.RISEN, Sight.GONE)
 
 
 @dataclass(frozen=True)
@@ -97,18 +122,23 @@ class Verdict:
         return self.code is Code.OK
 
 
-def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> tuple[Grip, str]:
+@dataclass(frozen=True)
+class PlaceVerdict(Verdict):
+    """What the camera says of an object that was put down."""
+
+
+def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> GripVerdict:
     """Held, empty, moving, or the hand on top of the object.
 
     Args:
         e: What the gripper says.
         config: Thresholds.
         was_held: The object was held before: an empty hand has lost it.
-
-    Returns:
-        The judgement and its reason with values and limits.
     """
-    empty = Grip.LOST if was_held else Grip.EMPTY
+    return GripVerdict(*_grip(e, config, Grip.LOST if was_held else Grip.EMPTY))
+
+
+def _grip(e: Evidence, config: HeldConfig, empty: Grip) -> tuple[Grip, str]:
     gap, width = f"gap {e.gap * 1e3:.1f} mm", f"the object's {e.expected * 1e3:.1f} mm"
     if e.tcp_error > config.max_tcp_error:
         off, limit = e.tcp_error * 1e3, config.max_tcp_error * 1e3
@@ -137,7 +167,7 @@ def judge_sight(
     *,
     match_radius: float,
     others: Sequence[Detection] = (),
-) -> tuple[Sight, str]:
+) -> SightVerdict:
     """Whether the camera still sees the object at its old place, sees it higher, or not there any more.
 
     Args:
@@ -148,7 +178,7 @@ def judge_sight(
         others: What else stood there; those like the object are not taken for it.
     """
     if not frames:
-        return Sight.BLIND, "no camera frame after the lift"
+        return SightVerdict(Sight.BLIND, "no camera frame after the lift")
     twins = [d for d in others if d.label == before.label]
     same = [
         d
@@ -157,7 +187,7 @@ def judge_sight(
         if d.label == before.label and all(apart(d, twin) > match_radius for twin in twins)
     ]
     if not same:
-        return Sight.GONE, f"{before.label!r} has gone from its place"
+        return SightVerdict(Sight.GONE, f"{before.label!r} has gone from its place")
     # The top counts: a detector may take the visible part of a lifted object for a box that reaches down to the table.
     highest = max(same, key=lambda d: d.top)
     risen = highest.top - before.top
@@ -166,12 +196,16 @@ def judge_sight(
         off = sticks_out(highest, before)
         if off > config.askew:
             limit = f"expected at most {config.askew * 1e3:.0f} mm"
-            return Sight.ASKEW, f"{text}, {off * 1e3:.0f} mm out of where the hand should hold it, {limit}"
-        return Sight.RISEN, text
+            return SightVerdict(
+                Sight.ASKEW, f"{text}, {off * 1e3:.0f} mm out of where the hand should hold it, {limit}"
+            )
+        return SightVerdict(Sight.RISEN, text)
     distance = min(apart(d, before) for d in same)
     if distance <= match_radius:
-        return Sight.STILL_THERE, f"{before.label!r} still stands at its place ({distance * 1e3:.0f} mm from it)"
-    return Sight.GONE, f"{before.label!r} has left its place ({distance * 1e3:.0f} mm)"
+        return SightVerdict(
+            Sight.STILL_THERE, f"{before.label!r} still stands at its place ({distance * 1e3:.0f} mm from it)"
+        )
+    return SightVerdict(Sight.GONE, f"{before.label!r} has left its place ({distance * 1e3:.0f} mm)")
 
 
 def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) -> tuple[bool, str]:
@@ -194,14 +228,14 @@ def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) 
     return True, f"{before.label!r} still stands there"
 
 
-def judge_lift(grip: tuple[Grip, str], sight: tuple[Sight, str]) -> Verdict:
-    """A lift counts only when hand and camera agree."""
-    if grip[0] is not Grip.HELD:
-        return Verdict(grip[0].code, grip[1])
-    if sight[0] in (Sight.RISEN, Sight.GONE):
-        return Verdict(Code.OK, f"{grip[1]}; {sight[1]}")
-    code = Code.STALE_DATA if sight[0] is Sight.BLIND else Code.GRASP_MISSED
-    return Verdict(code, f"{grip[1]}, but {sight[1]}")
+def judge_lift(gripper: GripVerdict, camera: SightVerdict) -> Verdict:
+    """A lift counts only when gripper and camera agree."""
+    if not gripper.ok:
+        return Verdict(gripper.grip.code, gripper.reason)
+    if camera.ok:
+        return Verdict(Code.OK, f"{gripper.reason}; {camera.reason}")
+    code = Code.STALE_DATA if camera.sight is Sight.BLIND else Code.GRASP_MISSED
+    return Verdict(code, f"{gripper.reason}, but {camera.reason}")
 
 
 def judge_place(
@@ -211,7 +245,7 @@ def judge_place(
     tolerance: float,
     yaw: float | None = None,
     height: float | None = None,
-) -> Verdict:
+) -> PlaceVerdict:
     """Whether the camera sees the object at the place target after the arm has left.
 
     Args:
@@ -223,24 +257,24 @@ def judge_place(
         height: Of the object as it stood, m: one of another height lies on its side. None: it is not judged.
     """
     if not frames:
-        return Verdict(Code.STALE_DATA, "no camera frame after the place")
+        return PlaceVerdict(Code.STALE_DATA, "no camera frame after the place")
     same = next(
         (found for frame in reversed(frames) if (found := [d for d in frame.detections if d.label == label])), ()
     )
     if not same:
-        return Verdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
+        return PlaceVerdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
     nearest = min(same, key=lambda d: float(np.linalg.norm((d.p_base - p_target)[:2])))
     distance = float(np.linalg.norm((nearest.p_base - p_target)[:2]))
     text = f"{label!r} stands {distance * 1e3:.0f} mm from its target"
     if distance > tolerance:
-        return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
+        return PlaceVerdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
     top = nearest.top - float(p_target[2])
     if height is not None and abs(top - height) > UPRIGHT_WITHIN:
         was = f"it is {top * 1e3:.0f} mm high there and was {height * 1e3:.0f} mm"
-        return Verdict(Code.PLACE_FAILED, f"{label!r} has fallen over: {was}", final=True)
+        return PlaceVerdict(Code.PLACE_FAILED, f"{label!r} has fallen over: {was}", final=True)
     if yaw is not None and abs(float(nearest.size[0] - nearest.size[1])) > SQUARE_WITHIN:
         off = abs((nearest.yaw - yaw + np.pi / 2.0) % np.pi - np.pi / 2.0)
         text += f", turned {np.degrees(off):.0f}° from what was asked"
         if off > YAW_TOLERANCE:
-            return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {np.degrees(YAW_TOLERANCE):.0f}°")
-    return Verdict(Code.OK, text)
+            return PlaceVerdict(Code.PLACE_FAILED, f"{text}, expected at most {np.degrees(YAW_TOLERANCE):.0f}°")
+    return PlaceVerdict(Code.OK, text)

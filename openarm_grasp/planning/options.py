@@ -13,6 +13,9 @@ from openarm_grasp.evidence.evidence import Verdict
 from openarm_grasp.evidence.observation import Detection
 from openarm_grasp.planning.candidates import GraspCandidate, wide_edges
 
+#: A plan that fails with one of these says that it cannot be done; with any other it was not found out.
+NO_WAY = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN, Code.TOO_WIDE)
+
 
 class NoWayError(OpenArmError):
     """The planner refused every way that it was offered.

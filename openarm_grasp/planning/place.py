@@ -18,7 +18,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.evidence import SQUARE_WITHIN
-from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.evidence.observation import Detection, Frame
 from openarm_grasp.planning.candidates import UP, GraspCandidate, hold_of
 
 #: Spots nearer to each other than this are one, m.
@@ -255,3 +255,21 @@ def check_position(
 def grid(low: float, high: float, step: float) -> Array:
     """Numbers from one end to the other, about a step apart."""
     return np.linspace(low, high, max(2, round((high - low) / step) + 1))
+
+
+def placing_error(label: str, target: PlaceTarget, frame: Frame) -> tuple[Array, float] | None:
+    """How far the camera sees a placed object from where the hand let it go, along the opening axis of the hand.
+
+    Args:
+        label: Of the object.
+        target: Where it was let go.
+        frame: Observed since.
+
+    Returns:
+        Unit direction (2,), base frame, and the distance along it, m; None when the object is not in the frame.
+    """
+    off = [(d.p_base - target.position)[:2] for d in frame.detections if d.label == label and d.measured]
+    if not off:
+        return None
+    axis = target.T_base_tcp[:2, 1] / np.linalg.norm(target.T_base_tcp[:2, 1])
+    return axis, float(axis @ min(off, key=lambda v: float(np.linalg.norm(v))))

@@ -27,17 +27,10 @@ from openarm_grasp.evidence.observation import Detection, Frame
 from openarm_grasp.planning.candidates import Box, GraspCandidate
 from openarm_grasp.planning.options import NoWayError, Option
 from openarm_grasp.planning.place import PlaceTarget
-from openarm_grasp.strategy.effects import (
-    GoHome,
-    GraspOutcome,
-    GraspRequest,
-    MoveLinear,
-    PlanGrasp,
-    Planned,
-    PlanPlace,
-)
-from openarm_grasp.strategy.machine import GraspMachine
-from openarm_grasp.strategy.pair import PairOutcome
+from openarm_grasp.strategies.pair import PairOutcome
+from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
+from openarm_grasp.strategies.task import Status
+from openarm_grasp.strategy.effects import GoHome, MoveLinear, PlanGrasp, Planned, PlanPlace
 
 _CHOSEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 _REFUSED = ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.35)
@@ -136,16 +129,15 @@ def pair_result(outcome: PairOutcome) -> PickTwo.Result:
     return result
 
 
-def status_msg(machine: GraspMachine, t_ns: int, *, again: bool = False) -> GraspStatus:
-    """Where the grasp stands; when it is said again, it came from where it is."""
-    ended = machine.outcome
+def status_msg(status: Status, t_ns: int) -> GraspStatus:
+    """A state that was entered."""
     message = GraspStatus(
-        state=machine.state.value,
-        previous_state=machine.state.value if again else machine.previous.value,
-        reason=machine.reason,
-        attempt=machine.attempt,
-        label=ended.label if ended else machine.label,
-        arm=ended.arm if ended else machine.arm,
+        state=status.state.value,
+        previous_state=status.previous.value,
+        reason=status.reason,
+        attempt=status.attempt,
+        label=status.label,
+        arm=status.arm,
     )
     message.header.stamp = ns_to_stamp(t_ns)
     message.header.frame_id = BASE_FRAME

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from openarm_interfaces.action import Pick, PickTwo
@@ -18,16 +19,16 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.context import GraspContext
 from openarm_grasp.ros import convert
-from openarm_grasp.ros.request_executor import RequestExecutor
-from openarm_grasp.strategy.effects import GraspOutcome, GraspRequest
-from openarm_grasp.strategy.machine import GraspMachine
-from openarm_grasp.strategy.memory import Surroundings
-from openarm_grasp.strategy.pair import PairOutcome
-from openarm_grasp.strategy.states import State
+from openarm_grasp.ros.request_server import RequestServer
+from openarm_grasp.strategies.pair import PairOutcome
+from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
+from openarm_grasp.strategies.states import State
+from openarm_grasp.strategies.task import Status
 
 AnswerT = TypeVar("AnswerT", GraspOutcome, PairOutcome)
-OnStatus = Callable[[GraspMachine, GraspStatus], None]
+OnStatus = Callable[[int, GraspStatus], None]
 
 #: Latched, and deep enough that two transitions in a row both arrive.
 _QOS_STATUS = QoSProfile(depth=20, reliability=QOS_LATCHED.reliability, durability=QOS_LATCHED.durability)
@@ -38,8 +39,9 @@ class GraspNode(BaseNode[GraspConfig]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("grasp", GraspConfig, **kwargs)
-        around = Surroundings.of(self.config, load_scene(self.config.scene).table, self.description)
-        self._requests = RequestExecutor(self, around)
+        context = GraspContext.of(self.config, load_scene(self.config.scene).table, self.description)
+        self._requests = RequestServer(self, context)
+        self._newest: dict[int, Status] = {}
         self._goal: ServerGoalHandle | None = None
         self._status_topic = self.create_publisher(GraspStatus, "/grasp/status", _QOS_STATUS)
         self._marker_topic = self.create_publisher(MarkerArray, "/grasp/markers", QOS_LATCHED)
@@ -48,7 +50,7 @@ class GraspNode(BaseNode[GraspConfig]):
             self._serve(Pick, "/grasp/pick", self._on_pick),
             self._serve(PickTwo, "/grasp/pick_two", self._on_pick_two),
         ]
-        self._status_topic.publish(convert.status_msg(self._requests.machines[0], 0))
+        self._status_topic.publish(convert.status_msg(Status(State.IDLE, State.IDLE, "waiting for a request"), 0))
 
     def close(self) -> None:
         """Stop listening and take the actions down."""
@@ -63,7 +65,7 @@ class GraspNode(BaseNode[GraspConfig]):
         return response
 
     async def _on_pick(self, goal: ServerGoalHandle) -> Pick.Result:
-        def feedback(_: GraspMachine, status: GraspStatus) -> None:
+        def feedback(_: int, status: GraspStatus) -> None:
             goal.publish_feedback(Pick.Feedback(status=status))
 
         request, result = convert.request_from_msg(goal.request), Pick.Result()
@@ -71,8 +73,7 @@ class GraspNode(BaseNode[GraspConfig]):
         return result
 
     async def _on_pick_two(self, goal: ServerGoalHandle) -> PickTwo.Result:
-        def feedback(machine: GraspMachine, status: GraspStatus) -> None:
-            which = self._requests.machines.index(machine)
+        def feedback(which: int, status: GraspStatus) -> None:
             goal.publish_feedback(PickTwo.Feedback(request=which, status=status))
 
         requests = convert.requests_from_msg(goal.request)
@@ -106,7 +107,7 @@ class GraspNode(BaseNode[GraspConfig]):
     # --- requests
     async def _one(self, request: GraspRequest, on_status: OnStatus | None = None) -> GraspOutcome:
         try:
-            outcome = await self._requests.one(request, lambda machine: self._tell(machine, on_status))
+            outcome = await self._requests.one(request, lambda status: self._publish(status, on_status))
         except OpenArmError as error:
             self._refused(f"grasp of {request.label!r}", error)
             return GraspOutcome(error.code, error.message, request.label)
@@ -115,7 +116,7 @@ class GraspNode(BaseNode[GraspConfig]):
 
     async def _two(self, requests: tuple[GraspRequest, GraspRequest], on_status: OnStatus) -> PairOutcome:
         try:
-            outcome = await self._requests.two(requests, lambda machine: self._tell(machine, on_status))
+            outcome = await self._requests.two(requests, lambda status: self._publish(status, on_status))
         except OpenArmError as error:
             self._refused(f"grasp of {requests[0].label!r} and {requests[1].label!r}", error)
             return PairOutcome((), error.code, error.message)
@@ -125,47 +126,43 @@ class GraspNode(BaseNode[GraspConfig]):
 
     def _refused(self, what: str, error: OpenArmError) -> None:
         self.get_logger().warning(f"{what} refused: {error}")
-        if error.code is Code.BUSY:
-            return  # what runs tells of itself
-        machine = self._requests.machines[0]
-        self.diagnose(error.code is not Code.NOT_READY, f"{error.code}: {error.message}", state=machine.state.value)
+        if error.code is not Code.BUSY:  # what runs publishes its own state
+            self._diagnose(error.code is not Code.NOT_READY, f"{error.code}: {error.message}")
 
-    # --- telling
+    # --- publishing
+    def _diagnose(self, ok: bool, text: str, **values: str) -> None:
+        self.diagnose(ok, text, state=self._newest[0].state.value if 0 in self._newest else State.IDLE.value, **values)
+
     def _report(self, outcome: GraspOutcome) -> None:
-        """Say how a request ended."""
+        """Publish how a request ended."""
         report = f"{outcome.code}: {outcome.message} (arm {outcome.arm or '-'}, attempts {outcome.attempts})"
         self.get_logger().info(report) if outcome.success else self.get_logger().warning(report)
-        machine = self._requests.machines[0]
-        drift = machine.drift.of(self.config.camera)
+        drift = self._requests.session.drift.of(self.config.camera)
         if drift.alarm:
             self.get_logger().error(drift.message)
-        text = f"{drift.message}; {report}" if drift.alarm else report
-        self.diagnose(not drift.alarm, text, state=machine.state.value, drift=drift.message)
+        self._diagnose(not drift.alarm, f"{drift.message}; {report}" if drift.alarm else report, drift=drift.message)
 
-    def _tell(self, machine: GraspMachine, on_status: OnStatus | None) -> None:
-        """Say where a machine stands now."""
+    def _publish(self, status: Status, on_status: OnStatus | None) -> None:
+        """Publish a state that was entered."""
         t_ns = self._requests.now_ns
-        status = convert.status_msg(machine, t_ns)
-        self._status_topic.publish(status)
+        self._newest[status.request] = status
+        message = convert.status_msg(status, t_ns)
+        self._status_topic.publish(message)
         if on_status is not None:
-            on_status(machine, status)
-        if status.state == State.IDLE.value:
-            self._tell_of_others(machine, t_ns)
-        change = f"{status.previous_state} -> {status.state} at {t_ns * 1e-9:.2f} s, attempt {status.attempt}"
+            on_status(status.request, message)
+        if status.state is State.IDLE:
+            # The newest status is not that of one which has ended while the other is at work.
+            for other in self._newest.values():
+                if other.request != status.request and other.state is not State.IDLE:
+                    self._status_topic.publish(convert.status_msg(replace(other, previous=other.state), t_ns))
+        change = f"{message.previous_state} -> {message.state} at {t_ns * 1e-9:.2f} s, attempt {status.attempt}"
         about = f"{status.label} " if status.label else ""
         self.get_logger().info(f"{about}{change}: {status.reason}")
-        self.diagnose(True, f"{status.state}: {status.reason}", state=status.state, label=status.label, arm=status.arm)
-        memory = machine.memory
-        if memory is not None and machine.state in (State.PLAN, State.MOVE_TO_PREGRASP):
-            chosen = memory.candidate.id if memory.candidate else ""
-            refused = {o.id for o in memory.options.values() if o.arm == memory.arm and o.code not in ("", Code.OK)}
-            self._marker_topic.publish(convert.candidate_markers(memory.offered, chosen, refused, t_ns))
-
-    def _tell_of_others(self, idle: GraspMachine, t_ns: int) -> None:
-        """The newest status is not that of one which has ended while the other is at work."""
-        for machine in self._requests.machines:
-            if machine is not idle and machine.memory is not None:
-                self._status_topic.publish(convert.status_msg(machine, t_ns, again=True))
+        text = f"{message.state}: {status.reason}"
+        self.diagnose(True, text, state=message.state, label=status.label, arm=status.arm)
+        if status.candidates:
+            markers = convert.candidate_markers(status.candidates, status.chosen, status.refused, t_ns)
+            self._marker_topic.publish(markers)
 
 
 def main() -> None:

@@ -21,7 +21,8 @@ from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.sets import SETS, make_task
 from openarm_evaluation.campaign.tasks import FaultPlan
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.strategy import performer
+from openarm_grasp.robot import skills
+from openarm_grasp.strategies import pick_and_place
 from openarm_octomap.config import GridConfig
 from openarm_octomap.grid import OccupancyGrid
 
@@ -191,7 +192,7 @@ def test_what_cannot_be_held_is_refused_and_everything_of_it_kept(tmp_path) -> N
 @pytest.mark.requirement("P-16")
 def test_nothing_that_decides_reads_ground_truth() -> None:
 
-    for module in (performer, link):
+    for module in (skills, pick_and_place, link):
         text = Path(module.__file__ or "").read_text()
         for word in ("tracks", ".objects()", "body_pose", "qpos"):
             assert word not in text, f"{module.__name__} reads {word}"

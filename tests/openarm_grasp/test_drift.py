@@ -66,7 +66,7 @@ def test_grasps_with_a_mount_8_mm_off_raise_the_alarm() -> None:
     trials = Trials(task, SimulatedSenses(depth_noise=False), GraspConfig(), mounts={"overhead": believed})
     row = trials.run()
     assert row["placed"], row["message"]
-    drift = trials.machine.drift.of("overhead")
+    drift = trials.session.drift.of("overhead")
     assert drift.grasps == 6
     assert drift.alarm, drift.message
     assert drift.bias == pytest.approx((0.006, 0.0053), abs=0.003)

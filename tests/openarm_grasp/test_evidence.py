@@ -14,7 +14,9 @@ from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.evidence import (
     Evidence,
     Grip,
+    GripVerdict,
     Sight,
+    SightVerdict,
     judge_grip,
     judge_lift,
     judge_place,
@@ -113,7 +115,7 @@ def test_sight_truth_table(after, expected):
 @pytest.mark.parametrize("grip", list(Grip))
 @pytest.mark.requirement("A-71", "P-08")
 def test_a_lift_needs_hand_and_camera(grip, sight):
-    verdict = judge_lift((grip, "hand"), (sight, "camera"))
+    verdict = judge_lift(GripVerdict(grip, "hand"), SightVerdict(sight, "camera"))
     assert verdict.ok == (grip is Grip.HELD and sight in (Sight.RISEN, Sight.GONE))
     if grip is not Grip.HELD:
         assert verdict.code is grip.code

@@ -11,32 +11,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-from openarm_common.errors import Code
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, SceneObject
 from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.evidence import Verdict
-from openarm_grasp.planning.options import Option
-from openarm_grasp.strategy import effects as fx
-from openarm_grasp.strategy.performer import run_request
+from openarm_grasp.planning.options import NoWayError, Option
+from openarm_grasp.strategies.registry import carry_out
+from openarm_grasp.strategies.request import GraspRequest
+from openarm_grasp.strategy.effects import Planned
 
 
 @pytest.fixture
 def asked(worlds: Callable[..., Any], box: Callable[..., Any]) -> Callable[..., tuple[Option, ...]]:
     """Asks a scripted planner for a dry run; it answers each plan with what comes next."""
 
-    def ask(*answers: fx.Planned | fx.Outcome, **changes: Any) -> tuple[Option, ...]:
+    def ask(*answers: Planned | OpenArmError, **changes: Any) -> tuple[Option, ...]:
         world = worlds(replace(box("red", 0.26, -0.2), **changes))
-        machine, left = world.machine, list(answers)
-        recipe = machine.step(fx.GraspRequest("red", arm="right", dry_run=True), world.t_ns)
-        while recipe:
-            plans = isinstance(recipe[0], fx.PlanGrasp | fx.PlanPlace)
-            answer = left.pop(0) if plans and left else world.perform(recipe)
-            outcome = fx.Outcome(results=(answer,)) if isinstance(answer, fx.Planned) else answer
-            recipe = machine.step(outcome, world.t_ns)
-        return machine.outcome.options
+        world.plans = list(answers)
+        return world.grasp("red", arm="right", dry_run=True).options
 
     return ask
 
@@ -45,14 +40,14 @@ def by_id(options: tuple[Option, ...]) -> dict[str, Option]:
     return {option.id: option for option in options}
 
 
-def no_way(code: Code, **refusals: str) -> fx.Outcome:
+def no_way(code: Code, **refusals: str) -> NoWayError:
     why = {id.replace("_", "/"): Verdict(code, reason) for id, reason in refusals.items()}
-    return fx.Outcome(code, "no way", refusals=why)
+    return NoWayError(code, "no way", why)
 
 
 def test_the_answer_has_every_way_with_its_score_and_its_fate(asked) -> None:
     refusals = {"red/x-/tilt0": Verdict(Code.IN_COLLISION, "red/x-/tilt0: on the approach it meets 'blue'")}
-    options = asked(fx.Planned(0, "", "", "", 0.1, refusals, (0.3, 0.2, *(nan,) * 26)))
+    options = asked(Planned(0, "", "", "", 0.1, refusals, (0.3, 0.2, *(nan,) * 26)))
     assert len(options) == 28
     assert [o.score for o in options] == sorted((o.score for o in options), reverse=True)
     assert all(o.score == pytest.approx(sum(o.parts.values())) for o in options)
@@ -80,7 +75,7 @@ def test_an_edge_that_is_too_wide_is_told(asked) -> None:
 
 
 def test_what_could_be_grasped_but_not_placed_says_so_and_those_that_share_its_fate(asked) -> None:
-    found = by_id(asked(fx.Planned(0, "", "", ""), no_way(Code.UNREACHABLE)))
+    found = by_id(asked(Planned(0, "", "", ""), no_way(Code.UNREACHABLE)))
     assert found["red/x+/tilt0"].code is Code.UNREACHABLE
     assert found["red/x+/tilt0"].message == "it could grasp, but not place: no way"
     assert found["red/y-/tilt0"].message == "it would stand at the place as red/x+/tilt0, and not do"
@@ -95,9 +90,8 @@ def test_the_planner_says_what_became_of_each_and_how_near_to_a_limit() -> None:
     config = GraspConfig()
     trials = Trials(Task("nominal", 1, scene, ()), SimulatedSenses(depth_noise=False), config)
     trials.robot.pass_time(0.3)
-    request = fx.GraspRequest("red", arm="right", dry_run=True)
-    work = run_request(trials.machine, trials.performer, request, lambda: None)
-    outcome = trials.link.run(work)
+    request = GraspRequest("red", arm="right", dry_run=True)
+    outcome = trials.link.run(carry_out(trials.grasp_task(request)))
     assert outcome.success, outcome.message
     (chosen,) = (o for o in outcome.options if o.code is Code.OK)
     assert f"grasp {chosen.id} with the right arm" in outcome.message

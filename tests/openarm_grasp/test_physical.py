@@ -14,9 +14,8 @@ from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks import Task, endurance
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.strategy import effects as fx
-from openarm_grasp.strategy.effects import GraspOutcome, GraspRequest
-from openarm_grasp.strategy.performer import run_request
+from openarm_grasp.strategies.pick_and_place import pick_and_place
+from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
 
 BOX = SceneObject(name="blue_box", shape="box", size=(0.045, 0.06, 0.07), color="blue", position=(0.26, 0.22), yaw=0.4)
 
@@ -28,7 +27,8 @@ def trials(*objects: SceneObject) -> Trials:
 
 
 def ask(run: Trials, label: str, **kwargs) -> GraspOutcome:
-    return run.link.run(run_request(run.machine, run.performer, GraspRequest(label, **kwargs), run._tell))
+    task = run.grasp_task(GraspRequest(label, **kwargs))
+    return run.link.run(pick_and_place(task, task.request))
 
 
 @dataclass
@@ -54,7 +54,7 @@ def watched() -> Watched:
     def watch() -> None:
         tick()
         q = dict(zip(robot.world.joint_names, robot.world.read_joints().position.tolist(), strict=True))
-        seen.states.append(run.machine.state.value)
+        seen.states.append(run.steps[-1].state if run.steps else "IDLE")
         seen.p_object.append(robot.world.objects()[0].T_world_object[:3, 3].copy())
         seen.p_tcp.append(robot.description.link_pose(link, q)[:3, 3])
         seen.gap.append(2.0 * q[robot.description.finger_joint("left")])
@@ -99,7 +99,7 @@ def test_a_gap_that_changes_on_the_way_is_a_slip_and_stops_the_carry() -> None:
     """The fingers creep together while the arm follows its path; 2 mm are let pass, 4 mm are not."""
     run = trials(BOX)
     assert ask(run, "blue", phase="pick").success
-    hand, gap = run.performer._hands["left"], run.performer.gap("left")
+    hand, gap = run.skills._hands["left"], run.skills.aperture("left")
 
     def carry(creep: float) -> None:
         async def follow(arm, trajectory, what, guard) -> None:
@@ -108,7 +108,7 @@ def test_a_gap_that_changes_on_the_way_is_a_slip_and_stops_the_carry() -> None:
 
         hand.gap = lambda: gap  # type: ignore[method-assign]
         run.link.follow = follow  # type: ignore[method-assign]
-        run.link.run(run.performer._follow(fx.Execute("left", "carry", "carry", carrying=True)))
+        run.link.run(run.skills.follow("left", "carry", "carry", carrying=True))
 
     carry(0.002)
     with pytest.raises(OpenArmError, match="the object slips: the gap went from") as error:

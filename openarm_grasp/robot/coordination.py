@@ -31,7 +31,7 @@ _GONE_ON = 0.1
 
 
 @dataclass
-class Company:
+class ArmCoordination:
     """What both links share.
 
     Attributes:
@@ -45,19 +45,19 @@ class Company:
     done: set[str] = field(default_factory=set[str])
 
 
-class BesideLink:
+class CoordinatedRobot:
     """Implements `Link` for one arm beside the other.
 
     Args:
         arm: Whose link.
         link: To the robot, for this arm alone.
-        company: Shared with the other arm's link.
+        coordination: Shared with the other arm's link.
         config: Parameters.
     """
 
-    def __init__(self, arm: Side, link: Link, company: Company, config: GraspConfig) -> None:
+    def __init__(self, arm: Side, link: Link, coordination: ArmCoordination, config: GraspConfig) -> None:
         self.arm: Side = arm
-        self._link, self._company, self._config = link, company, config
+        self._link, self._coordination, self._config = link, coordination, config
         self._other: Side = "right" if arm == "left" else "left"
         self._homes = {a: link.description.group_state(f"{a}_arm", config.home_state) for a in (arm, self._other)}
         self.deadline_ns = 0
@@ -117,15 +117,15 @@ class BesideLink:
         An arm that looks from home (at what it is to grasp, or has placed) waits until the other one hides nothing any
         more; one that is at work does not.
         """
-        company, limit = self._company, self._config.limits.beside_timeout
+        coordination, limit = self._coordination, self._config.limits.beside_timeout
         if not near and self._is_home(self.arm):
             await self.until(self._other_is_away, limit, f"looking: the {self._other} arm is in the view")
-        await self.until(lambda: company.looking in ("", self.arm), limit, "looking: the other arm's look")
-        company.looking = self.arm
+        await self.until(lambda: coordination.looking in ("", self.arm), limit, "looking: the other arm's look")
+        coordination.looking = self.arm
         try:
             return await self._link.observe(count, near=near)
         finally:
-            company.looking = ""
+            coordination.looking = ""
             self._link.stop_looking()
 
     def stop_looking(self) -> None:
@@ -172,20 +172,20 @@ class BesideLink:
 
     async def _gone_on(self, what: str) -> bool:
         """Wait until the other arm has gone on; false when it waits for this one, and this one is to give way."""
-        company, before = self._company, self._pose(self._other)
+        coordination, before = self._coordination, self._pose(self._other)
         gives_way = ARMS.index(self.arm) > 0
 
         def over() -> bool:
             moved = float(np.max(np.abs(self._pose(self._other) - before))) > _GONE_ON
-            return moved or self._other_is_away() or (gives_way and self._other in company.waiting)
+            return moved or self._other_is_away() or (gives_way and self._other in coordination.waiting)
 
-        company.waiting.add(self.arm)
+        coordination.waiting.add(self.arm)
         try:
             text = f"{what}: the {self._other} arm stands in the way"
             await self.until(over, self._config.limits.beside_timeout, text)
         finally:
-            company.waiting.discard(self.arm)
-        return not (gives_way and self._other in company.waiting)
+            coordination.waiting.discard(self.arm)
+        return not (gives_way and self._other in coordination.waiting)
 
     def _pose(self, arm: Side) -> Array:
         _, q = self.states.latest()
@@ -196,4 +196,4 @@ class BesideLink:
         return float(np.max(off)) <= self._config.home_tolerance
 
     def _other_is_away(self) -> bool:
-        return self._other in self._company.done or self._is_home(self._other)
+        return self._other in self._coordination.done or self._is_home(self._other)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plans of what is not done yet: whether an arm could pick an object that stood somewhere, and put it somewhere else.
+"""Plan what is not carried out yet: could an arm pick an object that stood somewhere, and put it somewhere else?
 
-Nothing moves. Ways with several parts are found so before their first part begins. Base frame, m, rad.
+Nothing moves. Strategies with several parts are planned to their end so before their first part begins. Base frame, m,
+rad.
 """
 
 from __future__ import annotations
@@ -14,15 +15,13 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
+from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.observation import Detection
 from openarm_grasp.planning.candidates import GraspCandidate, held_box, obstacle_boxes, propose, target_box
+from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import PlaceTarget, other_grasps, place_targets
+from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategy.effects import PlanGrasp, Planned, PlanPlace
-from openarm_grasp.strategy.link import Link
-from openarm_grasp.strategy.memory import Surroundings
-
-#: A plan that fails with one of these says that it cannot be done; with any other it was not found out.
-NO_WAY = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN, Code.TOO_WIDE)
 
 
 @dataclass(frozen=True)
@@ -33,17 +32,16 @@ class Pick:
     plan: Planned
 
 
-class Rehearsal:
-    """Asks the planner.
+class FeasibilityCheck:
+    """Ask the planner.
 
     Args:
-        link: To the planner.
-        around: Parameters and where the arms stand.
+        robot: Whose planner.
+        context: Parameters and where the arms stand.
     """
 
-    def __init__(self, link: Link, around: Surroundings) -> None:
-        self._link = link
-        self._around = around
+    def __init__(self, robot: Skills, context: GraspContext) -> None:
+        self._robot, self._context = robot, context
 
     async def pick(
         self,
@@ -63,19 +61,18 @@ class Rehearsal:
             now: The object where it stands until then, when that is elsewhere.
 
         Raises:
-            OpenArmError: One of `NO_WAY`; what the link raises.
+            OpenArmError: One of `NO_WAY`; what the robot raises.
         """
-        config = self._around.config
+        config = self._context.config
         offered = self._offered(arm, target, others) if offered is None else tuple(offered)
-        self._link.check()
         gone = () if now is None else (target_box(now, config),)
         effect = PlanGrasp(arm, offered, obstacle_boxes(others, config), target_box(target, config), gone)
-        plan = await self._link.plan(effect)
+        plan = await self._robot.plan(effect)
         return Pick(offered[plan.chosen], plan)
 
     def _offered(self, arm: str, target: Detection, others: Sequence[Detection]) -> tuple[GraspCandidate, ...]:
-        shoulder = self._around.shoulders.get(arm, (0.0, 0.0))
-        return propose(target, self._around.config, shoulder_xy=shoulder, others=others)
+        shoulder = self._context.shoulders.get(arm, (0.0, 0.0))
+        return propose(target, self._context.config, shoulder_xy=shoulder, others=others)
 
     async def place(
         self, arm: str, pick: Pick, target: Detection, others: Sequence[Detection], ways: Sequence[PlaceTarget]
@@ -85,12 +82,11 @@ class Rehearsal:
         Raises:
             OpenArmError: As `pick`.
         """
-        config = self._around.config
-        self._link.check()
+        config = self._context.config
         held = held_box(target, pick.candidate, config)
         stood = (target_box(target, config),)
         effect = PlanPlace(arm, tuple(ways), obstacle_boxes(others, config), held, pick.plan.retreat, stood)
-        return ways[(await self._link.plan(effect)).chosen]
+        return ways[(await self._robot.plan(effect)).chosen]
 
     async def pick_and_place(
         self,
@@ -109,7 +105,7 @@ class Rehearsal:
             target: The object.
             others: What else stands on the table.
             spots: (2,) footprint centres, best first.
-            yaw: Of the object there; None: any.
+            yaw: Of the object there; None: unconstrained.
             used: Ways to put it down that are of no use.
 
         Raises:
@@ -124,7 +120,7 @@ class Rehearsal:
                 if refused is None or error.code not in NO_WAY:
                     raise
                 raise refused from error
-            offered = place_targets(target, pick.candidate, spots, self._around.config, yaw=yaw)
+            offered = place_targets(target, pick.candidate, spots, self._context.config, yaw=yaw)
             ways = [way for way in offered if not any(_same(way, other, any_turn=target.round) for other in used)]
             try:
                 if not ways:

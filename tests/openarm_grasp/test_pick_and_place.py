@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state machine against a scripted world: what it does when all goes well, what it sees, how it plans."""
+"""Pick and place with a scripted robot: what it does when all goes well, what it sees, how it plans."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code
-from openarm_grasp.strategy import effects as fx
-from openarm_grasp.strategy.states import State
+from openarm_grasp.strategies.states import State
+from openarm_grasp.strategy.effects import PlanGrasp, PlanPlace
+from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Observe, ToBase, Wait
 
 
 # --- success
@@ -27,21 +28,23 @@ def test_a_grasp_goes_through_all_states_in_order(world):
 
 @pytest.mark.requirement("B-51")
 def test_the_hand_opens_on_the_way_to_the_pregrasp(world):
-    machine_step, seen = world.machine.step, []
-    world.machine.step = lambda event, t: seen.append(machine_step(event, t)) or seen[-1]
+    real, together = world.follow_and_grip, []
+
+    async def follow_and_grip(arm, trajectory, what, **fingers):
+        together.append((trajectory, fingers["position"]))
+        await real(arm, trajectory, what, **fingers)
+
+    world.follow_and_grip = follow_and_grip
     world.grasp()
-    together = next(e for recipe in seen for e in recipe if isinstance(e, fx.Together))
-    assert [type(e) for e in together.effects] == [fx.MoveGripper, fx.Execute]
-    assert together.effects[0].position == 0.044
-    assert together.effects[1].trajectory == "transfer"
+    assert together == [("transfer", 0.044)]
 
 
 @pytest.mark.requirement("B-52", "B-53", "B-54")
 def test_pause_close_wait_lift(world):
     world.grasp()
     (close,) = world.times(world.grips(opening=False))
-    (arrive,) = world.times(world.executes("approach"))
-    (lift,) = world.times(world.executes("lift"))
+    (arrive,) = world.times(world.follows_path("approach"))
+    (lift,) = world.times(world.follows_path("lift"))
     assert close - (arrive + 1.0) == pytest.approx(0.5)  # the motion takes 1 s
     assert lift - (close + 0.6) == pytest.approx(0.2)  # the fingers take 0.6 s
 
@@ -50,13 +53,13 @@ def test_pause_close_wait_lift(world):
 def test_timing_is_a_parameter(worlds, box):
     world = worlds(box("red", 0.26, -0.2), timing={"pause_at_grasp": 1.5, "after_close": 0.7})
     world.grasp()
-    assert [e.duration for e in world.done(fx.Wait)][:2] == [1.5, 0.7]
+    assert [e.duration for e in world.done(Wait)][:2] == [1.5, 0.7]
 
 
 @pytest.mark.requirement("B-71")
 def test_the_hand_opens_only_before_the_grasp_and_at_the_place(world):
     world.grasp()
-    gripper = [(e.what, e.position) for e in world.done(fx.MoveGripper)]
+    gripper = [(e.what, e.position) for e in world.done(Grip)]
     assert gripper == [("open", 0.044), ("close", 0.0), ("release", 0.044)]
 
 
@@ -65,7 +68,7 @@ def test_a_moved_object_is_grasped_where_it_is(worlds, box):
     for x, y in ((0.2, -0.1), (0.3, -0.35), (0.22, 0.31)):
         world = worlds(box("red", x, y))
         assert world.grasp().success
-        (plan,) = world.done(fx.PlanGrasp)
+        (plan,) = world.done(PlanGrasp)
         assert plan.candidates[0].T_base_tcp[:2, 3] == pytest.approx((x, y))
 
 
@@ -73,8 +76,7 @@ def test_a_moved_object_is_grasped_where_it_is(worlds, box):
 def test_twenty_cycles_unattended(world):
     for _ in range(20):
         assert world.grasp().success
-        assert world.machine.state is State.IDLE
-    homes = [e.arms for e in world.done(fx.GoHome)]
+    homes = [e.arms for e in world.done(GoHome)]
     assert homes.count(("right",)) == 20
 
 
@@ -93,7 +95,7 @@ def test_without_a_label_the_retry_keeps_to_the_same_object(worlds, box):
 
 def test_others_are_obstacles_and_the_target_may_be_touched(world):
     world.grasp()
-    plan = world.done(fx.PlanGrasp)[0]
+    plan = world.done(PlanGrasp)[0]
     assert [b.id for b in plan.obstacles] == ["detected/blue_0"]
     assert plan.target.id == "target/red"
 
@@ -103,8 +105,8 @@ def test_dry_run_plans_both_and_moves_nothing(world):
     assert outcome.success
     assert outcome.attempts == 0
     assert "can be done" in outcome.message
-    assert not world.done(fx.Execute) + world.done(fx.MoveGripper) + world.done(fx.GoHome) + world.done(fx.MoveLinear)
-    (place,) = world.done(fx.PlanPlace)
+    assert not world.done(Follow) + world.done(Grip) + world.done(GoHome) + world.done(MoveLinear)
+    (place,) = world.done(PlanPlace)
     assert place.after == "lift"
     assert [b.id for b in place.gone] == ["target/red"], "the map still shows it where it stands"
 
@@ -127,11 +129,11 @@ def test_an_empty_table_is_named(worlds):
 def test_an_object_that_comes_into_view_is_waited_for(worlds, box):
     world = worlds(box("blue", 0.26, 0.2))
 
-    def arrive(effect):
-        if world.machine.state is State.IDLE:
+    def arrive(status):
+        if status.state is State.IDLE:
             world.objects["red"] = box("red", 0.26, -0.2)
 
-    world.faults.append(arrive)
+    world.on_report = arrive
     assert world.grasp().success
 
 
@@ -141,22 +143,22 @@ def test_a_stale_detection_is_not_acted_on(world):
     outcome = world.grasp()
     assert outcome.code is Code.STALE_DATA
     assert "0.60 s old" in outcome.message
-    assert not world.done(fx.PlanGrasp)
+    assert not world.done(PlanGrasp)
 
 
 def test_no_frames_end_the_grasp_at_once(world):
-    world.fail(lambda e: isinstance(e, fx.Observe), Code.STALE_DATA)
+    world.fail(lambda e: isinstance(e, Observe), Code.STALE_DATA)
     outcome = world.grasp()
     assert outcome.code is Code.STALE_DATA
-    assert len(world.done(fx.Observe)) == 1
+    assert len(world.done(Observe)) == 1
 
 
 @pytest.mark.requirement("B-33")
 def test_no_transform_means_no_motion(world):
-    world.fail(lambda e: isinstance(e, fx.ToBase), Code.NO_TRANSFORM)
+    world.fail(lambda e: isinstance(e, ToBase), Code.NO_TRANSFORM)
     outcome = world.grasp()
     assert outcome.code is Code.NO_TRANSFORM
-    assert not world.done(fx.Execute)
+    assert not world.done(Follow)
 
 
 def test_too_wide_is_refused_with_width_and_limit(worlds, box):
@@ -169,7 +171,7 @@ def test_too_wide_is_refused_with_width_and_limit(worlds, box):
 # --- planning
 @pytest.mark.requirement("B-58")
 def test_a_failed_plan_looks_again(world):
-    world.fail(lambda e: isinstance(e, fx.PlanGrasp), Code.NO_PLAN, times=1)
+    world.fail(lambda e: isinstance(e, PlanGrasp), Code.NO_PLAN, times=1)
     outcome = world.grasp()
     assert outcome.success
     assert world.states.count(State.PLAN) == 2
@@ -177,28 +179,28 @@ def test_a_failed_plan_looks_again(world):
 
 
 def test_out_of_reach_names_the_reason_and_the_nearest_arm(world):
-    world.fail(lambda e: isinstance(e, fx.PlanGrasp), Code.UNREACHABLE)
+    world.fail(lambda e: isinstance(e, PlanGrasp), Code.UNREACHABLE)
     outcome = world.grasp()
     assert outcome.code is Code.UNREACHABLE
     assert "right arm gets within 200 mm" in outcome.message
-    assert len(world.done(fx.PlanGrasp)) == 2  # plan_attempts
+    assert len(world.done(PlanGrasp)) == 2  # plan_attempts
     assert outcome.attempts == 0
 
 
 def test_in_the_overlap_the_second_arm_is_tried(worlds, box):
     world = worlds(box("red", 0.26, -0.05))
-    world.fail(lambda e: isinstance(e, fx.PlanGrasp) and e.arm == "right", Code.NO_PLAN)
+    world.fail(lambda e: isinstance(e, PlanGrasp) and e.arm == "right", Code.NO_PLAN)
     outcome = world.grasp()
     assert outcome.success
     assert outcome.arm == "left"
 
 
 def test_a_place_out_of_reach_is_refused_before_anything_moves(world):
-    world.fail(lambda e: isinstance(e, fx.PlanPlace), Code.UNREACHABLE)
+    world.fail(lambda e: isinstance(e, PlanPlace), Code.UNREACHABLE)
     outcome = world.grasp(place=(0.75, -0.5))
     assert outcome.code is Code.UNREACHABLE
     assert "could grasp, but not place" in outcome.message
-    assert not world.done(fx.Execute)
+    assert not world.done(Follow)
 
 
 def test_a_place_off_the_table_is_refused(world):

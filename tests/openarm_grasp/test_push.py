@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code
-from openarm_grasp.strategy import effects as fx
+from openarm_grasp.strategy.effects import PlanGrasp, Planned, PlanPlace
+from tests.openarm_grasp.scripted import Follow, Grip
 
 
 @pytest.mark.requirement("N-13", "A-65")
@@ -17,10 +18,10 @@ def test_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(robot) -> 
     outcome = two.ask()
     assert (outcome.code, outcome.route) == (Code.OK, "push")
     assert two.pushed == 1
-    pusher = next(e.arm for e in two.world.done(fx.Execute))
+    pusher = next(e.arm for e in two.done(Follow))
     assert f"push 1 by the {pusher} hand moved it 60 mm" in outcome.message
     assert pusher != outcome.arm  # the hand that comes from the other side pushes
-    closed = next(e for e in two.world.done(fx.MoveGripper))
+    closed = next(e for e in two.done(Grip))
     assert closed.position == 0.0
 
 
@@ -28,10 +29,10 @@ def test_what_no_arm_grasps_is_pushed_into_reach_looked_at_and_picked(robot) -> 
 def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_object_now(robot) -> None:
     two = robot(0.46, 0.02)
     two.far = 0.44
-    plan, ahead = two.plan, list[fx.PlanGrasp]()
+    plan, ahead = two.plan, list[PlanGrasp]()
 
-    async def noted(effect: fx.PlanGrasp | fx.PlanPlace) -> fx.Planned:
-        if isinstance(effect, fx.PlanGrasp) and not two.pushed:
+    async def noted(effect: PlanGrasp | PlanPlace) -> Planned:
+        if isinstance(effect, PlanGrasp) and not two.pushed:
             p = effect.target.T_frame_box[:2, 3]
             ahead.extend([effect] if np.hypot(*(p - (0.46, 0.02))) > 0.05 else [])
         return await plan(effect)
@@ -51,7 +52,7 @@ def test_a_push_that_the_object_does_not_follow_is_repeated_three_times_and_told
     outcome = two.ask()
     assert two.pushed == 3
     assert (outcome.kind, outcome.code, outcome.route) == ("PARTIAL", Code.UNREACHABLE, "")
-    x, y, _ = two.world.objects["red"].p_base
+    x, y, _ = two.objects["red"].p_base
     assert f"after the pushes 'red' was seen at ({x:.3f}, {y:.3f}) m" in outcome.message
 
 
@@ -70,8 +71,8 @@ def test_the_camera_verifies_a_push(robot) -> None:
 def test_an_object_that_is_lost_in_a_push_is_told(robot) -> None:
     two = robot(0.46, 0.02)
     two.far = 0.44
-    push = two._push
-    two._push = lambda: (push(), two.world.objects.pop("red"))
+    push = two.push
+    two.push = lambda: (push(), two.objects.pop("red"))
     outcome = two.ask()
     assert (outcome.kind, outcome.success) == ("FAILED", False)
     assert outcome.code in (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT)
@@ -79,7 +80,7 @@ def test_an_object_that_is_lost_in_a_push_is_told(robot) -> None:
 
 def test_a_hand_that_meets_something_behind_the_object_does_not_push(robot) -> None:
     two = robot(0.46, 0.02)
-    two.far, two.world.tcp_error = 0.44, 0.02
+    two.far, two.tcp_error = 0.44, 0.02
     outcome = two.ask()
     assert (outcome.kind, outcome.code) == ("FAILED", Code.HAND_COLLISION)
     assert two.pushed == 0
@@ -92,7 +93,7 @@ def test_what_can_neither_be_grasped_nor_pushed_is_refused_with_both_reasons(rob
     assert (outcome.kind, outcome.code) == ("REFUSED", Code.UNREACHABLE)
     assert "out of reach" in outcome.message
     assert "cannot be pushed into reach either" in outcome.message
-    assert not two.world.done(fx.Execute)
+    assert not two.done(Follow)
 
 
 @pytest.mark.requirement("N-13")
@@ -101,4 +102,4 @@ def test_a_dry_run_of_a_push_moves_nothing(robot) -> None:
     two.far = 0.44
     outcome = two.ask(dry_run=True)
     assert (outcome.code, outcome.route) == (Code.OK, "push")
-    assert not two.world.done(fx.Execute)
+    assert not two.done(Follow)

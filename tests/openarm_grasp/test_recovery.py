@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state machine against a scripted world: what goes wrong with the arm and the hand, and how a request stops."""
+"""Pick and place with a scripted robot: what goes wrong with the arm and the hand, and how a request stops."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ import pytest
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.evidence.observation import Frame
-from openarm_grasp.strategy import effects as fx
-from openarm_grasp.strategy.states import State
+from openarm_grasp.strategies.pick_and_place import pick_and_place
+from openarm_grasp.strategies.request import GraspRequest
+from openarm_grasp.strategies.states import State
+from openarm_grasp.strategy.effects import Frames, PlanGrasp, PlanPlace
+from tests.openarm_grasp.scripted import GoHome, Grip, MoveLinear, Wait
 
 
 # --- grasping
@@ -21,9 +24,9 @@ def test_a_miss_opens_backs_off_and_tries_another_way(world):
     assert outcome.success
     assert outcome.attempts == 2
     missed = world.log[world.log.index(next(x for x in world.log if world.grips(opening=False)(x[1]))) :]
-    kinds = [type(e) for _, e in missed[3:8]]
-    assert kinds == [fx.MoveGripper, fx.Wait, fx.MoveLinear, fx.GoHome, fx.GoHome]
-    first, second = world.done(fx.PlanGrasp)
+    kinds = [type(e) for _, e in missed[3:8]]  # pause, measure
+    assert kinds == [Grip, Wait, MoveLinear, GoHome, GoHome]
+    first, second = world.done(PlanGrasp)
     assert first.candidates[0].id == second.candidates[-1].id
 
 
@@ -31,7 +34,7 @@ def test_a_miss_opens_backs_off_and_tries_another_way(world):
 def test_without_an_object_the_grasp_fails(worlds, box):
     """The object disappears after its detection: three attempts at most, never a success."""
     world = worlds(box("red", 0.26, -0.2))
-    world.faults.append(lambda e: world.objects.clear() if isinstance(e, fx.PlanGrasp) else None)
+    world.faults.append(lambda e: world.objects.clear() if isinstance(e, PlanGrasp) else None)
     outcome = world.grasp()
     assert outcome.code is Code.GRASP_MISSED
     assert "nothing is in view" in outcome.message
@@ -44,8 +47,8 @@ def test_three_misses_end_with_a_named_refusal_open_hand_and_home(world):
     assert outcome.code is Code.GRASP_MISSED
     assert outcome.attempts == 3
     assert world.gap == pytest.approx(0.088)
-    assert isinstance(world.log[-1][1], fx.GoHome)
-    assert world.machine.carrying == ""
+    assert isinstance(world.log[-1][1], GoHome)
+    assert not world.session.kept
 
 
 def test_a_hand_that_stops_short_has_met_the_object(world):
@@ -61,15 +64,15 @@ def test_an_object_that_moves_before_the_hand_goes_down_is_not_touched(world, bo
     moved = []
 
     def nudge(effect):
-        if world.machine.state is State.MOVE_TO_GRASP and not moved:
+        if world.state is State.MOVE_TO_GRASP and not moved:
             moved.append(world.objects.update(red=box("red", 0.30, -0.2)))
 
     world.faults.append(nudge)
     outcome = world.grasp()
     assert outcome.success, outcome.message
     assert outcome.attempts == 2
-    assert len(world.times(world.executes("approach"))) == 1  # the first hand did not go down
-    assert world.done(fx.PlanGrasp)[1].candidates[0].T_base_tcp[0, 3] == pytest.approx(0.30)
+    assert len(world.times(world.follows_path("approach"))) == 1  # the first hand did not go down
+    assert world.done(PlanGrasp)[1].candidates[0].T_base_tcp[0, 3] == pytest.approx(0.30)
 
 
 @pytest.mark.requirement("N-03")
@@ -77,10 +80,10 @@ def test_a_placed_object_that_the_detector_misses_is_looked_for_again(world):
     real, missed = world.frames, []
 
     def frames(count):
-        if world.machine.state is State.RESET and not missed:
+        if world.state is State.RESET and not missed:
             missed.append(count)
             world.pass_time(0.1 * count)
-            return fx.Frames(tuple(Frame(world.t_ns, ()) for _ in range(count)), "base")
+            return Frames(tuple(Frame(world.t_ns, ()) for _ in range(count)), "base")
         return real(count)
 
     world.frames = frames
@@ -96,9 +99,9 @@ def test_an_alarm_that_the_look_from_home_does_not_confirm_is_raised_once(world,
 
     def frames(count):
         found = real(count)
-        if world.machine.state is not State.MOVE_TO_GRASP:
+        if world.state is not State.MOVE_TO_GRASP:
             return found
-        return fx.Frames(tuple(Frame(frame.t_ns, (shifted,)) for frame in found.frames), "base")
+        return Frames(tuple(Frame(frame.t_ns, (shifted,)) for frame in found.frames), "base")
 
     world.frames = frames
     outcome = world.grasp()
@@ -119,25 +122,17 @@ def test_an_object_that_has_fallen_over_is_told(world, box):
 @pytest.mark.requirement("P-08")
 def test_held_but_still_seen_in_its_place_is_put_back(world):
     """The hand has something, but the camera says it is not the object: no success, and nothing is dropped."""
-    real = world.carry_out
-
-    def carry_out(effect):
-        if world.executes("lift")(effect):
-            world.pass_time(1.0)
-            return None
-        return real(effect)
-
-    world.carry_out = carry_out
+    world.lifted = lambda label: None
     outcome = world.grasp()
     assert outcome.code is Code.GRASP_MISSED
     assert "still stands at its place" in outcome.message
-    linear = [e.what for e in world.done(fx.MoveLinear)]
+    linear = [e.what for e in world.done(MoveLinear)]
     assert linear == ["put back", "back off"] * 3
 
 
 def test_lost_on_the_way_is_found_again(world, box):
     def drop_once(effect):
-        if not world.executes("carry")(effect) or world.machine.attempt > 1:
+        if not world.follows_path("carry")(effect) or world.attempt > 1:
             return None
         world.objects["red"] = box("red", 0.3, -0.3)
         world.held, world.gap = None, 0.0
@@ -160,58 +155,58 @@ def test_a_place_that_is_not_seen_within_2_cm_is_tried_again(world):
 
 
 def test_a_place_that_cannot_be_planned_puts_the_object_back(world):
-    world.fail(lambda e: isinstance(e, fx.PlanPlace), Code.NO_PLAN, times=1)
+    world.fail(lambda e: isinstance(e, PlanPlace), Code.NO_PLAN, times=1)
     outcome = world.grasp()
     assert outcome.code is Code.PLACE_FAILED
     assert world.objects["red"].p_base[:2] == pytest.approx((0.26, -0.2))
-    assert world.machine.carrying == ""
+    assert not world.session.kept
     assert outcome.place_position == (0.0, 0.0, 0.0)
 
 
 def test_a_carry_that_was_blocked_puts_the_object_back_and_tries_again(world):
-    world.fail(world.executes("carry"), Code.EXECUTION_FAILED, times=1)
+    world.fail(world.follows_path("carry"), Code.EXECUTION_FAILED, times=1)
     outcome = world.grasp()
     assert outcome.success, outcome.message
     assert outcome.attempts == 2
-    first, _, second = world.done(fx.PlanPlace)
+    first, _, second = world.done(PlanPlace)
     assert first.targets[0].position != pytest.approx(second.targets[0].position)
 
 
 def test_a_hand_that_can_put_its_object_nowhere_keeps_it_and_says_so(world):
-    world.fail(lambda e: isinstance(e, fx.PlanPlace), Code.NO_PLAN)
+    world.fail(lambda e: isinstance(e, PlanPlace), Code.NO_PLAN)
     outcome = world.grasp()
     assert outcome.code is Code.PLACE_FAILED
     assert "still holds 'red'" in outcome.message
     assert world.held == "red"
-    assert world.machine.carrying == "right"
+    assert list(world.session.kept) == ["right"]
 
 
 def test_a_failed_way_back_after_release_still_ends_well(world):
-    world.fail(world.executes("leave"), Code.EXECUTION_FAILED, times=1)
+    world.fail(world.follows_path("leave"), Code.EXECUTION_FAILED, times=1)
     outcome = world.grasp()
     assert outcome.success
-    assert [e.what for e in world.done(fx.MoveLinear)] == ["leave"]
+    assert [e.what for e in world.done(MoveLinear)] == ["leave"]
 
 
 def test_the_placed_object_is_kept_clear_of_on_the_way_home(world):
     world.grasp()
-    home = world.done(fx.GoHome)[-1]
+    home = world.done(GoHome)[-1]
     assert [b.id for b in home.obstacles] == ["detected/blue_0", "placed/red"]
 
 
 def test_no_way_home_is_tried_without_obstacles_then_named(world):
-    world.fail(lambda e: isinstance(e, fx.GoHome) and e.arms == ("right",), Code.IN_COLLISION)
+    world.fail(lambda e: isinstance(e, GoHome) and e.arms == ("right",), Code.IN_COLLISION)
     outcome = world.grasp()
     assert outcome.code is Code.IN_COLLISION
     assert "could not go home" in outcome.message
-    assert [len(e.obstacles) for e in world.done(fx.GoHome) if e.arms == ("right",)] == [2, 0]
+    assert [len(e.obstacles) for e in world.done(GoHome) if e.arms == ("right",)] == [2, 0]
 
 
 # --- stopping
 @pytest.mark.parametrize("code", [Code.CANCELLED, Code.ROBOT_LOST, Code.INTERNAL])
 @pytest.mark.parametrize("state", list(State)[1:])
 def test_a_stop_in_any_state_ends_the_request_and_the_next_works(world, state, code):
-    world.faults.append(lambda e: OpenArmError(code, "stopped on purpose") if world.machine.state is state else None)
+    world.faults.append(lambda e: OpenArmError(code, "stopped on purpose") if world.state is state else None)
     outcome = world.grasp()
     assert outcome.code is code
     assert world.states[-2:] == [state, State.IDLE]
@@ -223,39 +218,33 @@ def test_a_stop_in_any_state_ends_the_request_and_the_next_works(world, state, c
 
 @pytest.mark.requirement("P-21")
 def test_a_cancel_while_carrying_keeps_the_object(world):
-    world.fail(world.executes("carry"), Code.CANCELLED)
+    world.fail(world.follows_path("carry"), Code.CANCELLED)
     outcome = world.grasp()
     assert outcome.code is Code.CANCELLED
     assert world.held == "red"
-    assert world.machine.carrying == "right"
+    assert list(world.session.kept) == ["right"]
     assert world.times(world.grips(opening=True)) == world.times(world.grips(opening=True))[:1]
 
 
-def test_a_second_request_is_refused_at_once_and_disturbs_nothing(world):
-    world.machine.step(fx.GraspRequest("red"), world.t_ns)
-    with pytest.raises(OpenArmError, match="a grasp of 'red' is running") as error:
-        world.machine.step(fx.GraspRequest("blue"), world.t_ns)
-    assert error.value.code is Code.BUSY
-    assert (world.machine.state, world.machine.label) == (State.DETECT, "red")
-
-
-def test_a_request_for_an_unknown_arm_is_refused_and_leaves_the_machine_idle(world):
+def test_a_request_for_an_unknown_arm_is_refused_and_the_next_works(world):
     with pytest.raises(OpenArmError, match="auto, left, right"):
-        world.machine.step(fx.GraspRequest("red", arm="middle"), world.t_ns)
+        pick_and_place(world.task(GraspRequest("red", arm="middle")), GraspRequest("red", arm="middle")).send(None)
+    assert world.status == []
+    assert world.grasp().success
+
+
+def test_a_defect_of_the_program_is_answered_and_the_next_request_works(world):
+    world.faults.append(lambda call: 1 / 0 if isinstance(call, PlanGrasp) else None)
+    outcome = world.grasp()
+    assert outcome.code is Code.INTERNAL
+    assert "ZeroDivisionError" in outcome.message
+    world.faults.clear()
     assert world.grasp().success
 
 
 @pytest.mark.requirement("B-72")
-def test_every_transition_has_a_reason(world):
+def test_every_transition_has_a_reason_and_begins_where_the_last_ended(world):
     world.slips = 1
-    machine_step, reasons = world.machine.step, []
-
-    def step(event, t_ns):
-        recipe = machine_step(event, t_ns)
-        reasons.append((world.machine.previous, world.machine.state, world.machine.reason))
-        return recipe
-
-    world.machine.step = step
     world.grasp()
-    assert all(reason for _, _, reason in reasons)
-    assert all(a[1] is b[0] for a, b in pairwise(reasons))
+    assert all(status.reason for status in world.status)
+    assert all(a.state is b.previous for a, b in pairwise(world.status))

@@ -11,7 +11,7 @@ import pytest
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.strategy.beside import BesideLink, Company
+from openarm_grasp.robot.coordination import ArmCoordination, CoordinatedRobot
 
 
 class Robot:
@@ -64,8 +64,8 @@ def run(work: Coroutine[Any, Any, Any]) -> Any:
     raise AssertionError("it waits for something that nobody does")
 
 
-def link(robot: Robot, arm: Any, company: Company | None = None) -> BesideLink:
-    return BesideLink(arm, robot, company or Company(), GraspConfig())  # type: ignore[arg-type]
+def link(robot: Robot, arm: Any, coordination: ArmCoordination | None = None) -> CoordinatedRobot:
+    return CoordinatedRobot(arm, robot, coordination or ArmCoordination(), GraspConfig())  # type: ignore[arg-type]
 
 
 def test_an_arm_waits_until_the_other_has_gone_on_and_plans_again() -> None:
@@ -90,17 +90,17 @@ def test_what_is_not_the_other_arms_doing_is_told_at_once() -> None:
 
 
 def test_of_two_arms_that_wait_for_each_other_the_right_one_gives_way() -> None:
-    robot, company = Robot(), Company(waiting={"left"})
+    robot, coordination = Robot(), ArmCoordination(waiting={"left"})
     robot.away("left")
     robot.faults = [Code.IN_COLLISION]
     with pytest.raises(OpenArmError, match="in the way"):
-        run(link(robot, "right", company).plan(None))  # type: ignore[arg-type]
-    robot, company = Robot(), Company(waiting={"right"})
+        run(link(robot, "right", coordination).plan(None))  # type: ignore[arg-type]
+    robot, coordination = Robot(), ArmCoordination(waiting={"right"})
     robot.away("right")
     robot.faults = [Code.IN_COLLISION]
     robot.on_step = lambda step: robot.away("right", -0.5) if step == 2 else None
-    assert run(link(robot, "left", company).plan(None)) == "plan"  # type: ignore[arg-type]
-    assert company.waiting == {"right"}
+    assert run(link(robot, "left", coordination).plan(None)) == "plan"  # type: ignore[arg-type]
+    assert coordination.waiting == {"right"}
 
 
 def test_an_arm_at_home_looks_when_the_other_hides_nothing_and_one_at_work_does_not_wait() -> None:
@@ -118,5 +118,5 @@ def test_an_arm_at_home_looks_when_the_other_hides_nothing_and_one_at_work_does_
 def test_an_arm_whose_work_is_done_hides_nothing() -> None:
     robot = Robot()
     robot.away("right")
-    run(link(robot, "left", Company(done={"right"})).observe(3))
+    run(link(robot, "left", ArmCoordination(done={"right"})).observe(3))
     assert robot.looks == 1

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hand-over through the middle: one arm sets the object down where both reach, the other takes it from there.
+"""Hand-over through the middle: one arm puts the object down where both reach, the other takes it from there.
 
-The way is planned before anything moves: the giver's grasp and a place in the middle, and from that place the taker's
+It is planned before anything moves: the giver's grasp and a place in the middle, and from that place the taker's
 grasp and the place that was asked for. An object is seldom set down exactly where it was meant, so the taker must be
 able to go on from around that place, too. Base frame, m, rad.
 """
@@ -9,7 +9,7 @@ able to go on from around that place, too. Base frame, m, rad.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 
 import numpy as np
@@ -17,11 +17,15 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import HandOverConfig
+from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.observation import Detection, Sighting
+from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
+from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import PlaceTarget, grid
-from openarm_grasp.planning.rehearsal import NO_WAY, Rehearsal, standing_at
 from openarm_grasp.planning.routing import ARMS
-from openarm_grasp.strategy.memory import Surroundings
+from openarm_grasp.strategies.pick_and_place import pick_and_place
+from openarm_grasp.strategies.request import Feasible, GraspOutcome
+from openarm_grasp.strategies.task import Task
 
 
 @dataclass(frozen=True)
@@ -49,13 +53,54 @@ class HandOver:
         )
 
 
-def middle_spots(target: Detection, others: Sequence[Detection], around: Surroundings) -> tuple[Array, ...]:
+async def hand_over(task: Task) -> GraspOutcome | None:
+    """From hand to hand by way of the middle, when an arm can pick the object and only the other reaches its place.
+
+    When the taker is refused after all, anew from where the object then is.
+    """
+    asked, most = task.request, task.context.config.hand_over.rounds
+    known = task.outcome
+    if known is None or asked.place is None or not task.findings.place_refused:
+        return None
+    feasible, place = FeasibilityCheck(task.robot, task.context), np.array(asked.place[:2], dtype=np.float64)
+    number, refused = 0, None
+    while True:
+        found = task.findings.need_sighting()
+        try:
+            way = await plan_hand_over(feasible, task.context, found, place, asked.place_yaw)
+        except OpenArmError as error:
+            if refused is None or error.code not in (*NO_WAY, Code.PLACE_FAILED):
+                raise
+            return replace(refused, message=f"{refused.message}; {error.message}")
+        if asked.dry_run:
+            x, y, _ = found.target.p_base
+            text = f"can be done from ({x:.3f}, {y:.3f}) m: {way}"
+            return replace(known, code=Code.OK, message=text, arm=way.taker, proof=Feasible(str(way)))
+        number += 1
+        again = "" if number == 1 else f", at try number {number}"
+        x, y = (float(v) for v in way.spot)
+        why = f"hand-over, 1 of 2: {way}"
+        brought = await pick_and_place(task, replace(asked, arm=way.giver, place=(x, y), place_yaw=way.yaw, why=why))
+        if not brought.success:
+            return replace(brought, message=f"on the way to the middle: {brought.message}")
+        task.displaced = f"brought to the middle{again}"
+        taken = await pick_and_place(task, replace(asked, arm=way.taker, why=f"hand-over, 2 of 2: {way}"))
+        if taken.success:
+            text = f"{taken.message}; the {way.giver} arm had brought it to the middle, ({x:.3f}, {y:.3f}) m{again}"
+            return replace(taken, message=text)
+        refused = replace(taken, arm=way.taker)
+        if number == most or not task.may_go_on(taken):
+            return refused
+        task.note(f"{taken.message}; looking for another way from where it stands now")
+
+
+def middle_spots(target: Detection, others: Sequence[Detection], context: GraspContext) -> tuple[Array, ...]:
     """Free spots that both arms reach, those with most room first, then the nearest to the object.
 
     Raises:
         OpenArmError: PLACE_FAILED, when none is free.
     """
-    config, place = around.config.hand_over, around.config.place
+    config, place = context.config.hand_over, context.config.place
     ranked: list[tuple[float, float, float]] = []
     for x in grid(*config.x, config.step):
         for y in grid(-config.abs_y, config.abs_y, config.step):
@@ -74,7 +119,7 @@ def middle_spots(target: Detection, others: Sequence[Detection], around: Surroun
 
 
 async def plan_hand_over(
-    rehearsal: Rehearsal, around: Surroundings, seen: Sighting, place: Array, place_yaw: float | None
+    feasible: FeasibilityCheck, context: GraspContext, seen: Sighting, place: Array, place_yaw: float | None
 ) -> HandOver:
     """Find a way through the middle.
 
@@ -82,21 +127,21 @@ async def plan_hand_over(
     again. A place from which the taker could go on, but not from all around it, is the last resort.
 
     Args:
-        rehearsal: To plan with.
-        around: Parameters.
+        feasible: To plan with.
+        context: Parameters.
         seen: The object and its neighbours.
         place: (2,) where it shall stand in the end.
         place_yaw: And how it is turned there; None: any.
 
     Raises:
-        OpenArmError: NO_PLAN or PLACE_FAILED, with what each arm lacks; what the planner's link raises.
+        OpenArmError: NO_PLAN or PLACE_FAILED, with what each arm lacks; what the robot raises.
     """
-    spots = middle_spots(seen.target, seen.others, around)
+    spots = middle_spots(seen.target, seen.others, context)
     order = ARMS if seen.target.p_base[1] >= 0.0 else ARMS[::-1]
     faults: list[str] = []
     for giver, taker in (order, order[::-1]):
         try:
-            return await _between(rehearsal, around.config.hand_over, seen, (giver, taker), spots, place, place_yaw)
+            return await _between(feasible, context.config.hand_over, seen, (giver, taker), spots, place, place_yaw)
         except OpenArmError as error:
             if error.code not in NO_WAY:
                 raise
@@ -105,7 +150,7 @@ async def plan_hand_over(
 
 
 async def _between(
-    rehearsal: Rehearsal,
+    feasible: FeasibilityCheck,
     config: HandOverConfig,
     seen: Sighting,
     arms: tuple[str, str],
@@ -119,7 +164,7 @@ async def _between(
     fault = ""
     for _ in range(config.tries):
         try:
-            way = await rehearsal.pick_and_place(giver, seen.target, seen.others, spots, used=useless)
+            way = await feasible.pick_and_place(giver, seen.target, seen.others, spots, used=useless)
         except OpenArmError as error:
             if error.code not in NO_WAY or not fault:
                 raise
@@ -129,7 +174,7 @@ async def _between(
         copes = 0
         try:
             for stands in (there, *_around(there, config)):
-                await rehearsal.pick_and_place(taker, stands, seen.others, (place,), yaw=place_yaw)
+                await feasible.pick_and_place(taker, stands, seen.others, (place,), yaw=place_yaw)
                 copes += 1
         except OpenArmError as error:
             if error.code not in NO_WAY:

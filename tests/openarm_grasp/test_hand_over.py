@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code
-from openarm_grasp.strategy import effects as fx
-from tests.openarm_grasp.two_arms import OVER, TwoArms
+from openarm_grasp.strategy.effects import PlanPlace
+from tests.openarm_grasp.scripted import OVER, Follow, GoHome, Grip, World
 
 
 @pytest.mark.requirement("P-11")
@@ -22,7 +22,7 @@ def test_a_direct_request_goes_one_way_and_says_so(robot) -> None:
 def test_the_other_arm_is_asked_before_a_hand_over(robot) -> None:
     """At y = 0.14 the left arm is nearer, but the right one reaches both ends."""
     two = robot(0.25, 0.14)
-    two._reaches = lambda arm, p: (p[1] >= 0.1) if arm == "left" else (p[1] <= 0.2)
+    two.reaches = lambda arm, p: (p[1] >= 0.1) if arm == "left" else (p[1] <= 0.2)
     outcome = two.ask(place=(0.25, -0.30))
     assert (outcome.code, outcome.route, outcome.arm) == (Code.OK, "direct", "right")
     assert any("from the other side" in note for note in two.notes)
@@ -34,15 +34,15 @@ def test_an_object_goes_from_hand_to_hand_by_way_of_the_middle(robot) -> None:
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.code, outcome.route, outcome.kind) == (Code.OK, "hand_over", "SUCCESS")
     assert outcome.arm == "left"
-    assert two.world.objects["red"].p_base[:2] == pytest.approx((0.25, 0.30), abs=1e-6)
-    lifts = [effect.arm for effect in two.world.done(fx.Execute) if effect.trajectory == "lift"]
+    assert two.objects["red"].p_base[:2] == pytest.approx((0.25, 0.30), abs=1e-6)
+    lifts = [effect.arm for effect in two.done(Follow) if effect.trajectory == "lift"]
     assert lifts == ["right", "left"]
     told = [note for note in two.notes if "hand-over" in note]
     assert "1 of 2: the right arm brings it to the middle" in told[0]
     assert "2 of 2" in told[1]
     # In between it stood where both reach, clear of the other object.
-    middle = two.world.machine.around.config.hand_over
-    first = next(effect for effect in two.world.done(fx.PlanPlace) if effect.arm == "right" and effect.after is None)
+    middle = two.session.context.config.hand_over
+    first = next(effect for effect in two.done(PlanPlace) if effect.arm == "right" and effect.after is None)
     x, y, _ = first.targets[0].position
     assert middle.x[0] <= x <= middle.x[1]
     assert abs(y) <= middle.abs_y
@@ -52,22 +52,22 @@ def test_an_object_goes_from_hand_to_hand_by_way_of_the_middle(robot) -> None:
 def test_what_the_taker_cannot_use_is_not_chosen(robot) -> None:
     """The taker reaches one end of the strip only; nothing moves before a spot there is found."""
     two = robot(0.25, -0.30, hand_over={"tries": 50})
-    two._reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= 0.02
+    two.reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= 0.02
     outcome = two.ask(place=(0.25, 0.30))
     assert outcome.route == "hand_over"
-    assert len([e for e in two.world.done(fx.Execute) if e.trajectory == "lift"]) == 2
+    assert len([e for e in two.done(Follow) if e.trajectory == "lift"]) == 2
 
 
 @pytest.mark.requirement("P-12")
 def test_a_taker_that_fails_leaves_a_partial_result_that_says_where_the_object_is(robot) -> None:
     two = robot(0.25, -0.30)
-    two.world.fail(lambda e: isinstance(e, fx.Execute) and e.arm == "left" and e.trajectory == "approach",
+    two.fail(lambda e: isinstance(e, Follow) and e.arm == "left" and e.trajectory == "approach",
                    Code.EXECUTION_FAILED)  # fmt: skip
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.kind, outcome.code, outcome.route) == ("PARTIAL", Code.EXECUTION_FAILED, "")
-    x, y, _ = two.world.objects["red"].p_base
+    x, y, _ = two.objects["red"].p_base
     assert f"'red' was seen at ({x:.3f}, {y:.3f}) m" in outcome.message
-    assert abs(y) <= two.world.machine.around.config.hand_over.abs_y
+    assert abs(y) <= two.session.context.config.hand_over.abs_y
 
 
 @pytest.mark.parametrize(("margin", "spot_y"), [(0.0, -0.03), (0.005, 0.0)])
@@ -75,7 +75,7 @@ def test_a_taker_that_fails_leaves_a_partial_result_that_says_where_the_object_i
 def test_the_taker_must_cope_with_an_object_that_stands_a_little_off(robot, margin, spot_y) -> None:
     """The nearest spot is within the taker's reach by 2 mm: too little, once a margin is asked for."""
     two = robot(0.25, -0.30, hand_over={"margin": margin, "margin_deg": 0.0, "tries": 50})
-    two._reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= -0.032
+    two.reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= -0.032
     outcome = two.ask(place=(0.25, 0.30), dry_run=True)
     assert (outcome.code, outcome.route) == (Code.OK, "hand_over")
     assert f"{spot_y:.3f}) m, and the left arm from there" in outcome.message.replace("-0.000", "0.000")
@@ -84,27 +84,27 @@ def test_the_taker_must_cope_with_an_object_that_stands_a_little_off(robot, marg
 @pytest.mark.requirement("P-12")
 def test_a_spot_without_margin_is_better_than_none(robot) -> None:
     two = robot(0.25, -0.30, hand_over={"abs_y": 0.001, "tries": 50})
-    two._reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= 0.0
+    two.reaches = lambda arm, p: p[1] <= OVER if arm == "right" else p[1] >= 0.0
     outcome = two.ask(place=(0.25, 0.30), dry_run=True)
     assert (outcome.code, outcome.route) == (Code.OK, "hand_over")
     assert "0.001) m, and the left arm" in outcome.message
 
 
-def lifts(two: TwoArms) -> list[str]:
-    return [effect.arm for effect in two.world.done(fx.Execute) if effect.trajectory == "lift"]
+def lifts(two: World) -> list[str]:
+    return [effect.arm for effect in two.done(Follow) if effect.trajectory == "lift"]
 
 
-def shy_taker(two: TwoArms, times: int) -> None:
+def shy_taker(two: World, times: int) -> None:
     """The left arm cannot grasp the object where it truly stands, so many times; the plan ahead did not know."""
 
     def reaches(arm: str, p: np.ndarray) -> bool:
         if arm == "right":
             return float(p[1]) <= OVER
-        red, brought = two.world.objects.get("red"), len(lifts(two))
+        red, brought = two.objects.get("red"), len(lifts(two))
         there = red is not None and float(np.linalg.norm(red.p_base[:2] - p[:2])) < 0.02
         return float(p[1]) >= -OVER and not (there and 0 < brought <= times)
 
-    two._reaches = reaches
+    two.reaches = reaches
 
 
 @pytest.mark.requirement("P-12")
@@ -125,7 +125,7 @@ def test_it_is_brought_to_the_middle_as_often_as_the_parameter_says(robot) -> No
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.kind, outcome.code, outcome.route) == ("PARTIAL", Code.UNREACHABLE, "")
     assert lifts(two) == ["right", "right"]
-    x, y, _ = two.world.objects["red"].p_base
+    x, y, _ = two.objects["red"].p_base
     assert f"at try number 2 'red' was seen at ({x:.3f}, {y:.3f}) m" in outcome.message
 
 
@@ -134,13 +134,13 @@ def test_without_another_way_the_answer_says_both(robot) -> None:
     """From the middle the right arm cannot lift it again."""
     two = robot(0.25, -0.30)
     shy_taker(two, 9)
-    reaches = two._reaches
+    reaches = two.reaches
 
     def holds_on(arm: str, p: np.ndarray) -> bool:
-        stands = "red" in two.world.objects and bool(lifts(two))
+        stands = "red" in two.objects and bool(lifts(two))
         return reaches(arm, p) and not (arm == "right" and stands and abs(p[1]) < 0.04)
 
-    two._reaches = holds_on
+    two.reaches = holds_on
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.kind, outcome.code) == ("PARTIAL", Code.UNREACHABLE)
     assert "no hand-over through the middle" in outcome.message
@@ -150,11 +150,11 @@ def test_without_another_way_the_answer_says_both(robot) -> None:
 @pytest.mark.requirement("P-12")
 def test_a_giver_that_fails_never_calls_the_taker(robot) -> None:
     two = robot(0.25, -0.30)
-    two.world.fail(lambda e: isinstance(e, fx.Execute) and e.trajectory == "approach", Code.EXECUTION_FAILED)
+    two.fail(lambda e: isinstance(e, Follow) and e.trajectory == "approach", Code.EXECUTION_FAILED)
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.kind, outcome.code) == ("FAILED", Code.EXECUTION_FAILED)
     assert "on the way to the middle" in outcome.message
-    assert {e.arm for e in two.world.done(fx.Execute)} == {"right"}
+    assert {e.arm for e in two.done(Follow)} == {"right"}
 
 
 @pytest.mark.requirement("P-11")
@@ -163,7 +163,7 @@ def test_a_full_middle_is_a_reason_to_refuse(robot) -> None:
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.kind, outcome.code) == ("REFUSED", Code.UNREACHABLE)
     assert "no free spot in the middle" in outcome.message
-    assert not two.world.done(fx.Execute)
+    assert not two.done(Follow)
 
 
 @pytest.mark.requirement("P-11")
@@ -178,11 +178,11 @@ def test_a_dry_run_tells_the_way_and_moves_nothing(robot) -> None:
     outcome = two.ask(place=(0.25, 0.30), dry_run=True)
     assert (outcome.code, outcome.route) == (Code.OK, "hand_over")
     assert "the right arm brings it to the middle" in outcome.message
-    assert not [e for _, e in two.world.log if isinstance(e, fx.Execute | fx.MoveGripper | fx.GoHome)]
+    assert not [e for _, e in two.log if isinstance(e, Follow | Grip | GoHome)]
 
 
 def test_cancel_between_the_parts_ends_the_whole(robot) -> None:
     two = robot(0.25, -0.30)
-    two.stopped = Code.CANCELLED
+    two.on_report = lambda status: setattr(two, "stopped", Code.CANCELLED if "another way" in status.reason else None)
     outcome = two.ask(place=(0.25, 0.30))
     assert (outcome.kind, outcome.code) == ("CANCELLED", Code.CANCELLED)

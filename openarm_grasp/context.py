@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every part of grasping needs to know and no request changes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from openarm_common.robot.description import RobotDescription, Side
+from openarm_common.scene.scene import Table
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.planning.routing import ARMS
+
+
+@dataclass(frozen=True)
+class GraspContext:
+    """What does not change from request to request.
+
+    Attributes:
+        config: Parameters.
+        table: Where objects stand.
+        shoulders: (x, y) of each arm's shoulder, base frame, m.
+    """
+
+    config: GraspConfig
+    table: Table
+    shoulders: Mapping[str, Sequence[float]]
+
+    @classmethod
+    def of(cls, config: GraspConfig, table: Table, robot: RobotDescription) -> GraspContext:
+        """That of a robot at a table."""
+        return cls(config, table, {arm: _shoulder(robot, arm) for arm in ARMS})
+
+
+def _shoulder(robot: RobotDescription, arm: Side) -> tuple[float, float]:
+    """(x, y) of the arm's first joint, base frame, m."""
+    first = robot.joint(robot.arm_joints(arm)[0])
+    T_base_shoulder = robot.link_pose(first.parent, {}) @ first.T_parent_joint
+    return float(T_base_shoulder[0, 3]), float(T_base_shoulder[1, 3])

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a robot can do as one step of a strategy: observe, plan, move, grip, measure. No ROS, no clock of its own.
+
+Each skill checks first that the work may go on (cancel, deadline, a robot that has gone silent), and raises when it
+does not succeed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.types import Array
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.evidence.evidence import Evidence
+from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
+from openarm_grasp.evidence.observation import in_base
+from openarm_grasp.planning.candidates import Box
+from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.strategy.effects import Frames, GoHome, MoveLinear, PlanGrasp, Planned, PlanPlace, Trajectory
+from openarm_grasp.strategy.link import Link
+
+#: Errors of a robot that end a request at once, with the arm where it is.
+STOPS = (Code.CANCELLED, Code.ROBOT_LOST, Code.INTERNAL)
+
+
+def reraise_stop(error: OpenArmError) -> None:
+    """Raise an error again that no strategy may handle, because it ends the request."""
+    if error.code in STOPS:
+        raise error
+
+
+class Skills:
+    """The skills of a robot.
+
+    Args:
+        robot: Interface to it.
+        config: Parameters.
+        arms: Those that may be sent home.
+    """
+
+    def __init__(self, robot: Link, config: GraspConfig, *, arms: Sequence[str] = ARMS) -> None:
+        self.robot = robot
+        self._config = config
+        self._arms = frozenset(arms)
+        self._hands = {arm: HandReader(robot.description, robot.states, arm) for arm in ARMS}
+
+    @property
+    def now_ns(self) -> int:
+        """Robot time."""
+        return self.robot.now_ns
+
+    @property
+    def description(self) -> RobotDescription:
+        """The robot."""
+        return self.robot.description
+
+    def set_deadline(self, timeout: float) -> None:
+        """End the work after so many s of robot time; 0: no limit."""
+        self.robot.deadline_ns = self.robot.now_ns + round(timeout * 1e9) if timeout > 0.0 else 0
+
+    def warn(self, text: str) -> None:
+        """Report something that does not stop the work."""
+        self.robot.warn(text)
+
+    async def wait(self, duration: float) -> None:
+        """Let robot time pass, s."""
+        robot = self.robot
+        robot.check()
+        end_ns = robot.now_ns + round(duration * 1e9)
+        # Simulated time may be slow; one that does not advance is noticed by the robot's interface.
+        limit = 20.0 * duration + 10.0
+        await robot.until(lambda: robot.now_ns >= end_ns, limit, f"waiting {duration:g} s of robot time")
+
+    # --- observing
+    async def observe(self, count: int, *, near: bool = False) -> Frames:
+        """Frames of detections that are taken from now on, by the camera over the table or the one on the hand."""
+        self.robot.check()
+        return await self.robot.observe(count, near=near)
+
+    def stop_observing(self) -> None:
+        """Let the detector rest."""
+        self.robot.stop_looking()
+
+    def in_base(self, seen: Frames) -> Frames:
+        """Frames of detections in the base frame, at the joints of their stamps."""
+        self.robot.check()
+        base, states = self.robot.base_frame, self.robot.states
+        if seen.frame_id == base:
+            return seen
+        return Frames(in_base(seen.frames, lambda t_ns: states.lookup(base, seen.frame_id, t_ns)), base)
+
+    async def observe_in_base(self, count: int) -> Frames:
+        """So many frames of the camera over the table, in the base frame; the detector rests afterwards."""
+        seen = await self.observe(count)
+        self.stop_observing()
+        return self.in_base(seen)
+
+    # --- planning
+    async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
+        """Plan; raises with the planner's code."""
+        self.robot.check()
+        return await self.robot.plan(request)
+
+    async def reach(self, arms: Sequence[str], T_base_tcp: Array) -> dict[str, float]:
+        """How far each arm's TCP stays from a point, m by arm; those of which nothing is known are left out."""
+        self.robot.check()
+        distances: dict[str, float] = {}
+        for arm in arms:
+            distances |= await self.robot.reach(arm, T_base_tcp)
+        return distances
+
+    # --- moving
+    async def follow(self, arm: str, trajectory: Trajectory, what: str, *, carrying: bool = False) -> None:
+        """Follow a planned trajectory.
+
+        Args:
+            arm: Which.
+            trajectory: Of the planner.
+            what: For errors, for example "lift".
+            carrying: A hand that closes or slips stops it.
+
+        Raises:
+            OpenArmError: GRASP_LOST; as the robot.
+        """
+        self.robot.check()
+        await self._follow(arm, trajectory, what, carrying=carrying)
+
+    async def _follow(self, arm: str, trajectory: Trajectory, what: str, *, carrying: bool = False) -> None:
+        held, at_first = self._config.held, self.aperture(arm)
+
+        def still_held() -> None:
+            now = self.aperture(arm)
+            if now <= held.closed_below:
+                raise OpenArmError(Code.GRASP_LOST, f"{what}: the hand closed to {now * 1e3:.1f} mm on the way")
+            if abs(now - at_first) > held.slip:
+                raise OpenArmError(
+                    Code.GRASP_LOST,
+                    f"{what}: the object slips: the gap went from {at_first * 1e3:.1f} to {now * 1e3:.1f} mm on the"
+                    f" way, expected to stay within {held.slip * 1e3:.0f} mm",
+                )
+
+        await self.robot.follow(arm, trajectory, f"{arm} arm: {what}", still_held if carrying else None)
+
+    async def follow_and_grip(self, arm: str, trajectory: Trajectory, what: str, *, position: float, how: str) -> None:
+        """Follow a trajectory and move the fingers at the same time; arguments as of `follow` and `grip`."""
+        self.robot.check()
+        await self.robot.together([lambda: self._grip(arm, position, how), lambda: self._follow(arm, trajectory, what)])
+
+    async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
+        """Move the TCP to a pose on a straight line."""
+        self.robot.check()
+        await self.robot.move_linear(MoveLinear(arm, T_base_tcp, what), f"{arm} arm: {what}")
+
+    async def go_home(
+        self, arms: Sequence[str], obstacles: Sequence[Box] = (), *, back_off_below: float = float("-inf")
+    ) -> None:
+        """Move the arms that are not there to their home posture, one after the other.
+
+        Args:
+            arms: Which.
+            obstacles: Boxes to keep clear of, base frame.
+            back_off_below: A hand lower than this (z, base frame, m) may be among the objects and first backs off along
+                its own approach axis.
+        """
+        config, robot = self._config, self.robot
+        robot.check()
+        for arm in arms:
+            if arm not in self._arms:
+                continue
+            home = robot.description.group_state(f"{arm}_arm", config.home_state)
+            _, q = robot.states.latest()
+            if max(abs(q[name] - value) for name, value in home.items()) <= config.home_tolerance:
+                continue
+            T_base_tcp = self._hands[arm].T_base_tcp()
+            if T_base_tcp[2, 3] < back_off_below:
+                T_back = T_base_tcp @ se3.make(p=(0.0, 0.0, -config.approach.pregrasp_distance))
+                try:
+                    await robot.move_linear(MoveLinear(arm, T_back, "back off"), f"{arm} arm: back off")
+                except OpenArmError as error:
+                    reraise_stop(error)
+                    robot.warn(error.message)  # the free path home may still be there
+            request = GoHome((arm,), tuple(obstacles), back_off_below)
+            await robot.move_named(arm, config.home_state, request, f"{arm} arm: go {config.home_state}")
+
+    # --- the hand
+    def aperture(self, arm: str) -> float:
+        """Distance between the fingers, m.
+
+        Raises:
+            OpenArmError: NOT_READY, when no joint state tells it.
+        """
+        return self._hands[arm].gap()
+
+    async def grip(self, arm: str, position: float, what: str, effort: float = 0.0) -> None:
+        """Move the fingers until they are there or push against something.
+
+        Args:
+            arm: Whose hand.
+            position: Of each finger, m; 0 closes.
+            what: For errors, for example "close".
+            effort: Largest force, N; 0: the driver's limit.
+
+        Raises:
+            OpenArmError: EXECUTION_FAILED, when an opening hand does not open, or a closing one neither closes nor
+                meets anything.
+        """
+        self.robot.check()
+        await self._grip(arm, position, what, effort)
+
+    async def _grip(self, arm: str, position: float, what: str, effort: float = 0.0) -> None:
+        hand, robot, what = self._hands[arm], self.robot, f"{arm} hand: {what}"
+        ended_well = await robot.grip(arm, hand.joint, position, what, effort)
+        if position > 0.0:
+            # The result may be here before the joint state that shows it.
+            least, end_ns = position - self._config.hand.open_tolerance, robot.now_ns + SPEED_WINDOW_NS
+            limit = self._config.limits.answer_timeout
+            await robot.until(lambda: hand.finger() >= least or robot.now_ns > end_ns, limit, what)
+            if hand.finger() < least:
+                reached = f"{hand.finger() * 1e3:.1f} mm of {position * 1e3:.0f} mm"
+                raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers stopped at {reached}")
+        elif not ended_well:
+            raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the fingers neither arrived nor met anything")
+
+    async def measure(
+        self, arm: str, expected: float, T_base_tcp: Array | None = None, *, settle: float = 0.0
+    ) -> Evidence:
+        """Read the gripper at rest.
+
+        Args:
+            arm: Whose hand.
+            expected: Width between the fingers, m.
+            T_base_tcp: (4, 4) planned pose that the TCP error is measured against; None leaves the error 0.
+            settle: Longest wait for the fingers to rest, s.
+        """
+        hand, robot, limit = self._hands[arm], self.robot, 20.0 * settle + 10.0
+        robot.check()
+        ready_ns = robot.now_ns + SPEED_WINDOW_NS
+        await robot.until(lambda: robot.now_ns >= ready_ns, limit, "reading the hand")
+        end_ns = ready_ns + round(settle * 1e9)
+
+        def at_rest() -> bool:
+            try:
+                speed = hand.gap_speed()
+            except OpenArmError as error:
+                if error.code is not Code.STALE_DATA:
+                    raise
+                return False  # joint states were missing for a moment; the speed is known again soon
+            return abs(speed) < self._config.held.max_speed or robot.now_ns >= end_ns
+
+        await robot.until(at_rest, limit, "waiting for the fingers to rest")
+        pads = robot.pads(arm) if self._config.held.use_finger_force else ()
+        return hand.evidence(expected, robot.effort(hand.joint), T_base_tcp, pads)

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One arm picks the object and places it: an arm that is near the object, or the far one when only that can."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from openarm_common.errors import OpenArmError
+from openarm_grasp.planning.feasibility import FeasibilityCheck
+from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.strategies.pick_and_place import pick_and_place
+from openarm_grasp.strategies.request import GraspOutcome
+from openarm_grasp.strategies.task import Task
+
+
+async def direct(task: Task) -> GraspOutcome:
+    """Pick and place with the arms asked for; when they cannot place it, with the other arm if that can do it alone."""
+    asked = task.request
+    outcome = await pick_and_place(task, asked)
+    if not task.may_go_on(outcome) or not task.findings.place_refused or asked.place is None:
+        return outcome
+    found, place = task.findings.need_sighting(), np.array(asked.place[:2], dtype=np.float64)
+    task.note("no arm that was asked can do it alone; looking for another way")
+    feasible = FeasibilityCheck(task.robot, task.context)
+    for arm in ARMS:
+        if arm in task.findings.refusals:
+            continue
+        try:
+            await feasible.pick_and_place(arm, found.target, found.others, (place,), yaw=asked.place_yaw)
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            continue
+        why = f"the {arm} arm does it alone, from the other side"
+        return await pick_and_place(task, replace(asked, arm=arm, why=why))
+    return outcome

@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two objects at once: observe both, an arm for each, then both strategies at the same time, each with its own arm.
+
+An arm is given to each object by planning: both grasps must be possible. Where they are not, or the places are so near
+to each other that the arms would only wait, the objects are picked one after the other. Base frame, m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import Side
+from openarm_grasp.evidence.observation import SAME_PLACE, Sighting, find, on_table
+from openarm_grasp.planning.feasibility import FeasibilityCheck
+from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.robot.coordination import ArmCoordination, CoordinatedRobot
+from openarm_grasp.robot.skills import Skills
+from openarm_grasp.strategies.pick_and_place import pick_and_place
+from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
+from openarm_grasp.strategies.states import State
+from openarm_grasp.strategies.task import GraspSession, Report, Status, Task
+from openarm_grasp.strategy.link import Link
+
+Requests = tuple[GraspRequest, GraspRequest]
+
+#: Places nearer to each other than this are served one after the other, m.
+_APART = 0.20
+#: These end both requests.
+_ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
+
+
+@dataclass(frozen=True)
+class PairOutcome:
+    """The answer to two requests.
+
+    Attributes:
+        answers: To each, in their order; none when they were not taken.
+        code: OK, or of the first that failed; CANCELLED, when one of them was.
+        message: What happened to each.
+        at_once: Both arms worked at the same time.
+        duration: s of robot time.
+    """
+
+    answers: tuple[GraspOutcome, ...]
+    code: Code
+    message: str
+    at_once: bool = False
+    duration: float = 0.0
+
+    @property
+    def success(self) -> bool:
+        """Whether both happened."""
+        return self.code is Code.OK
+
+    @property
+    def kind(self) -> str:
+        """What both are; else CANCELLED when one is, PARTIAL when one has come somewhere, FAILED."""
+        kinds = {answer.kind for answer in self.answers} or {"REFUSED"}
+        if len(kinds) == 1:
+            return kinds.pop()
+        if "CANCELLED" in kinds:
+            return "CANCELLED"
+        return "PARTIAL" if kinds & {"SUCCESS", "PARTIAL"} else "FAILED"
+
+
+class Pair:
+    """Two requests of a user while strategies carry them out.
+
+    Args:
+        session: What outlives the requests.
+        robot: Carries out what is done with one arm at a time.
+        robots: Interface for each arm while both work.
+        requests: What is asked for.
+        report: Called at each state that is entered.
+        alone: Carries out one of the requests alone, by whatever strategy.
+    """
+
+    def __init__(
+        self,
+        session: GraspSession,
+        robot: Skills,
+        robots: Mapping[Side, Link],
+        requests: Requests,
+        report: Report,
+        alone: Callable[[Task], Awaitable[GraspOutcome]],
+    ) -> None:
+        self.session, self.robot, self.robots = session, robot, robots
+        self.requests, self.report, self._alone = requests, report, alone
+        self.began_ns = robot.now_ns
+        #: Why both are, or are not, carried out at the same time.
+        self.reason = ""
+
+    def check(self) -> None:
+        """Refuse what is no pair, and what would drop an object that a hand keeps.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT; NOT_READY.
+        """
+        check_pair(self.requests)
+        for request in self.requests:
+            self.session.check_hands(self.robot, request)
+
+    def note(self, reason: str) -> None:
+        """Report what is done before either request is begun."""
+        self.report(Status(State.IDLE, State.IDLE, reason))
+
+    def task(self, i: int, robot: Skills, **changes: str) -> Task:
+        """One of the requests, with what is left of its time.
+
+        Raises:
+            OpenArmError: TIMEOUT, when nothing is.
+        """
+        request = replace(self.requests[i], **changes)
+        if request.timeout > 0.0:
+            left = request.timeout - self.seconds
+            if left <= 0.0:
+                raise OpenArmError(Code.TIMEOUT, f"the {request.timeout:g} s were over before it began")
+            request = replace(request, timeout=left)
+        return Task(self.session, robot, request, self.report, i)
+
+    async def alone(self, i: int) -> GraspOutcome:
+        """Carry one of the requests out alone."""
+        try:
+            return await self._alone(self.task(i, self.robot))
+        except OpenArmError as error:
+            return GraspOutcome(error.code, error.message, self.requests[i].label)
+
+    @property
+    def seconds(self) -> float:
+        """Robot time since both were asked for, s."""
+        return (self.robot.now_ns - self.began_ns) * 1e-9
+
+    def answer(self, answers: tuple[GraspOutcome, GraspOutcome], *, at_once: bool) -> PairOutcome:
+        """The answer to both."""
+        codes = [answer.code for answer in answers if not answer.success]
+        code = Code.CANCELLED if Code.CANCELLED in codes else next(iter(codes), Code.OK)
+        text = "; ".join(f"{answer.label}: {answer.message}" for answer in answers)
+        return PairOutcome(answers, code, f"{self.reason}. {text}", at_once, self.seconds)
+
+
+# --- strategies
+async def simultaneous(pair: Pair) -> PairOutcome | None:
+    """Both at the same time, each with its own arm, when planning finds an arm for each.
+
+    Raises:
+        OpenArmError: CANCELLED, TIMEOUT or ROBOT_LOST, when they ended before an object was touched.
+    """
+    first, second = pair.requests
+    pair.note(f"asked for {first.label!r} and {second.label!r} at once: looking at both")
+    arms, pair.reason = await _arms_for_both(pair)
+    pair.note(pair.reason)
+    if not arms:
+        return None
+    config, coordination = pair.session.context.config, ArmCoordination()
+    outcomes: dict[int, GraspOutcome] = {}
+
+    async def work(i: int) -> None:
+        arm = arms[i]
+        robot = Skills(CoordinatedRobot(arm, pair.robots[arm], coordination, config), config, arms=(arm,))
+        try:
+            task = pair.task(i, robot, arm=arm, why=pair.reason)
+            outcome = await pick_and_place(task, task.request)
+            outcomes[i] = replace(outcome, route="direct" if outcome.success else "")
+        except OpenArmError as error:
+            outcomes[i] = GraspOutcome(error.code, error.message, pair.requests[i].label)
+        finally:
+            coordination.done.add(arm)
+
+    await pair.robot.robot.together([lambda: work(0), lambda: work(1)])
+    for i, outcome in sorted(outcomes.items()):
+        # What was not touched next to the other arm may be reached when that is home.
+        if outcome.kind == "REFUSED" and not pair.session.kept:
+            outcomes[i] = await pair.alone(i)
+    return pair.answer((outcomes[0], outcomes[1]), at_once=True)
+
+
+async def in_turn(pair: Pair) -> PairOutcome:
+    """One after the other; the second is not begun when the first was stopped or its object is still in the hand."""
+    first = await pair.alone(0)
+    if first.code in _ENDS or first.held:
+        text = f"not begun: {first.label!r} ended with {first.code}: {first.message}"
+        second = GraspOutcome(first.code, text, pair.requests[1].label)
+    else:
+        second = await pair.alone(1)
+    return pair.answer((first, second), at_once=False)
+
+
+# --- which arm
+async def _arms_for_both(pair: Pair) -> tuple[tuple[Side, ...], str]:
+    """Observe once, and give an arm to each object; none, with the reason, when they go one after the other."""
+    requests = pair.requests
+    places = [request.place for request in requests if request.place is not None]
+    if len(places) == 2 and float(np.hypot(*(np.subtract(places[0][:2], places[1][:2])))) < _APART:
+        return (), "the places are close to each other: one after the other"
+    try:
+        found = await _observe_both(pair)
+    except OpenArmError as error:
+        if error.code not in _ENDS:
+            return (), f"{error.message}: one after the other"
+        if error.code is Code.CANCELLED:
+            pair.task(0, pair.robot)  # a deadline ends work as a cancel does; here it gets its own name
+        raise
+    straight: tuple[Side, Side] = ("left", "right")
+    crossed: tuple[Side, Side] = ("right", "left")
+    further_left = found[0].target.p_base[1] >= found[1].target.p_base[1]
+    faults: list[str] = []
+    for arms in (straight, crossed) if further_left else (crossed, straight):
+        asked = [request.arm in ("", "auto", arm) for request, arm in zip(requests, arms, strict=True)]
+        if not all(asked):
+            continue
+        fault = await _fault(pair, found, arms)
+        if not fault:
+            return arms, f"both at once: {requests[0].label!r} {arms[0]}, {requests[1].label!r} {arms[1]}"
+        faults.append(fault)
+    return (), f"not both at once ({'; '.join(faults) or 'the same arm is asked for'}): one after the other"
+
+
+async def _observe_both(pair: Pair) -> list[Sighting]:
+    """Both objects, from frames that show both. A dry run moves nothing."""
+    context, robot = pair.session.context, pair.robot
+    robot.set_deadline(pair.requests[0].timeout)
+    if not pair.requests[0].dry_run:
+        await robot.go_home(ARMS, back_off_below=context.table.top_z + 2.0 * context.config.approach.lift_height)
+    frames = (await robot.observe_in_base(context.config.detect.frames)).frames
+    found = [
+        find(frames, request.label, context.config.detect, at=request.object_at, leave=request.leave)
+        for request in pair.requests
+    ]
+    return [replace(one, target=on_table(one.target, context.table.top_z)) for one in found]
+
+
+async def _fault(pair: Pair, found: Sequence[Sighting], arms: tuple[Side, Side]) -> str:
+    """Why the arms cannot do this; "" when they can."""
+    feasible = FeasibilityCheck(pair.robot, pair.session.context)
+    for request, one, arm in zip(pair.requests, found, arms, strict=True):
+        try:
+            if request.place is None:
+                await feasible.pick(arm, one.target, one.others)
+            else:
+                place = np.array(request.place[:2], dtype=np.float64)
+                await feasible.pick_and_place(arm, one.target, one.others, (place,), yaw=request.place_yaw)
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            return error.message
+    return ""
+
+
+def check_pair(requests: Requests) -> None:
+    """Refuse what is no pair.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT.
+    """
+    for request in requests:
+        request.check()
+        if request.phase != "all":
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"two at once are picked and placed; phase {request.phase!r} is of one alone"
+            )
+    first, second = requests
+    if not first.label or not second.label:
+        labels = f"{first.label!r} and {second.label!r}"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"two at once need a label each, got {labels}")
+    if first.label != second.label:
+        return
+    if first.object_at is None or second.object_at is None:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"{first.label!r} is asked for twice: say of each where it stands, or ask for another object",
+        )
+    apart = float(np.hypot(*np.subtract(first.object_at[:2], second.object_at[:2])))
+    if apart <= 2.0 * SAME_PLACE:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"{first.label!r} is asked for at two places {apart * 1e3:.0f} mm apart, expected more than"
+            f" {2e3 * SAME_PLACE:.0f} mm: it may be one object",
+        )

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The strategies, in the order in which they are tried: a new one is a function in a file, and a line here.
+
+A strategy carries out a request of a user, a `Task`, and returns the answer; None, when it has nothing to offer for
+what the strategies before it found out. Parts of it may be carried out by `pick_and_place`. The answer's `route` is the
+name of the strategy that succeeded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.strategies.direct import direct
+from openarm_grasp.strategies.hand_over import hand_over
+from openarm_grasp.strategies.pair import Pair, PairOutcome, in_turn, simultaneous
+from openarm_grasp.strategies.push import push
+from openarm_grasp.strategies.request import GraspOutcome
+from openarm_grasp.strategies.task import Task
+
+Strategy = Callable[[Task], Awaitable[GraspOutcome | None]]
+PairStrategy = Callable[[Pair], Awaitable[PairOutcome | None]]
+
+#: For one object.
+STRATEGIES: dict[str, Strategy] = {
+    "direct": direct,
+    "push": push,
+    "hand_over": hand_over,
+}
+#: For two objects that are asked for together.
+PAIR_STRATEGIES: dict[str, PairStrategy] = {
+    "simultaneous": simultaneous,
+    "in_turn": in_turn,
+}
+#: These end a request; no other strategy is tried.
+_ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
+
+
+async def carry_out(task: Task) -> GraspOutcome:
+    """Carry out a request by the first strategy that succeeds; only an object that is refused untouched goes on.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT or NOT_READY, when the request is not taken.
+    """
+    for route, strategy in STRATEGIES.items():
+        try:
+            outcome = await strategy(task)
+        except OpenArmError as error:
+            known = task.outcome
+            if known is None or error.code not in (*_ENDS, *NO_WAY, Code.PLACE_FAILED):
+                raise
+            if error.code in _ENDS:
+                return task.answer(replace(known, code=error.code, message=error.message), "")
+            task.outcome = replace(known, message=f"{known.message}; {error.message}")
+            continue
+        if outcome is not None:
+            task.outcome = outcome
+            if not task.may_go_on(outcome):
+                return task.answer(outcome, route)
+    if task.outcome is None:
+        raise OpenArmError(Code.INTERNAL, f"none of the strategies {', '.join(STRATEGIES)} answered")
+    return task.answer(task.outcome, "")
+
+
+async def carry_out_pair(pair: Pair) -> PairOutcome:
+    """Carry out two requests: at the same time where that can be planned, else one after the other.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT or NOT_READY, when a request is not taken; CANCELLED, TIMEOUT or ROBOT_LOST,
+            when both ended before an object was touched.
+    """
+    pair.check()
+    for strategy in PAIR_STRATEGIES.values():
+        outcome = await strategy(pair)
+        if outcome is not None:
+            return outcome
+    raise OpenArmError(Code.INTERNAL, f"none of the strategies {', '.join(PAIR_STRATEGIES)} answered")

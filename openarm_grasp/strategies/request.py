@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is asked of a grasp, and the answer; no answer says success without evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.evidence.evidence import GripVerdict, PlaceVerdict, SightVerdict
+from openarm_grasp.planning.options import Option
+from openarm_grasp.planning.routing import arm_order
+
+#: What a request may ask for.
+PHASES = ("all", "pick", "place")
+
+
+@dataclass(frozen=True)
+class GraspRequest:
+    """A request of a user.
+
+    Attributes:
+        label: What to pick; "" takes the detection with the highest score.
+        arm: "auto", "left" or "right".
+        place: (2,) or (3,) footprint centre, base frame, m; None lets a free spot be chosen.
+        dry_run: Plan and report, do not move.
+        phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
+        place_yaw: Of the object's x axis about the base z, rad (half a turn makes no difference); None: unconstrained.
+        timeout: s of robot time for all of it; 0: none.
+        object_at: (x, y) near which the object is, base frame, m; None: any of that label.
+        leave: (x, y) of objects that stay where they are, base frame, m.
+        why: What it is for, when it is a part of another request.
+    """
+
+    label: str
+    arm: str = "auto"
+    place: tuple[float, ...] | None = None
+    dry_run: bool = False
+    phase: str = "all"
+    place_yaw: float | None = None
+    timeout: float = 0.0
+    object_at: tuple[float, ...] | None = None
+    leave: tuple[tuple[float, float], ...] = ()
+    why: str = ""
+
+    def check(self) -> None:
+        """Refuse an arm or a phase that does not exist.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT.
+        """
+        arm_order(self.arm, 0.0, 0.0)
+        if self.phase not in PHASES:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"phase {self.phase!r} does not exist; valid: {', '.join(PHASES)}"
+            )
+
+
+@dataclass(frozen=True)
+class Proof:
+    """Why a request counts as done: two kinds of evidence that do not depend on each other.
+
+    Attributes:
+        gripper: That the hand held the object.
+        camera: That the object has left its place, or is seen where it was to be placed.
+
+    Raises:
+        OpenArmError: INTERNAL, when one of them says otherwise.
+    """
+
+    gripper: GripVerdict
+    camera: SightVerdict | PlaceVerdict
+
+    def __post_init__(self) -> None:
+        if not (self.gripper.ok and self.camera.ok):
+            text = f"success without evidence: gripper {self.gripper.reason!r}, camera {self.camera.reason!r}"
+            raise OpenArmError(Code.INTERNAL, text)
+
+
+@dataclass(frozen=True)
+class Feasible:
+    """Why a dry run says that a request can be done: it was planned to its end, and nothing was moved."""
+
+    plan: str
+
+
+@dataclass(frozen=True)
+class GraspOutcome:
+    """The answer to a request.
+
+    Attributes:
+        code: OK, or what went wrong.
+        message: What happened, in a sentence or two.
+        label: What was picked (or asked for).
+        arm: The arm that was used, or "".
+        attempts: Physical attempts.
+        place_position: (3,) target that was used, base frame, m; zeros when none.
+        duration: s of robot time.
+        held: The object is in the hand.
+        moved: It is elsewhere than before, and not where it was asked for; the message says where.
+        route: How it came to its place: "direct", "hand_over", "push" or another strategy; "" when it did not.
+        options: Grasps that were considered for the newest plan, by arm, the preferred first.
+        proof: Why it may say OK; see `succeeded`.
+
+    Raises:
+        OpenArmError: INTERNAL, for OK without a proof, or from a plan alone when an arm has moved.
+    """
+
+    code: Code
+    message: str
+    label: str
+    arm: str = ""
+    attempts: int = 0
+    place_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    duration: float = 0.0
+    held: bool = False
+    moved: bool = False
+    route: str = ""
+    options: tuple[Option, ...] = ()
+    proof: Proof | Feasible | None = None
+
+    def __post_init__(self) -> None:
+        if self.code is Code.OK and (self.proof is None or (isinstance(self.proof, Feasible) and self.attempts > 0)):
+            raise OpenArmError(Code.INTERNAL, f"an answer says OK without evidence: {self.message!r}")
+
+    @property
+    def kind(self) -> str:
+        """SUCCESS; CANCELLED; PARTIAL: picked, not placed as asked; REFUSED: never touched; FAILED."""
+        if self.success:
+            return "SUCCESS"
+        if self.code is Code.CANCELLED:
+            return "CANCELLED"
+        if self.held or self.moved:
+            return "PARTIAL"
+        return "FAILED" if self.attempts else "REFUSED"
+
+    @property
+    def success(self) -> bool:
+        """Whether what was asked for happened."""
+        return self.code is Code.OK

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A request while it is carried out: what was asked, what has been learned, and what is reported of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.context import GraspContext
+from openarm_grasp.evidence.drift import DriftWatch
+from openarm_grasp.evidence.evidence import Verdict
+from openarm_grasp.evidence.observation import Detection, Sighting
+from openarm_grasp.planning.candidates import GraspCandidate
+from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.robot.skills import Skills
+from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
+from openarm_grasp.strategies.states import State
+
+
+# --- what outlives a request
+@dataclass(frozen=True)
+class Kept:
+    """What a hand kept when its request ended.
+
+    Attributes:
+        arm: Whose hand.
+        target: The object as it stood before the grasp.
+        candidate: How it is held.
+    """
+
+    arm: str
+    target: Detection
+    candidate: GraspCandidate
+
+
+class GraspSession:
+    """What outlives a request: the objects that hands keep, and what grasps tell about the camera.
+
+    Args:
+        context: Parameters, table and arms.
+    """
+
+    def __init__(self, context: GraspContext) -> None:
+        self.context = context
+        self.drift = DriftWatch(context.config.drift)
+        #: What hands kept when their requests ended, by arm.
+        self.kept: dict[str, Kept] = {}
+
+    def check_hands(self, robot: Skills, request: GraspRequest) -> None:
+        """Refuse what would drop an object that an ended request left in a hand; forget one that is gone.
+
+        Raises:
+            OpenArmError: NOT_READY.
+        """
+        if request.dry_run:
+            return
+        hand, closed = self.context.config.hand, self.context.config.held.closed_below
+        for arm, kept in list(self.kept.items()):
+            aperture = robot.aperture(arm)
+            if not closed < aperture < 2.0 * (hand.opening - hand.open_tolerance):
+                del self.kept[arm]  # taken or dropped meanwhile
+            elif request.phase != "place":
+                raise OpenArmError(
+                    Code.NOT_READY,
+                    f"the {arm} hand still holds {kept.target.label!r} (gap {aperture * 1e3:.0f} mm); ask for phase"
+                    f" place first, or open it with /{arm}_gripper_controller/gripper_cmd where that is safe",
+                )
+
+    def to_place(self, request: GraspRequest) -> Kept:
+        """What a request for phase place is about.
+
+        Raises:
+            OpenArmError: NOT_READY, when no hand holds anything; INVALID_ARGUMENT, when none holds that.
+        """
+        kept = list(self.kept.values())
+        if not kept:
+            raise OpenArmError(Code.NOT_READY, "no hand holds anything that was picked; ask for phase pick first")
+        for one in kept:
+            if request.label in ("", one.target.label) and request.arm in ("", "auto", one.arm):
+                return one
+        held = ", ".join(f"the {one.arm} hand that holds {one.target.label!r}" for one in kept)
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"asked to place {request.label or 'an object'!r} with arm {request.arm!r}, but it is {held}",
+        )
+
+
+# --- what is reported
+@dataclass(frozen=True)
+class Status:
+    """What is reported when a state is entered.
+
+    Attributes:
+        state: The state.
+        previous: The state before.
+        reason: Why it was entered.
+        attempt: 1-based number of the attempt, 0 when none runs.
+        label: Of the object, "" while none is known.
+        arm: The arm in use, "" while none is chosen.
+        request: Which of the requests that run at the same time, 0 or 1.
+        failed: The attempt, or what was observed for it, has failed.
+        candidates: Grasps that the planner chooses from; in PLAN and MOVE_TO_PREGRASP.
+        chosen: Id of the one that was chosen, or "".
+        refused: Ids of those that were refused.
+    """
+
+    state: State
+    previous: State
+    reason: str
+    attempt: int = 0
+    label: str = ""
+    arm: str = ""
+    request: int = 0
+    failed: bool = False
+    candidates: tuple[GraspCandidate, ...] = ()
+    chosen: str = ""
+    refused: frozenset[str] = frozenset()
+
+
+Report = Callable[[Status], None]
+
+
+@dataclass
+class Findings:
+    """What was found out about an object, for the next strategy when this one refuses it.
+
+    Attributes:
+        sighting: The object and its neighbours; None while none is trusted.
+        refusals: Why each arm could not be planned for.
+        place_refused: One of them could grasp, but not place.
+    """
+
+    sighting: Sighting | None = None
+    refusals: dict[str, Verdict] = field(default_factory=dict[str, Verdict])
+    place_refused: bool = False
+
+    def need_sighting(self) -> Sighting:
+        """The sighting, where a strategy only goes on with one."""
+        if self.sighting is None:
+            raise OpenArmError(Code.INTERNAL, "a strategy needs an object that was observed, and there is none")
+        return self.sighting
+
+
+# --- the request
+class Task:
+    """A request of a user while strategies carry it out.
+
+    Args:
+        session: What outlives the request.
+        robot: Carries out.
+        request: What is asked for.
+        report: Called at each state that is entered.
+        index: Which of the requests that run at the same time, 0 or 1.
+    """
+
+    def __init__(
+        self, session: GraspSession, robot: Skills, request: GraspRequest, report: Report, index: int = 0
+    ) -> None:
+        self.session, self.robot, self.request, self.report, self.index = session, robot, request, report, index
+        self.began_ns = robot.now_ns
+        #: Physical attempts so far.
+        self.attempts = 0
+        #: What the newest part of the request found out about the object.
+        self.findings = Findings()
+        #: The newest answer to a part of the request.
+        self.outcome: GraspOutcome | None = None
+        #: How a strategy has moved the object so far without placing it as asked, for the answer.
+        self.displaced = ""
+
+    @property
+    def context(self) -> GraspContext:
+        """Parameters, table and arms."""
+        return self.session.context
+
+    @property
+    def seconds(self) -> float:
+        """Robot time since it was asked for, s."""
+        return (self.robot.now_ns - self.began_ns) * 1e-9
+
+    def note(self, reason: str) -> None:
+        """Report what is done between two parts of the request."""
+        self.report(Status(State.IDLE, State.IDLE, reason, label=self.request.label, request=self.index))
+
+    def may_go_on(self, outcome: GraspOutcome) -> bool:
+        """Whether another strategy may try: planning has refused the object where it is, with any arm."""
+        free = self.request.phase == "all" and self.request.arm in ("", "auto")
+        refused = outcome.kind == "REFUSED" and outcome.code in NO_WAY
+        return free and refused and self.findings.sighting is not None and bool(self.findings.refusals)
+
+    def in_time(self, request: GraspRequest) -> GraspRequest:
+        """A part of the request, with what is left of the time.
+
+        Raises:
+            OpenArmError: TIMEOUT, when nothing is.
+        """
+        if request.timeout <= 0.0:
+            return request
+        left = request.timeout - self.seconds
+        if left <= 0.0:
+            raise OpenArmError(Code.TIMEOUT, f"the {request.timeout:g} s for the request are over; the arms hold")
+        return replace(request, timeout=left)
+
+    def answer(self, outcome: GraspOutcome, route: str) -> GraspOutcome:
+        """The answer to all of the request; of an object that is neither where it was nor where it shall be, where."""
+        route = route if outcome.success else ""
+        outcome = replace(outcome, attempts=self.attempts, duration=self.seconds, route=route)
+        if outcome.success or not self.displaced:
+            return outcome
+        sighting, text = self.findings.sighting, outcome.message
+        if sighting is not None and not outcome.held:
+            x, y, _ = sighting.target.p_base
+            text = f"{text}; {self.displaced} {outcome.label!r} was seen at ({x:.3f}, {y:.3f}) m"
+        return replace(outcome, message=text, moved=True)

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""No answer says success without two kinds of evidence, and one place can say it."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+import openarm_grasp
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.evidence.evidence import Grip, GripVerdict, PlaceVerdict, Sight, SightVerdict
+from openarm_grasp.strategies.request import Feasible, GraspOutcome, Proof
+
+HELD = GripVerdict(Grip.HELD, "held")
+AT_PLACE = PlaceVerdict(Code.OK, "2 mm from its target")
+
+
+@pytest.mark.parametrize("grip", list(Grip))
+@pytest.mark.parametrize("sight", list(Sight))
+@pytest.mark.requirement("P-08")
+def test_a_lift_is_proven_by_a_hand_that_holds_and_a_camera_that_sees_the_object_gone(grip, sight):
+    agree = grip is Grip.HELD and sight in (Sight.RISEN, Sight.GONE)
+    if agree:
+        Proof(GripVerdict(grip, "a"), SightVerdict(sight, "b"))
+        return
+    with pytest.raises(OpenArmError, match="success without evidence") as error:
+        Proof(GripVerdict(grip, "a"), SightVerdict(sight, "b"))
+    assert error.value.code is Code.INTERNAL
+
+
+@pytest.mark.requirement("P-09")
+def test_a_place_is_proven_by_the_camera_and_the_hand_that_carried():
+    Proof(HELD, AT_PLACE)
+    for gripper, camera in product((HELD, GripVerdict(Grip.LOST, "")), (AT_PLACE, PlaceVerdict(Code.PLACE_FAILED, ""))):
+        if (gripper, camera) != (HELD, AT_PLACE):
+            with pytest.raises(OpenArmError, match="success without evidence"):
+                Proof(gripper, camera)
+
+
+@pytest.mark.requirement("P-08", "P-09")
+def test_an_answer_cannot_say_ok_without_its_proof():
+    with pytest.raises(OpenArmError, match="OK without evidence"):
+        GraspOutcome(Code.OK, "placed", "red", attempts=1)
+    refused = GraspOutcome(Code.UNREACHABLE, "too far", "red")
+    with pytest.raises(OpenArmError, match="OK without evidence"):
+        replace(refused, code=Code.OK)
+    assert GraspOutcome(Code.OK, "placed", "red", attempts=1, proof=Proof(HELD, AT_PLACE)).success
+
+
+def test_a_plan_alone_is_no_proof_once_an_arm_has_moved():
+    assert GraspOutcome(Code.OK, "can be done", "red", proof=Feasible("a plan")).success
+    with pytest.raises(OpenArmError, match="OK without evidence"):
+        GraspOutcome(Code.OK, "can be done", "red", attempts=1, proof=Feasible("a plan"))
+
+
+@pytest.mark.requirement("P-08", "P-09")
+def test_one_function_builds_the_proof_of_a_success_and_it_cannot_be_called_without_either_evidence():
+    found: list[str] = []
+    for path in Path(openarm_grasp.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                calls = [n.func.id for n in ast.walk(node) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
+                found += [node.name] * calls.count("Proof")
+                if node.name == "succeeded":
+                    assert [arg.arg for arg in node.args.kwonlyargs] == ["gripper", "camera"]
+                    assert node.args.kw_defaults == [None, None]
+    assert found == ["succeeded"]
+
+
+@pytest.mark.requirement("P-08")
+def test_the_answers_of_a_pick_and_of_a_place_carry_their_proof(world):
+    picked = world.grasp(phase="pick")
+    assert isinstance(picked.proof, Proof)
+    assert isinstance(picked.proof.camera, SightVerdict)
+    placed = world.grasp("", phase="place")
+    assert isinstance(placed.proof, Proof)
+    assert isinstance(placed.proof.camera, PlaceVerdict)
+    assert placed.proof.gripper.ok
