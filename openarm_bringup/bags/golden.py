@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Golden numbers: what a bag gave when somebody looked and found it right, each with how far it may be off."""
+"""Golden numbers: the verified results of a bag, each with its tolerance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from openarm_common.errors import Code, OpenArmError
 
 #: How far a number may be off when it is written anew, by the unit its name ends in; others have to be equal.
 TOLERANCES = {"_mm": 0.5, "_deg": 0.3, "_px": 0.05}
-#: Cells whose state hangs on a rounding of the last bit may differ between machines.
+#: Share of cells that may differ between machines, by rounding of the last bit.
 CELLS = 0.002
 
 
@@ -37,7 +37,7 @@ class Difference:
 
 
 def tolerance_of(name: str, value: float) -> float:
-    """How far a number of this name may be off."""
+    """Return the default tolerance of a number, by the unit in its name."""
     if name.startswith("map/"):
         return math.ceil(CELLS * abs(value))
     return next((limit for unit, limit in TOLERANCES.items() if name.endswith(unit)), 0.0)
@@ -78,7 +78,7 @@ def read(path: Path) -> dict[str, dict[str, float]]:
 
 
 def write(path: Path, numbers: Mapping[str, float], before: Mapping[str, Mapping[str, float]]) -> None:
-    """Write the numbers; a tolerance that stood there before stays."""
+    """Write the numbers; existing tolerances are kept."""
     entries = {
         name: {"value": value, "tolerance": before.get(name, {}).get("tolerance", tolerance_of(name, value))}
         for name, value in sorted(numbers.items())

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which messages of a topic were published and never came, told from the sequence numbers of its publishers.
+"""Messages of a topic that were published and never arrived, from the sequence numbers of its publishers.
 
-A publisher numbers its messages 1, 2, 3, …; a subscriber sees the numbers, but not whose they are.
+A publisher numbers its messages 1, 2, 3, …; a subscriber gets the numbers, but not which publisher they are of.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable
 class Arrivals:
     """The messages of one topic, as they arrive.
 
-    What was sent before the first message of a publisher came is not counted: nobody says since when it is heard.
+    Messages before the first that arrives of a publisher are not counted: they may be older than the subscription.
     """
 
     def __init__(self) -> None:
@@ -24,14 +24,14 @@ class Arrivals:
 
         Args:
             sequence: Number that its publisher gave it.
-            publishers: How many the topic has now; asked only when the number continues none that was seen.
+            publishers: How many the topic has now; asked only when the number continues no known one.
         """
         earlier = [number for number in self._last if number < sequence]
         before = sequence - 1
         if before not in earlier:
-            room = publishers() - len(self._last)
-            if room > 0 or not earlier:  # a new publisher, or in the place of one that has ended
-                if room <= 0:
+            free = publishers() - len(self._last)
+            if free > 0 or not earlier:  # a new publisher, or in the place of one that has ended
+                if free <= 0:
                     self._last.pop(0)
                 self._last.append(sequence)
                 return 0

@@ -65,7 +65,7 @@ def mend(path: Path) -> int | None:
         )
     with path.open("r+b") as file:
         chunks, end = whole_chunks(file, size)
-        # Whether all indexes of the last chunk were written can only be told from its content: they are made anew.
+        # Whether all indexes of the last chunk were written only its content shows: they are made anew.
         # After a loss of power its content may be missing, whatever its length: then it is given up.
         indexes: list[bytes] | None = None
         while chunks and (indexes := _indexes(file, chunks[-1][0])) is None:
@@ -79,7 +79,7 @@ def mend(path: Path) -> int | None:
         file.seek(0, os.SEEK_END)
         file.write(_record(_DATA_END, bytes(4)))
         summary = file.tell()
-        # Counts of nothing: readers that find no schema here count for themselves while they look for them.
+        # Counts of nothing: readers that find no schema here count for themselves while they search for them.
         file.write(b"".join(_record(_CHUNK_INDEX, index) for index in indexed))
         file.write(_record(_STATISTICS, bytes(46)))
         file.write(_record(_FOOTER, struct.pack("<QQI", summary, 0, 0)) + MAGIC)

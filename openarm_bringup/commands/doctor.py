@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm doctor`: what of this machine and installation would keep the suite from working, and what to do."""
+"""`openarm doctor`: what in this machine and installation would keep the suite from working, and what to do."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ with mujoco.Renderer(model, 240, 320) as renderer:
 
 
 def doctor(*, graph: str = "sim") -> Outcome:
-    """Look at versions, ROS, rendering, shared memory, ports and running graphs; say what to do about each fault.
+    """Check versions, ROS, rendering, shared memory, ports and running graphs, with advice on each fault.
 
     Args:
-        graph: The graph whose needs are held against the machine.
+        graph: Graph whose needs the machine is checked for.
     """
     findings = list(gather(graph))
     errors = [finding for finding in findings if finding.level == "error"]
@@ -56,13 +56,13 @@ def doctor(*, graph: str = "sim") -> Outcome:
     text = _table(findings)
     if errors:
         first = errors[0]
-        message = f"{len(errors)} of {len(findings)} checks failed; {first.name}: {first.advice or first.seen}"
+        message = f"{len(errors)} of {len(findings)} checks failed; {first.name}: {first.advice or first.observed}"
         return Outcome(False, message, Code.ENVIRONMENT, data, text)
     return Outcome(True, f"all {len(findings)} checks passed", data=data, text=text)
 
 
 def gather(graph: str) -> list[Finding]:
-    """Make every check, the simulator's version first."""
+    """Make all checks, the simulator's version first."""
     installed = {
         dist.metadata["Name"].lower(): dist.version for dist in metadata.distributions() if dist.metadata["Name"]
     }
@@ -95,7 +95,7 @@ def _table(findings: list[Finding]) -> str:
         table.add_column(no_wrap=not wrap, overflow="fold")
     for finding in findings:
         advice = f"\n→ {finding.advice}" if finding.advice else ""
-        table.add_row(MARKS[finding.level], finding.name, Text(finding.seen + advice))
+        table.add_row(MARKS[finding.level], finding.name, Text(finding.observed + advice))
     console = Console(highlight=False)
     with console.capture() as capture:
         console.print(table)
@@ -112,14 +112,14 @@ def _graph_findings(name: str) -> list[Finding]:
     need = shm.shm_need_mib(load_graph(name), extra_participants=4)
     findings = [checks.check_shm(usage.total / 2**20, usage.free / 2**20, need, name)]
     running = runs.running()
-    seen = "; ".join(f"{run.graph} in domain {run.domain}: {run.health} (pid {run.pid})" for run in running)
-    findings.append(Finding("graphs", "ok", seen or "none is running"))
+    observed = "; ".join(f"{run.graph} in domain {run.domain}: {run.health} (pid {run.pid})" for run in running)
+    findings.append(Finding("graphs", "ok", observed or "none is running"))
     for run in running:
         findings += graph.check_nodes(run)
         if run.ready_nodes:
             from openarm_bringup.doctor.ros.listener import listen
 
-            findings += graph.check_heard(run, listen(run))
+            findings += graph.check_status(run, listen(run))
     return findings
 
 
@@ -134,7 +134,7 @@ def _failed_imports(names: tuple[str, ...]) -> dict[str, str]:
 
 
 def _opencv_links_gl() -> bool:
-    """Tell whether cv2 pulls libGL in, from what a process that imports it has mapped."""
+    """Return whether cv2 loads libGL, by the memory maps of a process that imports it."""
     code = "import cv2; print('libGL.so' in open('/proc/self/maps').read())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     return (done.returncode != 0 and "libGL" in done.stderr) or done.stdout.strip() == "True"

@@ -65,20 +65,20 @@ def record(
     rows = [f"{recorded.counts[t]:8d}  {recorded.lost[t]:8d}  {t}" for t in sorted({*recorded.counts, *recorded.lost})]
     text = "\n".join([f"{'recorded':>8}  {'lost':>8}  topic", *rows])
     if recorded.ended:
-        said = f"recording ended early: {recorded.ended}; {data['messages']} messages are in {path}"
-        return Outcome(False, said, Code.ENVIRONMENT, data, text)
+        message = f"recording ended early: {recorded.ended}; {data['messages']} messages are in {path}"
+        return Outcome(False, message, Code.ENVIRONMENT, data, text)
     if not recorded.counts:
         shutil.rmtree(path)  # made by this recording; a second try may have the name
-        said = f"no message came; topics that match: {', '.join(recorder.topics) or 'none'}. Is a graph running?"
-        return Outcome(False, said, Code.NOTHING_DETECTED, data)
-    said = f"{data['messages']} messages, {data['bytes'] / 1e6:.1f} MB in {path}, {data['lost']} lost"
+        message = f"no message came; topics that match: {', '.join(recorder.topics) or 'none'}. Is a graph running?"
+        return Outcome(False, message, Code.NOTHING_DETECTED, data)
+    message = f"{data['messages']} messages, {data['bytes'] / 1e6:.1f} MB in {path}, {data['lost']} lost"
     if data["lost"]:
         worst = ", ".join(f"{count} of {topic}" for topic, count in recorded.lost.most_common(3))
         advice = (
             "record fewer topics (--profile, --topics) or fewer frames (--image-rate), or give it a quieter machine"
         )
-        return Outcome(False, f"{said} ({worst}); {advice}", Code.LIMITS, data, text)
-    return Outcome(True, said, data=data, text=text)
+        return Outcome(False, f"{message} ({worst}); {advice}", Code.LIMITS, data, text)
+    return Outcome(True, message, data=data, text=text)
 
 
 def replay(
@@ -159,7 +159,7 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
     with open_bag(bag) as opened, progress() as shown:
         expected = {} if update and not path.exists() else stored.read(path)
         task = shown.add_task("frames", total=None)
-        numbers = numbers_of(opened, scene=scene, tell=lambda done, of: shown.update(task, completed=done, total=of))
+        numbers = numbers_of(opened, scene=scene, on_progress=lambda n, of: shown.update(task, completed=n, total=of))
     data: dict[str, Any] = {"bag": str(bag), "golden": str(path), "numbers": numbers}
     if update:
         stored.write(path, numbers, expected)
@@ -167,8 +167,8 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
     differences = stored.compare(expected, numbers)
     data["differences"] = [str(difference) for difference in differences]
     if differences:
-        said = f"{len(differences)} of {len(expected)} numbers differ from {path}"
-        return Outcome(False, said, Code.STALE_DATA, data, "\n".join(data["differences"]))
+        message = f"{len(differences)} of {len(expected)} numbers differ from {path}"
+        return Outcome(False, message, Code.STALE_DATA, data, "\n".join(data["differences"]))
     return Outcome(True, f"{len(numbers)} numbers are as {path} says", data=data)
 
 

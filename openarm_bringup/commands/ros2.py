@@ -72,7 +72,7 @@ def echo(name: str, *, count: Count = 0, full: bool = False, timeout: float = 10
             # Kept messages come at once, the oldest first: some of them means the newest.
             peer.spin_until(lambda: False, _SETTLE_S)
             del waiting[:-count]
-        with suppress(KeyboardInterrupt):  # the way to end it
+        with suppress(KeyboardInterrupt):  # ends it
             while not count or len(taken) < count:
                 peer.spin_until(lambda: waiting, float("inf"))
                 data = to_data(waiting.pop(0), None if full else _LONGEST)

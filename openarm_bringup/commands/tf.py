@@ -71,9 +71,9 @@ def tree(*, out: Path | None = None, domain: Domain = None) -> Outcome:
         write(rows, out)
         data["out"] = str(out)
     if frames.clashes:
-        said = "; ".join(_grouped(frames.clashes))
-        advice = "a frame has one parent and one publisher: `openarm node list` shows who may be one too many"
-        return Outcome(False, f"{said}; {advice}", Code.NO_TRANSFORM, data, text)
+        faults = "; ".join(_grouped(frames.clashes))
+        advice = "a frame has one parent and one publisher: `openarm node list` shows the nodes"
+        return Outcome(False, f"{faults}; {advice}", Code.NO_TRANSFORM, data, text)
     if len(roots) != 1:
         return Outcome(False, f"{len(roots)} roots: {', '.join(roots) or 'none'}", Code.NO_TRANSFORM, data, text)
     return Outcome(True, f"{len(rows)} frames" + (f", drawn in {out}" if out else ""), data=data, text=text)
@@ -107,11 +107,11 @@ def _grouped(clashes: Mapping[str, str]) -> list[str]:
     frames: dict[str, list[str]] = {}
     for name, what in sorted(clashes.items()):
         frames.setdefault(what, []).append(name)
-    said: list[str] = []
+    lines: list[str] = []
     for what, names in frames.items():
         more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        said.append(f"{'each of ' if len(names) > 1 else ''}{', '.join(names[:_NAMED])}{more} {what}")
-    return said
+        lines.append(f"{'each of ' if len(names) > 1 else ''}{', '.join(names[:_NAMED])}{more} {what}")
+    return lines
 
 
 def _rows(edges: Edges) -> list[Row]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm view`: a web page with what the graph sees and does, and with a button for a grasp."""
+"""`openarm view`: a web page that shows the graph, with a button for a grasp."""
 
 from __future__ import annotations
 

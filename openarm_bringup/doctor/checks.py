@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of the machine and the installation. Each takes what it judges and returns a finding with what to do."""
+"""Checks of the machine and the installation, as functions of what was measured; each returns findings with advice."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RCLPY_MAJOR = 7
 PORTS = 110
 PYTHONS = ((3, 11), (3, 12), (3, 13))
 
-#: distribution → (lowest version, first that does not do, what it is for); mujoco is the first that is looked at.
+#: Distribution → (lowest version, first unsupported one, purpose); mujoco is checked first.
 WANTED: Mapping[str, tuple[tuple[int, ...], tuple[int, ...] | None, str]] = {
     "mujoco": ((4, 0), None, "simulator"),
     "opencv-python-headless": ((4, 13), (5,), "images; 5.0 has no calibrateHandEye"),
@@ -33,18 +33,18 @@ WANTED: Mapping[str, tuple[tuple[int, ...], tuple[int, ...] | None, str]] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """Result of one check.
 
     Args:
-        name: What.
-        level: ok, note (works, but look) or error (will not work).
-        seen: What was found.
+        name: What was checked.
+        level: ok, note (works, with a limitation) or error (will not work).
+        observed: What was found.
         advice: What to do; empty when nothing.
     """
 
     name: str
     level: Level
-    seen: str
+    observed: str
     advice: str = ""
 
 
@@ -54,18 +54,18 @@ def version_tuple(text: str) -> tuple[int, ...]:
 
 
 def check_python(version: tuple[int, int], system: str, machine: str) -> Finding:
-    """Judge interpreter and machine: the ROS wheels exist for CPython 3.11 to 3.13 on Linux x86-64."""
-    seen = f"CPython {version[0]}.{version[1]} on {system} {machine}"
+    """Check interpreter and machine: the ROS wheels exist for CPython 3.11 to 3.13 on Linux x86-64."""
+    observed = f"CPython {version[0]}.{version[1]} on {system} {machine}"
     if (system, machine) != ("Linux", "x86_64"):
         advice = "the ROS 2 wheels exist for Linux x86_64 only; elsewhere build the suite with colcon in a native Jazzy"
-        return Finding("python", "error", seen, advice)
+        return Finding("python", "error", observed, advice)
     if version not in PYTHONS:
-        return Finding("python", "error", seen, "use CPython 3.11, 3.12 or 3.13 (OPENARM_PYTHON=/path ./openarm)")
-    return Finding("python", "ok", seen)
+        return Finding("python", "error", observed, "use CPython 3.11, 3.12 or 3.13 (OPENARM_PYTHON=/path ./openarm)")
+    return Finding("python", "ok", observed)
 
 
 def check_versions(installed: Mapping[str, str]) -> list[Finding]:
-    """Judge the installed versions against what the suite was built with; the simulator comes first."""
+    """Check the installed versions against what the suite was built with; the simulator comes first."""
     findings: list[Finding] = []
     for name, (lowest, first_bad, purpose) in WANTED.items():
         version = installed.get(name)
@@ -84,18 +84,18 @@ def check_versions(installed: Mapping[str, str]) -> list[Finding]:
 
 
 def check_opencv(installed: Mapping[str, str], links_gl: bool) -> Finding:
-    """Judge which OpenCV is there: only the headless build needs no libGL and fights with no other."""
+    """Check which OpenCV is there: only the headless build needs no libGL and fights with no other."""
     others = [name for name in installed if name.startswith("opencv-") and name != "opencv-python-headless"]
     if others:
         advice = f"they overwrite each other: uninstall {', '.join(others)}, then reinstall opencv-python-headless"
-        return Finding("opencv build", "error", f"{', '.join(others)} beside the headless one", advice)
+        return Finding("opencv build", "error", f"{', '.join(others)} next to the headless one", advice)
     if links_gl:
         return Finding("opencv build", "error", "linked against libGL", "install opencv-python-headless instead")
     return Finding("opencv build", "ok", "headless, needs no libGL")
 
 
 def check_ros(environ: Mapping[str, str], rclpy_file: str | None, rclpy_version: str, prefix: str) -> list[Finding]:
-    """Judge that there is one ROS, that it is Jazzy, and that wheels and a sourced ROS are not mixed."""
+    """Check that there is one ROS, that it is Jazzy, and that wheels and a sourced ROS are not mixed."""
     if rclpy_file is None:
         return [Finding("ros", "error", "rclpy cannot be imported", "run ./openarm, or source /opt/ros/jazzy/setup.sh")]
     sourced = sorted(
@@ -125,7 +125,7 @@ def check_ros(environ: Mapping[str, str], rclpy_file: str | None, rclpy_version:
     if major and major != (RCLPY_MAJOR,):
         return [
             Finding(
-                "ros", "error", f"rclpy {rclpy_version}", f"{DISTRO} has rclpy {RCLPY_MAJOR}; another ROS is in the way"
+                "ros", "error", f"rclpy {rclpy_version}", f"{DISTRO} has rclpy {RCLPY_MAJOR}; another ROS shadows it"
             )
         ]
     origin = f"wheels in {prefix}" if from_wheels else f"a native ROS {DISTRO}"
@@ -133,7 +133,7 @@ def check_ros(environ: Mapping[str, str], rclpy_file: str | None, rclpy_version:
 
 
 def check_rmw(environ: Mapping[str, str]) -> list[Finding]:
-    """Judge the variables that decide how processes find each other."""
+    """Check the variables that decide how processes find each other."""
     findings: list[Finding] = []
     rmw = environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
     if rmw == "rmw_fastrtps_cpp":
@@ -156,7 +156,7 @@ def check_rmw(environ: Mapping[str, str]) -> list[Finding]:
 
 
 def check_domain(text: str, first_ephemeral_port: int) -> Finding:
-    """Judge ROS_DOMAIN_ID: a number, and its ports below those that the system gives to other programs."""
+    """Check ROS_DOMAIN_ID: a number, and its ports below those that the system gives to other programs."""
     if not text.isdecimal() or int(text) > 232:
         return Finding("domain", "error", f"ROS_DOMAIN_ID={text!r}", "set a number from 0 to 101")
     last_port = 7400 + 250 * int(text) + PORTS
@@ -167,7 +167,7 @@ def check_domain(text: str, first_ephemeral_port: int) -> Finding:
 
 
 def check_ports(taken: Sequence[int], domain: int) -> Finding:
-    """Judge that the domain's discovery ports can be used on this machine."""
+    """Check that the domain's discovery ports can be used on this machine."""
     if taken:
         advice = "another program holds them without sharing; choose another ROS_DOMAIN_ID"
         return Finding(
@@ -177,39 +177,39 @@ def check_ports(taken: Sequence[int], domain: int) -> Finding:
 
 
 def check_shm(total_mib: float, free_mib: float, need_mib: float, graph: str) -> Finding:
-    """Judge /dev/shm against what the graph takes of it."""
-    seen = f"{free_mib:.0f} of {total_mib:.0f} MiB free, graph {graph} needs {need_mib:.0f}"
+    """Check /dev/shm against what the graph takes of it."""
+    observed = f"{free_mib:.0f} of {total_mib:.0f} MiB free, graph {graph} needs {need_mib:.0f}"
     if free_mib >= need_mib:
-        return Finding("/dev/shm", "ok", seen)
+        return Finding("/dev/shm", "ok", observed)
     if total_mib >= need_mib:
         return Finding(
-            "/dev/shm", "error", seen, "stop other graphs, or remove what dead ones left: `fastdds shm clean`"
+            "/dev/shm", "error", observed, "stop other graphs, or remove what dead ones left: `fastdds shm clean`"
         )
     advice = (
         "images would be lost; give the container more (`docker run --shm-size=256m`), or "
         "`mount -o remount,size=256m /dev/shm`"
     )
-    return Finding("/dev/shm", "error", seen, advice)
+    return Finding("/dev/shm", "error", observed, advice)
 
 
 def check_gl(milliseconds: Mapping[str, float | str], chosen: str) -> Finding:
-    """Judge the off-screen renderers, each with its time for one image or why it failed."""
-    seen = ", ".join(
+    """Check the off-screen renderers, each with its time for one image or why it failed."""
+    observed = ", ".join(
         f"{name} {value:.0f} ms" if isinstance(value, float) else f"{name} {value}"
         for name, value in milliseconds.items()
     )
     if isinstance(milliseconds.get(chosen), float):
-        return Finding("rendering", "ok", f"MUJOCO_GL={chosen}: {seen}; no display is needed")
+        return Finding("rendering", "ok", f"MUJOCO_GL={chosen}: {observed}; no display is needed")
     working = [name for name, value in milliseconds.items() if isinstance(value, float)]
     if working:
-        return Finding("rendering", "error", seen, f"set MUJOCO_GL={working[0]}")
+        return Finding("rendering", "error", observed, f"set MUJOCO_GL={working[0]}")
     return Finding(
-        "rendering", "error", seen, "install a software renderer: apt-get install libegl1 libgl1 libegl-mesa0"
+        "rendering", "error", observed, "install a software renderer: apt-get install libegl1 libgl1 libegl-mesa0"
     )
 
 
 def check_imports(failed: Mapping[str, str], purpose: str, names: Sequence[str]) -> Finding:
-    """Judge that all packages of one purpose can be imported."""
+    """Check that all packages of one purpose can be imported."""
     if not failed:
         return Finding(purpose, "ok", f"{', '.join(names)} can be imported")
     name, why = next(iter(failed.items()))
@@ -219,11 +219,11 @@ def check_imports(failed: Mapping[str, str], purpose: str, names: Sequence[str])
 
 
 def check_machine(cores: int, memory_gib: float, load: float, display: bool, wsl: bool) -> Finding:
-    """Judge the machine; a display is never needed."""
-    seen = f"{cores} cores, {memory_gib:.0f} GiB, load {load:.1f}, {'WSL, ' if wsl else ''}"
-    seen += f"{'a' if display else 'no'} display (none is needed)"
+    """Check the machine; a display is never needed."""
+    observed = f"{cores} cores, {memory_gib:.0f} GiB, load {load:.1f}, {'WSL, ' if wsl else ''}"
+    observed += f"{'a' if display else 'no'} display (none is needed)"
     if cores < 2:
-        return Finding("machine", "note", seen, "images and control share one core; expect a real-time factor below 1")
+        return Finding("machine", "note", observed, "images and control share one core: slower than real time")
     if load > cores:
-        return Finding("machine", "note", seen, "other programs are busy; images may come late")
-    return Finding("machine", "ok", seen)
+        return Finding("machine", "note", observed, "other programs are busy; images may come late")
+    return Finding("machine", "ok", observed)

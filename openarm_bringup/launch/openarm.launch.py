@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A graph of the suite under `ros2 launch`, for those who start everything that way.
+"""A graph of the suite under `ros2 launch`.
 
 `ros2 launch openarm_bringup openarm.launch.py graph:=map rviz:=true`. Nodes, parameters and environment are those of
 `openarm up`; what launch has no word for is left out: nodes are started at once instead of in the order of their needs

@@ -26,7 +26,7 @@ def mermaid(graph: Graph) -> str:
 
 
 def text(graph: Graph) -> str:
-    """Return the nodes in the order of their start, and whom each gives what it offers."""
+    """Return the nodes in the order of their start, with what each offers and which nodes use it."""
     width = max(map(len, graph.nodes))
     lines = [f"{graph.name}: {graph.description}".rstrip(": ")]
     for name in (name for level in graph.levels() for name in level):

@@ -2,8 +2,8 @@
 """The node graph as data: a YAML file becomes a validated, frozen model.
 
 A graph names its nodes, what each needs before it starts, when it counts as ready, and its parameters. A file can
-extend another one and keep only some of its nodes. `${scene}`, `${seed}` and `${mount_seed}` in parameters stand for
-the graph's own top-level values.
+extend another one and keep only some of its nodes. `${scene}`, `${seed}` and `${mount_seed}` in parameters are
+replaced by the graph's own top-level values.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class NodeSpec(Config):
     module: str | None = Field(default=None, description="started as `python -m module`")
     command: tuple[str, ...] = Field(default=(), description="started instead of a module")
     params: dict[str, Any] = Field(default_factory=dict, description="ROS parameters, nested or joined by dots")
-    params_file: str | None = Field(default=None, description="ROS parameter file, in config/ or beside the graph")
+    params_file: str | None = Field(default=None, description="ROS parameter file, in config/ or next to the graph")
     remaps: dict[str, str] = Field(default_factory=dict)
     ready: tuple[Ready, ...] = Field(default=(), description="all must hold; none = ready when started")
     ready_timeout: float = Field(default=60.0, gt=0, description="s")
@@ -261,8 +261,8 @@ def _read(path: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
     graph.setdefault("name", path.stem)
     base_name, only = graph.pop("extends", None), graph.pop("only", None)
     if base_name is not None:
-        beside = path.parent / f"{base_name}.yaml"
-        base = _read(beside if beside.is_file() else find_graph(str(base_name)), (*trail, path))
+        sibling = path.parent / f"{base_name}.yaml"
+        base = _read(sibling if sibling.is_file() else find_graph(str(base_name)), (*trail, path))
         if only is not None:
             _keep(base, only, f"{path}:only")
         own = graph.pop("nodes", None) or {}

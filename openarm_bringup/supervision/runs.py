@@ -24,7 +24,7 @@ from openarm_common.errors import Code, OpenArmError
 
 
 class NodeRecord(Config):
-    """One node as the supervisor sees it."""
+    """State of one node, as its supervisor records it."""
 
     state: str
     pid: int | None = None
@@ -135,7 +135,7 @@ def the_running(domain: int | None = None) -> RunRecord:
     """Return the graph that runs now.
 
     Args:
-        domain: Tells several running graphs apart; None = ROS_DOMAIN_ID if it is set, else the only one.
+        domain: Selects one of several running graphs; None = ROS_DOMAIN_ID if it is set, else the only one.
 
     Raises:
         OpenArmError: NOT_READY, when none runs; INVALID_ARGUMENT, when several do, in different domains.
@@ -145,7 +145,7 @@ def the_running(domain: int | None = None) -> RunRecord:
     records = running()
     matching = [record for record in records if domain is None or record.domain == domain]
     if len({record.domain for record in matching}) == 1:
-        return matching[-1]  # several graphs of one domain are one graph to whoever asks
+        return matching[-1]  # several graphs of one domain are one graph to their clients
     listed = "; ".join(f"{r.graph} in domain {r.domain} (pid {r.pid})" for r in records)
     if not matching:
         hint = f"; running: {listed}" if listed else ""
@@ -155,7 +155,7 @@ def the_running(domain: int | None = None) -> RunRecord:
 
 
 def refuse_twins(domain: int, nodes: Iterable[str]) -> None:
-    """Look for nodes that are to be started in a domain and run there already: two of a name would both be obeyed.
+    """Refuse nodes that run in a domain already: commands would reach both of a name.
 
     Raises:
         OpenArmError: BUSY, naming the graph that has them.

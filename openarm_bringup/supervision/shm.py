@@ -17,11 +17,11 @@ from openarm_common.errors import Code, OpenArmError
 
 SHM = Path("/dev/shm")
 
-#: MiB of /dev/shm that a participant takes beside its large segment, measured.
+#: MiB of /dev/shm that a participant takes in addition to its large segment, measured.
 _PLAIN_MIB = 0.65
 _LARGE_EXTRA_MIB = 2.2
-#: Segments grow up to so many times where a graph then still takes no more than this part of the room.
-_ROOMY, _PART = 4, 0.25
+#: Segments grow up to so many times where a graph then still takes no more than this share of the free space.
+_GROWTH, _SHARE = 4, 0.25
 
 _SEGMENT = re.compile(r"^fastrtps_[0-9a-f]{16}$")
 _PORT = re.compile(r"^fastrtps_port(\d+)$")
@@ -31,7 +31,7 @@ _UNFINISHED = re.compile(r"^[a-z0-9_]{8}$")
 
 
 def shm_need_mib(graph: Graph, extra_participants: int = 1) -> float:
-    """Return how much of /dev/shm the graph takes, MiB, with `extra_participants` beside its nodes (probe, clients)."""
+    """Return how much of /dev/shm the graph and `extra_participants` (probe, clients) take, MiB."""
     need = extra_participants * _PLAIN_MIB
     for spec in graph.nodes.values():
         need += spec.shared_mib
@@ -69,7 +69,7 @@ def clean_command() -> list[str] | None:
 
 
 def clean_shm() -> str:
-    """Remove the segments of dead processes (those in use are locked and stay); return what the tool said."""
+    """Remove the segments of dead processes (those in use are locked and stay); return the output of the tool."""
     command = clean_command()
     if command is None:
         return "fastdds is not installed; segments of killed processes stay in /dev/shm"
@@ -78,14 +78,14 @@ def clean_shm() -> str:
     return " ".join((done.stdout + done.stderr).split())
 
 
-def with_room(graph: Graph, free_mib: float | None = None) -> Graph:
-    """Return the graph with larger segments where /dev/shm has room for them.
+def with_larger_segments(graph: Graph, free_mib: float | None = None) -> Graph:
+    """Return the graph with larger segments where /dev/shm has space for them.
 
-    A segment is how long a listener may be held up before images are lost to it: a quarter of a second of two cameras
+    A segment is how long a subscriber may be delayed before images are lost to it: a quarter of a second of two cameras
     in the least that a graph asks for. Fast DDS itself can take longer, when it meets many new participants.
     """
     free = shm_free_mib() if free_mib is None else free_mib
-    times = min(_ROOMY, int(_PART * free / shm_need_mib(graph)))
+    times = min(_GROWTH, int(_SHARE * free / shm_need_mib(graph)))
     if times < 2:
         return graph
     nodes = {
@@ -130,9 +130,9 @@ def names_of(domain: int, shm: Path = SHM) -> set[str]:
 
 
 def unused(names: Iterable[str], shm: Path = SHM) -> list[str]:
-    """Return those of the named segments, ports and fields that exist and that nobody uses any more.
+    """Return those of the named segments, ports and fields that exist and are no longer in use.
 
-    In use is what is locked, or mapped by any process that can be seen.
+    In use is what is locked, or mapped by any visible process.
     """
     wanted = {name for name in names if (shm / name).exists()}
     if not wanted:
@@ -143,7 +143,7 @@ def unused(names: Iterable[str], shm: Path = SHM) -> list[str]:
 
 
 def sweep(names: Iterable[str], shm: Path = SHM) -> list[str]:
-    """Remove those of the named segments, ports and fields that nobody uses any more; return them.
+    """Remove those of the named segments, ports and fields that are no longer in use; return them.
 
     A process that sends to one that has just died opens its port anew, without the lock by which `fastdds shm clean`
     knows a port; such ports would stay for ever.

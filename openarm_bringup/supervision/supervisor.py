@@ -62,7 +62,7 @@ class Supervisor:
         ladder: Ladder | None = None,
         poll: float = 0.1,
     ) -> None:
-        self.graph = shm.with_room(graph)
+        self.graph = shm.with_larger_segments(graph)
         self.run_dir = run_dir
         self._make_probe = probe
         self._probe: asyncio.Future[Probe] | None = None

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a person sees of a graph: the web page, and Foxglove."""
+"""Visualisation of a graph: the web page, and Foxglove."""

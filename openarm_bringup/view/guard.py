@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who may speak to a server that moves a robot: a token a run, the host name it was called by, the page that asks.
+"""Authorisation for a server that moves a robot: a token a run, the host name of the request, the page it comes from.
 
 A browser lets any page of the internet send requests to this machine. What keeps such a page out: it does not know the
 token; its `Origin` is not ours; and a name of its own that it makes point here (DNS rebinding) is none of our names.
@@ -70,7 +70,7 @@ class Guard:
         raise _refused(f"{page} may not ask; open the address that was printed")
 
     def check_token(self, token: str | None) -> None:
-        """Refuse who does not know the token.
+        """Refuse a request without the token.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT.

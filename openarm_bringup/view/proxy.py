@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A door before a websocket server that can't tell who knocks: checks each connection, then passes frames both ways.
+"""A proxy that authorises connections to a websocket server, then passes frames in both directions.
 
-The SDK's server neither knows a token nor looks at `Origin` or `Host`, so it listens where a page can't find it, on a
-random address of the 2^24 in 127.0.0.0/8 and a random port, and this door is the only one that is told where.
+The SDK's server checks neither a token nor `Origin` nor `Host`, so it listens where a page can't find it, on a random
+address of the 2^24 in 127.0.0.0/8 and a random port, and only this proxy knows it.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ def hidden_address() -> str:
     return f"127.{a}.{b}.{1 + c % 254}"
 
 
-class Door:
+class Proxy:
     """Listens in a thread of its own until it is closed.
 
     Args:
-        guard: Decides who may.
+        guard: Authorises requests.
         port: TCP port on the loopback address; 0 takes any that is free.
         inner: `ws://` address of the server behind.
 
@@ -39,7 +39,7 @@ class Door:
     def __init__(self, guard: Guard, port: int, inner: str) -> None:
         self._guard, self._inner = guard, inner
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="door", daemon=True)
+        self._thread = threading.Thread(target=self._loop.run_forever, name="proxy", daemon=True)
         self._thread.start()
         self._runner = web.AppRunner(self._app(), access_log=None, shutdown_timeout=0.5)
         try:
@@ -84,11 +84,11 @@ class Door:
             chosen = [inner.protocol] if inner.protocol else []
             outer = web.WebSocketResponse(protocols=chosen, max_msg_size=2**20, compress=False)
             await outer.prepare(request)
-            ways = [asyncio.create_task(_pass(inner, outer)), asyncio.create_task(_pass(outer, inner))]
-            _, rest = await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-            for way in rest:
-                way.cancel()
-            await asyncio.gather(*ways, return_exceptions=True)
+            directions = [asyncio.create_task(_pass(inner, outer)), asyncio.create_task(_pass(outer, inner))]
+            _, rest = await asyncio.wait(directions, return_when=asyncio.FIRST_COMPLETED)
+            for task in rest:
+                task.cancel()
+            await asyncio.gather(*directions, return_exceptions=True)
             await inner.close()
             await outer.close()
         return outer

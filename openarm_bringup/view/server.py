@@ -46,7 +46,7 @@ _MAX_BYTES = 4096
 class Order(Config):
     """A grasp that a page asks for."""
 
-    label: str = Field(default="", max_length=64, description="what to pick; empty = what is seen best")
+    label: str = Field(default="", max_length=64, description="what to pick; empty = the best detection")
     arm: Literal["auto", "left", "right"] = "auto"
     dry_run: bool = False
 
@@ -59,7 +59,7 @@ class Reset(Config):
 
 
 class Wants(Config):
-    """What a page looks at."""
+    """Layers that a page wants."""
 
     want: tuple[str, ...] = Field(max_length=32)
 
@@ -94,8 +94,8 @@ class ViewServer:
     """Serves pages; made and used in one asyncio loop.
 
     Args:
-        guard: Decides who may.
-        hello: What a page is told first: the robot, the cameras, the states of a grasp.
+        guard: Authorises requests.
+        hello: What a page gets first: the robot, the cameras, the states of a grasp.
         view: Observes the graph; its methods but `want` block, and are called in threads.
     """
 
@@ -126,7 +126,7 @@ class ViewServer:
             if item.layer in page.wants:
                 page.give(item.key, item.payload)
 
-    # --- who may
+    # --- authorisation
     @web.middleware
     async def _check(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -150,7 +150,7 @@ class ViewServer:
             response.headers.update(_HEADERS)
         return response
 
-    # --- what is shown
+    # --- layers
     async def _page(self, _: web.Request) -> web.Response:
         return self._response("index.html")
 
@@ -211,12 +211,12 @@ class ViewServer:
         self._demand()
 
     def _demand(self) -> None:
-        """Look at what some page wants; what none wants any more is not kept, it would be old when one does."""
+        """Observe what some page wants; what none wants any more is not kept, it would be stale later."""
         wanted = frozenset[str]().union(*(page.wants for page in self._pages))
         self._kept = {key: item for key, item in self._kept.items() if item.layer in wanted | ALWAYS}
         self._view.want(wanted)
 
-    # --- what is asked
+    # --- requests
     async def _pick(self, request: web.Request) -> web.Response:
         order = await _body(request, Order)
         if self._picking is not None and not self._picking.done():

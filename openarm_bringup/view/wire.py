@@ -25,7 +25,7 @@ from openarm_perception.geometry.depth import Deprojector
 
 _KEY_ZERO = 1 << 15
 _GREY = (0.6, 0.6, 0.6, 1.0)
-#: Cells of a cloud are counted from here, 2^20 each way.
+#: Added to cell indices of a cloud: 2^20 in each direction.
 _OFFSET = 1 << 20
 
 
@@ -53,7 +53,7 @@ def _shape(link: int, shape: Primitive) -> dict[str, Any]:
 
 
 def link_poses(description: RobotDescription, q: Mapping[str, float]) -> Floats:
-    """`T_base_link` (n, 16) of all links by columns, in their order; joints that are not known stand at 0."""
+    """`T_base_link` (n, 16) of all links by columns, in their order; unknown joints are at 0."""
     at = {name: 0.0 for name, joint in description.joints.items() if joint.type != "fixed"} | dict(q)
     poses = description.link_poses(at)
     return np.array([poses[link].T.ravel() for link in description.links], np.float32)
@@ -74,7 +74,7 @@ class CloudMaker:
     Args:
         deprojector: With the limits of the camera.
         edge: One point is kept for each cell of this edge, m.
-        stride: Only every so many-th pixel of a row and column is looked at.
+        stride: Every so many-th pixel of a row and column is used.
     """
 
     def __init__(self, deprojector: Deprojector, edge: float = 0.01, stride: int = 2) -> None:

@@ -34,7 +34,7 @@ NATIVE = "/opt/ros/jazzy/lib/python3.12/site-packages/rclpy/__init__.py"
 def test_the_simulators_version_is_the_first_check() -> None:
     first = checks.check_versions(GOOD)[0]
     assert (first.name, first.level) == ("mujoco", "ok")
-    assert "4.0.0" in first.seen
+    assert "4.0.0" in first.observed
 
 
 @pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def test_missing_package_is_an_error() -> None:
 def test_more_than_one_ros_is_an_error(environ: dict[str, str], file: str, words: str) -> None:
     (finding,) = checks.check_ros(environ, file, "7.1.6", PREFIX)
     assert finding.level == "error"
-    assert words in finding.seen
+    assert words in finding.observed
     assert finding.advice
 
 
@@ -81,7 +81,7 @@ def test_wheels_alone_and_native_jazzy_alone_are_both_fine() -> None:
 
 def test_rclpy_of_another_distribution_and_none_at_all_are_errors() -> None:
     assert checks.check_ros({}, WHEEL, "3.3.13", PREFIX)[0].level == "error"
-    assert "cannot be imported" in checks.check_ros({}, None, "", PREFIX)[0].seen
+    assert "cannot be imported" in checks.check_ros({}, None, "", PREFIX)[0].observed
 
 
 @pytest.mark.requirement("B-11")

@@ -13,7 +13,15 @@ import pytest
 
 from openarm_bringup.supervision.environment import node_arguments, node_environment, write_profile
 from openarm_bringup.supervision.graph import Graph, NodeSpec
-from openarm_bringup.supervision.shm import fields_of, mapped_by, names_of, ports_of, shm_need_mib, sweep, with_room
+from openarm_bringup.supervision.shm import (
+    fields_of,
+    mapped_by,
+    names_of,
+    ports_of,
+    shm_need_mib,
+    sweep,
+    with_larger_segments,
+)
 
 
 def make(folder: Path, name: str, *, lock: bool) -> Path:
@@ -104,9 +112,9 @@ def test_no_message_may_be_larger_than_its_segment(tmp_path: Path) -> None:
 
 def test_segments_grow_where_there_is_room(graph: Graph) -> None:
     need = shm_need_mib(graph)
-    sizes = [with_room(graph, times * 4 * need + 1).nodes["eye"].segment_mib for times in (0, 1, 2, 3, 9)]
+    sizes = [with_larger_segments(graph, times * 4 * need + 1).nodes["eye"].segment_mib for times in (0, 1, 2, 3, 9)]
     assert sizes == [8, 8, 16, 24, 32]
-    assert with_room(graph, 1000 * need).nodes["arm"] == graph.nodes["arm"]
+    assert with_larger_segments(graph, 1000 * need).nodes["arm"] == graph.nodes["arm"]
 
 
 def test_command_line_of_a_node_carries_name_remaps_and_parameters(graph: Graph, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ from openarm_perception.detection.localize import Localizer, LocalizerConfig, Lo
 from openarm_perception.detection.pipeline import Pipeline
 from openarm_perception.geometry.depth import DepthLimits
 
-#: A board is looked for twice a second in each camera: it is held still for as long, and the search takes longest.
+#: Boards are searched for twice a second in each camera: it is held still for as long, and the search is slow.
 _BOARD_PERIOD_NS = 500_000_000
 _STREAMS = ("color/image_raw", "depth/image_raw", "depth/camera_info")
 
@@ -56,7 +56,7 @@ class _Shot:
 
 @dataclass
 class _Found:
-    """What the frames showed."""
+    """Results of the frames."""
 
     frames: int = 0
     skipped: int = 0
@@ -69,15 +69,15 @@ def numbers_of(
     *,
     scene: str = "demo",
     board: Board | None = None,
-    tell: Callable[[int, int], None] = lambda done, of: None,
+    on_progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, float]:
     """Run detection, localisation, map and board detection on a bag.
 
     Args:
         bag: Open; with colour and depth of a camera of the suite, /joint_states and /tf_static.
-        scene: Whose table the objects stand on.
-        board: Which calibration board to look for; None is that of the suite.
-        tell: Called with the number of frames done, and of all.
+        scene: Scene whose table the objects stand on.
+        board: Calibration board to detect; None is that of the suite.
+        on_progress: Called with the number of frames done, and of all.
 
     Returns:
         By name: frames used and skipped, of each label how often it was found, where last (base frame), how far from
@@ -92,19 +92,19 @@ def numbers_of(
     table = load_scene(scene).table.top_z
     mapper = Mapper(description, GridConfig(), FilterConfig(), FieldConfig())
     found = _Found()
-    looked_ns: dict[str, int] = {}
+    searched_ns: dict[str, int] = {}
     for number, shot in enumerate(shots):
-        tell(number, len(shots))
+        on_progress(number, len(shots))
         limits = DepthLimits(near=shot.camera.near, far=shot.camera.far)
         pipeline = Pipeline(detector, Localizer(LocalizerConfig(), limits, table))
         try:
             _work(shot, states, pipeline, mapper, found)
         except OpenArmError:
             found.skipped += 1
-        if shot.t_ns - looked_ns.get(shot.camera.name, shot.t_ns - _BOARD_PERIOD_NS) >= _BOARD_PERIOD_NS:
-            looked_ns[shot.camera.name] = shot.t_ns
-            _look_for(board or CircleGrid(), shot, found)
-    tell(len(shots), len(shots))
+        if shot.t_ns - searched_ns.get(shot.camera.name, shot.t_ns - _BOARD_PERIOD_NS) >= _BOARD_PERIOD_NS:
+            searched_ns[shot.camera.name] = shot.t_ns
+            _detect_board(board or CircleGrid(), shot, found)
+    on_progress(len(shots), len(shots))
     if not found.frames:
         raise OpenArmError(
             Code.NOTHING_DETECTED,
@@ -154,7 +154,7 @@ def _work(shot: _Shot, states: RobotStateBuffer, pipeline: Pipeline, mapper: Map
     found.frames += 1
 
 
-def _look_for(board: Board, shot: _Shot, found: _Found) -> None:
+def _detect_board(board: Board, shot: _Shot, found: _Found) -> None:
     if shot.color is None:
         return
     rgb: NDArray[np.uint8] = image_to_array(shot.color)  # type: ignore[assignment]

@@ -47,7 +47,7 @@ class Player(ContextNode):
     Attributes:
         published: Messages so far.
         unknown: Types that no installed package has.
-        left: Topics that the graph makes itself, and that are not published therefore.
+        left: Topics that the graph publishes itself, and that are left to it.
         late_ms: The most that a message was published after its time.
     """
 
@@ -78,7 +78,7 @@ class Player(ContextNode):
         self._clock = self._node.create_publisher(Clock, _CLOCK, 1) if own_clock else None
 
     def __enter__(self) -> Player:
-        # A subscriber knows of a publisher a little later than the publisher of it; nothing tells when.
+        # A subscriber discovers a publisher a little later than the publisher discovers it; there is no event for that.
         began = changed = time.monotonic()
         before: list[int] = []
         while (now := time.monotonic()) - began < _MEET_S:
@@ -97,10 +97,10 @@ class Player(ContextNode):
         return self
 
     def _yield_to_graph(self) -> None:
-        """Leave the topics out that somebody publishes already.
+        """Leave out the topics that other nodes publish already.
 
         Raises:
-            OpenArmError: BUSY, when it is a robot that does.
+            OpenArmError: BUSY, when a robot publishes them.
         """
         for topic, publisher in list(self._publishers.items()):
             name = publisher.topic_name

@@ -2,7 +2,7 @@
 """Records topics of a running graph into a bag, as raw CDR.
 
 Messages are taken in one thread and written in another, with a bounded queue between them. What does not fit is
-counted as lost, and so is what never came: the numbers of the publishers tell.
+counted as lost, and so is what never arrived, by the sequence numbers of the publishers.
 """
 
 from __future__ import annotations
@@ -53,16 +53,16 @@ _QUEUE_BYTES, _LARGE = 512 * 2**20, 64 * 2**10
 _BEHIND_BYTES = 32 * 2**20
 _DISCOVERY_S = 0.5
 _LOOK_S = 0.005
-#: A graph is known when nothing new was seen of it for so long, s: a participant announces itself every three seconds.
-#: To meet one, Fast DDS opens its port in shared memory and, if nobody reads there just then, sleeps a third of a
-#: second with a lock that readers of other topics need: images that come meanwhile are lost. So everybody is met first,
-#: and then recorded.
+#: Discovery is complete after this long without a change, s: a participant announces itself every three seconds. On
+#: discovery Fast DDS opens its port in shared memory and, if no process reads there just then, sleeps a third of a
+#: second with a lock that readers of other topics need: images that arrive meanwhile are lost. So all participants are
+#: discovered first, and then recorded.
 _KNOWN_S, _LONGEST_S = 3.2, 12.0
-#: Messages that a reader keeps between two looks.
+#: Messages that a reader keeps between two reads.
 _DEPTH = 200
 #: Given a message as CDR and what is known of it.
 Take = Callable[[bytes, Mapping[str, Any]], None]
-#: The disk is left this much room, so that the bag can still be closed.
+#: This much of the disk is left free, so that the bag can still be closed.
 _SPARE_BYTES = 200 * 2**20
 #: What rosbag2 writes for "no limit".
 _NEVER_S = QosTime(9223372036, 854775807)
@@ -161,33 +161,33 @@ class Recorder(ContextNode):
         return sorted(self._topics)
 
     def wait_began(self, seconds: float) -> bool:
-        """Wait, but not longer, until it has met everybody on the graph and records; returns whether it does."""
+        """Wait until discovery is complete and it records, at most for a time, s; return whether it does."""
         return self._began.wait(seconds)
 
     def wait(self, seconds: float) -> bool:
-        """Wait, but not longer than until the recording ends by itself; returns whether it goes on."""
+        """Wait for a time, s, at most until the recording ends early; return whether it goes on."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self.recorded.ended), seconds)
         return not self.recorded.ended
 
-    def _meet(self) -> None:
-        """Wait until everybody on the graph has been met."""
+    def _await_discovery(self) -> None:
+        """Wait until discovery is complete."""
         began = changed_at = time.monotonic()
         met: object = None
         while not self._end.wait(0.05):
             topics = self._node.get_topic_names_and_types()
-            seen = self._node.get_node_names(), [(topic, self._node.count_publishers(topic)) for topic, _ in topics]
+            present = self._node.get_node_names(), [(topic, self._node.count_publishers(topic)) for topic, _ in topics]
             now = time.monotonic()
-            if seen != met:
-                met, changed_at = seen, now
+            if present != met:
+                met, changed_at = present, now
             if now - changed_at > _KNOWN_S or now - began > _LONGEST_S:
                 break
 
     def _listen(self) -> None:
-        self._meet()
+        self._await_discovery()
         self._discover()
         self._began.set()
-        # Looking into sixty readers takes 0.1 ms; an executor makes a wait set of them anew for every few messages.
+        # Polling sixty readers takes 0.1 ms; an executor makes a wait set of them anew for every few messages.
         found_at = time.monotonic()
         while not self._end.wait(_LOOK_S):
             if time.monotonic() - found_at > _DISCOVERY_S:
@@ -220,7 +220,7 @@ class Recorder(ContextNode):
                 continue
             profile = offered_qos(self._node, topic, _DEPTH)
             self._queue.put(_Topic(topic, kinds[0], from_profile(profile)))
-            reader = self._node.create_subscription(kind, topic, _in_vain, profile, raw=True)
+            reader = self._node.create_subscription(kind, topic, _unused, profile, raw=True)
             self._readers.append((reader, self._taker(topic)))
 
     def _taker(self, topic: str) -> Take:
@@ -234,9 +234,9 @@ class Recorder(ContextNode):
                 self.recorded.lost[topic] += missing
             if not self._thinner.keeps(topic, data):
                 return
-            # Where the disk can't follow, what is large gives way first.
-            room = _QUEUE_BYTES if len(data) > _LARGE else 2 * _QUEUE_BYTES
-            if self._bytes_in - self._bytes_out > room or self.recorded.ended:
+            # Where the disk can't keep up, large messages are dropped first.
+            limit = _QUEUE_BYTES if len(data) > _LARGE else 2 * _QUEUE_BYTES
+            if self._bytes_in - self._bytes_out > limit or self.recorded.ended:
                 self.recorded.lost[topic] += 1
                 return
             self._bytes_in += len(data)
@@ -273,8 +273,8 @@ class Recorder(ContextNode):
             self.recorded.bytes += len(data)
 
 
-def _in_vain(_: bytes) -> None:
-    """The callback of a reader that nobody spins."""
+def _unused(_: bytes) -> None:
+    """The callback of a reader that is polled, not spun."""
 
 
 class Thinner:

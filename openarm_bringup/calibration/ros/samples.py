@@ -35,11 +35,11 @@ class BagOptions:
     """What a bag does not say.
 
     Args:
-        camera: Whose images are used; empty: the only one there is.
-        board: Which board is looked for; None is the suite's.
-        carrier: Link that holds the board when the camera stands; empty is the node's parameter.
+        camera: Camera whose images are used; empty: the only one.
+        board: Board to detect; None is the suite's.
+        carrier: Link that holds the board when the camera is fixed; empty is the node's parameter.
         mount_seed: Of simulated mounts; None is what the bag says of itself.
-        gate: When the robot stands.
+        gate: When the robot is at rest.
     """
 
     camera: str = ""
@@ -60,7 +60,7 @@ class _Small:
 
 
 def samples_of(bag: Bag, options: BagOptions) -> tuple[SampleSet, list[Stretch]]:
-    """Take a sample of each stand of the robot in a bag.
+    """Take a sample of each posture in which the robot rests.
 
     Returns:
         The samples, and what became of all images.
@@ -75,7 +75,7 @@ def samples_of(bag: Bag, options: BagOptions) -> tuple[SampleSet, list[Stretch]]
     head = _head(bag, camera, optics, small, options)
     samples = SampleSet(head, small.robot)
     images = f"/{camera}{_IMAGES}"
-    # The first bytes of a message are its stamp; the pixels are looked at in a second pass, where they are wanted.
+    # The first bytes of a message are its stamp; the pixels are read in a second pass, where they are needed.
     stamps = [_stamp(record.data) for record in bag.records([images])]
     found = stretches(stamps, small.states, samples.joint_names, small.robot, options.gate)
     picker = Picker(samples, found)
@@ -87,7 +87,7 @@ def samples_of(bag: Bag, options: BagOptions) -> tuple[SampleSet, list[Stretch]]
 
 
 def _camera(bag: Bag, name: str) -> str:
-    """The camera whose images are used."""
+    """Return the camera whose images are used."""
     there = sorted(topic[1 : -len(_IMAGES)] for topic, count in bag.counts.items() if topic.endswith(_IMAGES) and count)
     if name and name not in there:
         raise OpenArmError(
@@ -126,8 +126,8 @@ def _small(bag: Bag, camera: str) -> _Small:
         elif record.topic == "/robot_description":
             urdf = deserialize_message(record.data, String).data
         else:
-            told = deserialize_message(record.data, CameraInfo)
-            optics[stamp_to_ns(told.header.stamp)] = intrinsics_from_info(told)
+            message = deserialize_message(record.data, CameraInfo)
+            optics[stamp_to_ns(message.header.stamp)] = intrinsics_from_info(message)
     states.sort(key=lambda state: state[0])
     # what the bag says of the robot holds, also where this suite knows the robot otherwise
     robot = RobotDescription.from_urdf(urdf) if urdf else RobotDescription.load()
@@ -158,7 +158,7 @@ def _parent(small: _Small, camera: str, base: str, configured: Mapping[str, Came
     for ancestor in (frame, *_ancestors(small.parents, frame)):
         if ancestor in links:
             return ancestor
-        if ancestor in above:  # such as `world`: the camera stands where the robot does
+        if ancestor in above:  # such as `world`: the camera is fixed relative to the robot
             return base
     raise OpenArmError(
         Code.NO_TRANSFORM,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Listens to a graph that runs, for `openarm doctor`."""
+"""Rates and diagnostics of a running graph, for `openarm doctor`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from openarm_bringup.doctor.graph import RATES, Heard
+from openarm_bringup.doctor.graph import RATES, GraphStatus
 from openarm_bringup.messages import interface
 from openarm_bringup.ros.peer import Peer
 from openarm_bringup.supervision.discovery import variables
@@ -20,20 +20,20 @@ from openarm_common.ros.node import QOS_COMMAND
 _LISTEN_S = 2.5
 
 
-def listen(run: RunRecord) -> Heard:
-    """Listen to the graph of a run for a few seconds."""
+def listen(run: RunRecord) -> GraphStatus:
+    """Subscribe to the graph of a run for a few seconds."""
     try:
         return _listen(run)
     except OpenArmError as error:
         if error.code != Code.NOT_READY:
             raise
-        return Heard({}, {}, [])  # that nobody is heard is what doctor says of its nodes
+        return GraphStatus({}, {}, [])  # no node is discovered: a finding, not a failure of this command
 
 
-def _listen(run: RunRecord) -> Heard:
+def _listen(run: RunRecord) -> GraphStatus:
     os.environ.update(variables(run.domain, run.discovery))
     counts: dict[str, int] = {}
-    said: dict[str, tuple[bool, str]] = {}
+    diagnostics: dict[str, tuple[bool, str]] = {}
 
     def count(topic: str) -> Any:
         def take(_: bytes) -> None:
@@ -43,8 +43,8 @@ def _listen(run: RunRecord) -> Heard:
 
     def note(message: DiagnosticArray) -> None:
         for status in message.status:
-            good = status.level in (DiagnosticStatus.OK, DiagnosticStatus.STALE)  # stale: it has said nothing yet
-            said[status.name.partition(":")[0]] = (good, status.message)
+            good = status.level in (DiagnosticStatus.OK, DiagnosticStatus.STALE)  # stale: nothing reported yet
+            diagnostics[status.name.partition(":")[0]] = (good, status.message)
 
     with Peer() as peer:
         names = [name for name, _ in peer.node.get_node_names_and_namespaces() if not name.startswith("_")]
@@ -56,4 +56,4 @@ def _listen(run: RunRecord) -> Heard:
         began = peer.node.get_clock().now()
         peer.spin_until(lambda: False, _LISTEN_S)
         seconds = (peer.node.get_clock().now() - began).nanoseconds * 1e-9
-    return Heard({topic: n / seconds for topic, n in counts.items()}, said, names)
+    return GraphStatus({topic: n / seconds for topic, n in counts.items()}, diagnostics, names)

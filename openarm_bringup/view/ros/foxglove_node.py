@@ -23,7 +23,7 @@ from rosgraph_msgs.msg import Clock
 from openarm_bringup.bags.definitions import full_definition
 from openarm_bringup.messages import interface
 from openarm_bringup.view.guard import LOOPBACK, Guard
-from openarm_bringup.view.proxy import Door, hidden_address
+from openarm_bringup.view.proxy import Proxy, hidden_address
 from openarm_bringup.view.ros.layers import Polled
 from openarm_bringup.view.viz import TOKEN_VARIABLE
 from openarm_common.config import Config
@@ -36,7 +36,7 @@ _ENCODING, _SCHEMA = "cdr", "ros2msg"
 
 
 class FoxgloveConfig(Config):
-    """Where it listens, and who may come."""
+    """Address, and who may connect."""
 
     port: int = Field(default=8765, ge=0, le=65535, description="on the loopback address; 0 takes any that is free")
     origins: tuple[str, ...] = Field(
@@ -46,7 +46,7 @@ class FoxgloveConfig(Config):
 
 
 class _Listener(ServerListener):
-    """Notes who came: what is latched is sent again to a client that comes later."""
+    """Counts subscribers: latched messages are sent again to clients that subscribe later."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -82,11 +82,11 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
             server_listener=self._listener,
             message_backlog_size=256,
         )
-        self._door = Door(guard, self.config.port, f"ws://{hidden}:{self._server.port}/")
-        self.port, self.token = self._door.port, guard.token
+        self._proxy = Proxy(guard, self.config.port, f"ws://{hidden}:{self._server.port}/")
+        self.port, self.token = self._proxy.port, guard.token
         self._channels: dict[str, tuple[foxglove.Channel, Any]] = {}
         self._unknown: set[str] = set()
-        self._heard: dict[str, Subscription] = {}
+        self._forwarded: dict[str, Subscription] = {}
         self._offered: set[str] = set()
         self._ask = BackgroundNode("foxglove_services", timeout=5.0)
         # Polled, so in no executor: a subscription to 100 Hz would cost more than all else here.
@@ -101,7 +101,7 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
 
     def close(self) -> None:
         """Close the websocket with all its clients, then the node."""
-        self._door.close()
+        self._proxy.close()
         self._server.stop()
         self._ask.close()
         self._time.close()
@@ -122,7 +122,7 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
         new = {name: services[name] for name in services.keys() - self._offered}
         self._server.add_services([self._service(name, kind) for name, kind in sorted(new.items())])
         self._offered = set(services)
-        self.diagnose(True, f"{len(self._channels)} topics, {len(self._heard)} of them forwarded")
+        self.diagnose(True, f"{len(self._channels)} topics, {len(self._forwarded)} of them forwarded")
 
     def _advertise(self, topic: str, name: str) -> None:
         try:
@@ -140,19 +140,19 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
         with self._listener.lock:
             wanted = {topic for topic, count in self._listener.counts.items() if count > 0}
             come, self._listener.come = self._listener.come, set()
-        for topic in self._heard.keys() - (wanted & self._channels.keys()):
-            self.destroy_subscription(self._heard.pop(topic))
+        for topic in self._forwarded.keys() - (wanted & self._channels.keys()):
+            self.destroy_subscription(self._forwarded.pop(topic))
         for topic in wanted & self._channels.keys():
-            if topic in come and topic in self._heard:  # latched messages are heard anew by a new subscription only
-                self.destroy_subscription(self._heard.pop(topic))
-            if topic not in self._heard:
-                self._heard[topic] = self._hear(topic)
-        if self._heard:
+            if topic in come and topic in self._forwarded:  # latched messages come again with a new subscription only
+                self.destroy_subscription(self._forwarded.pop(topic))
+            if topic not in self._forwarded:
+                self._forwarded[topic] = self._forward(topic)
+        if self._forwarded:
             clock = self._time.newest()
             self._time_ns = stamp_to_ns(clock.clock) if clock is not None else self._time_ns
             self._server.broadcast_time(self._now_ns())
 
-    def _hear(self, topic: str) -> Subscription:
+    def _forward(self, topic: str) -> Subscription:
         channel, kind = self._channels[topic]
 
         def forward(data: Any) -> None:

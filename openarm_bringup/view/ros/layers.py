@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a graph a page can look at, a class for each layer, which subscribes while it exists.
+"""Layers of a page: each is a class that subscribes while it exists.
 
 Subscriptions are polled and keep the newest message alone: of a topic with 100 Hz, no more is taken, and no more of it
 deserialised, than is shown.
@@ -50,20 +50,20 @@ _SILENT_S = 4.0
 
 
 class Polled:
-    """A subscription of a node that nobody spins.
+    """A subscription that is polled; its node is not spun.
 
     Args:
         node: Owns it.
         kind: Type of the messages.
         topic: Absolute name.
-        qos: How it listens.
+        qos: Quality of service.
     """
 
     def __init__(self, node: Node, kind: Any, topic: str, qos: QoSProfile = QOS_NEWEST) -> None:
         self.topic = topic
         self._node = node
-        self._subscription: Any = node.create_subscription(kind, topic, _nobody, qos)
-        self.heard_at = time.monotonic()
+        self._subscription: Any = node.create_subscription(kind, topic, _unused, qos)
+        self.received_at = time.monotonic()
 
     def take(self) -> list[Any]:
         """All messages that wait."""
@@ -73,7 +73,7 @@ class Polled:
             while (one := handle.take_message(kind, False)) is not None:
                 taken.append(one[0])
         if taken:
-            self.heard_at = time.monotonic()
+            self.received_at = time.monotonic()
         return taken
 
     def newest(self) -> Any | None:
@@ -83,19 +83,19 @@ class Polled:
 
     def silence(self, limit: float) -> str:
         """What to say when nothing has come for longer than a limit, s; else nothing."""
-        silent = time.monotonic() - self.heard_at
+        silent = time.monotonic() - self.received_at
         return f"nothing on {self.topic} for {silent:.0f} s" if silent > limit else ""
 
     def close(self) -> None:
-        """Stop listening."""
+        """Unsubscribe."""
         self._node.destroy_subscription(self._subscription)
 
 
 class Layer(ABC):
-    """One thing to look at.
+    """One layer.
 
     Attributes:
-        period: Between two looks, s.
+        period: Between two updates, s.
         fault: What keeps it from being shown; empty when nothing does.
     """
 
@@ -107,15 +107,15 @@ class Layer(ABC):
         self._polled: list[Polled] = []
 
     @abstractmethod
-    def look(self) -> Items:
-        """What is new since the last look."""
+    def update(self) -> Items:
+        """Yield what is new since the last update."""
 
     def close(self) -> None:
-        """Stop listening."""
+        """Unsubscribe."""
         for polled in self._polled:
             polled.close()
 
-    def _listen(self, kind: Any, topic: str, qos: QoSProfile = QOS_NEWEST) -> Polled:
+    def _subscribe(self, kind: Any, topic: str, qos: QoSProfile = QOS_NEWEST) -> Polled:
         self._polled.append(Polled(self._node, kind, topic, qos))
         return self._polled[-1]
 
@@ -125,16 +125,16 @@ class StatesLayer(Layer):
 
     def __init__(self, node: Node) -> None:
         super().__init__(node)
-        self._status = self._listen(
+        self._status = self._subscribe(
             GraspStatus, "/grasp/status", QoSProfile(depth=20, durability=QOS_LATCHED.durability)
         )
-        self._diagnostics = self._listen(DiagnosticArray, "/diagnostics", QoSProfile(depth=100))
-        self._speed = self._listen(Float64, "/sim/real_time_factor")
+        self._diagnostics = self._subscribe(DiagnosticArray, "/diagnostics", QoSProfile(depth=100))
+        self._speed = self._subscribe(Float64, "/sim/real_time_factor")
         self._steps: deque[dict[str, Any]] = deque(maxlen=40)
         self._nodes: dict[str, tuple[float, DiagnosticStatus]] = {}
         self._told = 0.0
 
-    def look(self) -> Items:
+    def update(self) -> Items:
         """Each transition of the grasp, in order; the rest once a second."""
         new = self._status.take()
         self._steps.extend(_step(message) for message in new)
@@ -161,11 +161,11 @@ class RobotLayer(Layer):
     def __init__(self, node: Node, description: RobotDescription) -> None:
         super().__init__(node)
         self._description = description
-        self._joints = self._listen(JointState, "/joint_states")
-        self._held = self._listen(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
+        self._joints = self._subscribe(JointState, "/joint_states")
+        self._held = self._subscribe(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
         self._shown: list[float] = []
 
-    def look(self) -> Items:
+    def update(self) -> Items:
         """Poses of the links when they have changed; held objects when they have."""
         joints = self._joints.newest()
         self.fault = self._joints.silence(1.0)
@@ -185,9 +185,9 @@ class ImageLayer(Layer):
     def __init__(self, node: Node, camera: str) -> None:
         super().__init__(node)
         self._camera = camera
-        self._image = self._listen(Image, f"/{camera}/color/image_raw")
+        self._image = self._subscribe(Image, f"/{camera}/color/image_raw")
 
-    def look(self) -> Items:
+    def update(self) -> Items:
         """The newest picture as JPEG."""
         image = self._image.newest()
         self.fault = self._image.silence(3.0)
@@ -204,16 +204,16 @@ class CloudLayer(Layer):
     def __init__(self, node: Node, description: RobotDescription, camera: CameraConfig) -> None:
         super().__init__(node)
         self._frame = camera.optical_frame
-        self._depth = self._listen(Image, f"/{camera.name}/depth/image_raw")
-        self._color = self._listen(Image, f"/{camera.name}/color/image_raw")
-        self._info = self._listen(CameraInfo, f"/{camera.name}/depth/camera_info")
-        self._static = self._listen(TFMessage, "/tf_static", QOS_STATIC_TF)
+        self._depth = self._subscribe(Image, f"/{camera.name}/depth/image_raw")
+        self._color = self._subscribe(Image, f"/{camera.name}/color/image_raw")
+        self._info = self._subscribe(CameraInfo, f"/{camera.name}/depth/camera_info")
+        self._static = self._subscribe(TFMessage, "/tf_static", QOS_STATIC_TF)
         self._states = RobotStateBuffer(description)
         self._maker = wire.CloudMaker(Deprojector(DepthLimits(near=camera.near, far=camera.far)))
         self._images: dict[Polled, Any] = {}
 
-    def look(self) -> Items:
-        """The cloud of the newest frame whose depth and colour are both here."""
+    def update(self) -> Items:
+        """Yield the cloud of the newest frame with both depth and colour."""
         for message in self._static.take():
             for edge in message.transforms:
                 T = transform_to_matrix(edge.transform)
@@ -239,9 +239,9 @@ class MapLayer(Layer):
 
     def __init__(self, node: Node) -> None:
         super().__init__(node)
-        self._map = self._listen(Octomap, "/octomap_binary", QOS_LATCHED)
+        self._map = self._subscribe(Octomap, "/octomap_binary", QOS_LATCHED)
 
-    def look(self) -> Items:
+    def update(self) -> Items:
         """Cells of the newest map."""
         message = self._map.newest()
         self.fault = self._map.silence(5.0)
@@ -252,34 +252,34 @@ class MapLayer(Layer):
 
 
 class DetectionsLayer(Layer):
-    """Objects as they are seen now."""
+    """Objects as they are detected now."""
 
     def __init__(self, node: Node) -> None:
         super().__init__(node)
-        self._detections = self._listen(Detection3DArray, "/detections_3d")
+        self._detections = self._subscribe(Detection3DArray, "/detections_3d")
 
-    def look(self) -> Items:
+    def update(self) -> Items:
         """The newest detections."""
         message = self._detections.newest()
         self.fault = self._detections.silence(3.0)
         if message is not None:
-            yield "detections", _text("detections", boxes=[_seen(d) for d in message.detections if d.results])
+            yield "detections", _text("detections", boxes=[_detection_box(d) for d in message.detections if d.results])
 
 
 class PlanLayer(Layer):
-    """The way of the tools on the newest plan."""
+    """Paths of the tools on the newest plan."""
 
     def __init__(self, node: Node) -> None:
         super().__init__(node)
-        self._preview = self._listen(MarkerArray, "/motion/preview", QOS_LATCHED)
+        self._preview = self._subscribe(MarkerArray, "/motion/preview", QOS_LATCHED)
 
-    def look(self) -> Items:
+    def update(self) -> Items:
         """The lines of the newest plan."""
         message = self._preview.newest()
         if message is not None:
             lines = [marker for marker in message.markers if marker.type == Marker.LINE_STRIP]
-            ways = [np.round([xyz(p) for p in line.points], 4).tolist() for line in lines if line.points]
-            yield "plan", _text("plan", ways=ways)
+            paths = [np.round([xyz(p) for p in line.points], 4).tolist() for line in lines if line.points]
+            yield "plan", _text("plan", ways=paths)
 
 
 def makers(
@@ -305,8 +305,8 @@ def makers(
     return fixed | images
 
 
-def _nobody(_: object) -> None:
-    """Nobody is called: the messages are taken."""
+def _unused(_: object) -> None:
+    """Never called: messages are polled."""
 
 
 def _text(kind: str, **values: Any) -> str:
@@ -338,7 +338,7 @@ def _by_name(node: dict[str, Any]) -> str:
     return node["name"]
 
 
-def _seen(detection: Any) -> dict[str, Any]:
+def _detection_box(detection: Any) -> dict[str, Any]:
     best = detection.results[0].hypothesis
     size = detection.bbox.size
     pose = pose_to_matrix(detection.bbox.center)

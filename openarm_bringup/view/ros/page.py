@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page's side of the graph: a thread that looks at the wanted layers, and what can be asked of the robot."""
+"""The graph for a page: a thread that polls the wanted layers, and requests to the robot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ANSWER_S = 30.0
 
 
 class GraphView(ContextNode):
-    """Looks at the graph and asks it; a context manager.
+    """Observes the graph and sends requests; a context manager.
 
     Args:
         on_item: Gets all that is new, in a thread of this object.
@@ -66,11 +66,11 @@ class GraphView(ContextNode):
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Names of all that can be looked at."""
+        """Names of all layers."""
         return tuple(self._makers)
 
     def want(self, layers: frozenset[str]) -> None:
-        """Look at these layers from now on, and at no others."""
+        """Observe these layers from now on, and no others."""
         self._wanted = layers
 
     def pick(self, order: Order) -> dict[str, Any]:
@@ -120,17 +120,17 @@ class GraphView(ContextNode):
                 for name, one in open_layers.items():
                     if now >= one.due:
                         one.due = now + one.layer.period
-                        self._look(name, one)
+                        self._poll(name, one)
         except BaseException as error:  # handed to the server, which ends with it
             self._on_end(error)
         finally:
             for one in open_layers.values():
                 one.layer.close()
 
-    def _look(self, name: str, one: _Open) -> None:
+    def _poll(self, name: str, one: _Open) -> None:
         fault = ""
         try:
-            for key, payload in one.layer.look():
+            for key, payload in one.layer.update():
                 self._on_item(Item(name, key, payload))
         except OpenArmError as error:  # one message that can't be shown
             fault = error.message
