@@ -63,7 +63,7 @@ def run_tasks(set_name: str, seeds: Sequence[int], noise: bool) -> Run:
     """Run tasks of a campaign in this process.
 
     Args:
-        set_name: Set of tasks, as `openarm campaign --set`.
+        set_name: Set of tasks, as `openarm campaign --suite`.
         seeds: One task each.
         noise: Whether depth is as noisy as a D435's.
     """
@@ -110,7 +110,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="one task")
     parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--set", default="nominal", dest="set_name")
+    parser.add_argument("--suite", default="nominal")
     parser.add_argument("--seed", type=int, default=0, help="of the first task")
     parser.add_argument("--tasks", type=int, default=5)
     parser.add_argument("--noise", action="store_true", help="depth as noisy as a D435's")
@@ -121,7 +121,7 @@ def main() -> int:
     for k in range(args.runs):
         disturbed = k == args.runs - 1
         with busy((os.cpu_count() or 1) if disturbed else 0):
-            run = run_in_new_process(args.set_name, seeds, args.noise)
+            run = run_in_new_process(args.suite, seeds, args.noise)
         runs.append(run)
         print(f"run {k + 1}{' beside busy processes' if disturbed else ''}: {', '.join(run.codes)}")
         print(f"  joints  {run.motion}")

@@ -6,9 +6,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from openarm_common.config import Config
 from openarm_motion.collision.collision import Clearance
@@ -115,6 +115,11 @@ class MapConfig(Config):
         default=0.03, ge=0.0, le=0.2, description="the same for a request's boxes and for what is held, m"
     )
     robot_padding: float = Field(default=0.005, ge=0.0, le=0.2, description="the same for the robot where it stands, m")
+
+    @field_validator("use", mode="before")
+    @classmethod
+    def _off(cls, value: Any) -> Any:
+        return "off" if value is False else value  # as YAML reads it without quotes
 
 
 class MotionConfig(Config):

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The performer's link to a robot in this process: planner and controllers are called, time passes in ticks."""
+"""The grasp's link to the robot in this process: the motion service and the controllers are called, time is ticks."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Awaitable, Callable, Coroutine, Generator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from copy import copy
 from typing import Any, TypeVar
 
@@ -12,41 +11,33 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.types import Array
-from openarm_evaluation.campaign.planner import arms_behind, boxes_of, request_of
-from openarm_evaluation.campaign.robot import SimRobot
-from openarm_evaluation.campaign.traffic import Traffic
+from openarm_evaluation.campaign.robot import PLANNING_S, SimRobot
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.evidence import Verdict
+from openarm_grasp.planning.candidates import Box as GraspBox
 from openarm_grasp.planning.options import NoWayError
 from openarm_grasp.strategy import effects
 from openarm_grasp.strategy.effects import Frames, GoHome, Planned
 from openarm_grasp.strategy.link import check_deadline
-from openarm_motion.collision.collision import Box
-from openarm_motion.planning import moves
-from openarm_motion.planning.approach import ApproachFailedError, Refused, plan_approach
-from openarm_motion.planning.arm import Arm, Situation
-from openarm_motion.scene.memory import HeldMemory
-from openarm_motion.timing.checks import Motion, check_trajectory
+from openarm_motion.collision.solids import Box
+from openarm_motion.planning.approach import ApproachRequest, Target
+from openarm_motion.service.requests import (
+    ExecuteRequest,
+    LineGoal,
+    MotionAnswer,
+    MoveRequest,
+    NamedGoal,
+    PlanApproachRequest,
+)
+from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import Trajectory
-from openarm_sim_bridge.control.arm import End, TrajectoryOutcome
 from openarm_sim_bridge.control.gripper import GripperGoal, GripperOutcome
-from openarm_sim_bridge.control.trajectory import Trajectory as FollowedTrajectory
 from openarm_sim_bridge.world.touch import pad_links
 
 T = TypeVar("T")
-
-#: Simulated time that a plan takes, s: a robot's world goes on while it thinks.
-PLANNING_S = 0.1
-
-
-class _Turn:
-    """Awaited by coroutines of this link: gives one control tick."""
-
-    def __await__(self) -> Generator[None, None, None]:
-        yield
+AnswerT = TypeVar("AnswerT", bound=MotionAnswer)
 
 
 class DirectLink:
@@ -60,23 +51,18 @@ class DirectLink:
     def __init__(self, robot: SimRobot, config: GraspConfig) -> None:
         self.robot = robot
         self._config = config
-        table = robot.scene.table
-        self._arms = arms_behind(table.top_z, table.centre, table.extents)
-        self._held = HeldMemory()
-        self._traffic = Traffic(self._arms)
-        self.planning_s: list[float] = []
         self.warnings: list[str] = []
         self.cancelled = ""
         self.deadline_ns = 0
-        #: Longest rest before a motion until the other arm leaves room, s; 0: both never move at once.
+        #: Longest start delay of a motion next to the other arm, s; 0: both never move at once.
         self.max_wait = 0.0
-        #: So many plans find no way, on purpose.
+        #: So many plans fail, by fault injection.
         self.plans_to_fail = 0
         #: Called after each tick; what it raises ends what is waited for.
         self.watch: Callable[[], None] = lambda: None
 
     def beside(self, max_wait: float) -> DirectLink:
-        """Another link to the same robot, for an arm that moves while another does."""
+        """Return another link to the same robot, for an arm that moves while another does."""
         link = copy(self)
         link.max_wait = max_wait
         return link
@@ -111,6 +97,11 @@ class DirectLink:
         """Stamp of the newest joint state."""
         return self.robot.states.latest()[0]
 
+    @property
+    def planning_s(self) -> list[float]:
+        """How long plans took, s of wall clock."""
+        return self.robot.planning_s
+
     def effort(self, joint: str) -> float:
         """Newest effort of a joint, N or N m."""
         return self.robot.efforts.get(joint, 0.0)
@@ -126,8 +117,9 @@ class DirectLink:
         if self.cancelled:
             raise OpenArmError(Code.CANCELLED, self.cancelled)
         check_deadline(self.now_ns, self.deadline_ns)
-        if self.robot.silent_s > self._config.limits.joint_state_timeout:
-            raise OpenArmError(Code.ROBOT_LOST, f"joint states have been silent for {self.robot.silent_s:.1f} s")
+        silent_s = self.robot.state_age()
+        if silent_s > self._config.limits.joint_state_timeout:
+            raise OpenArmError(Code.ROBOT_LOST, f"joint states have been silent for {silent_s:.1f} s")
 
     def warn(self, text: str) -> None:
         """Keep a warning for the report."""
@@ -145,26 +137,11 @@ class DirectLink:
                 guard()
             if self.robot.t_ns > deadline_ns:
                 raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
-            await _Turn()
+            await self.robot.pause()
 
     async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
         """Carry out several things at once."""
-        left = [part().__await__() for part in parts]
-        faults: list[Exception] = []
-        while True:
-            for work in list(left):
-                try:
-                    next(work)
-                except StopIteration:
-                    left.remove(work)
-                except OpenArmError as error:
-                    left.remove(work)
-                    faults.append(error)
-            if not left:
-                break
-            await _Turn()
-        if faults:
-            raise faults[0]
+        await self.robot.together(parts)
 
     async def observe(self, count: int, *, near: bool = False) -> Frames:
         """Frames that are taken from now on.
@@ -196,53 +173,35 @@ class DirectLink:
 
     # --- planning
     async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
-        """Plan in this thread; a constant time passes for the robot.
+        """Plan with the motion service.
 
         Raises:
             OpenArmError: With the planner's code.
         """
-        arm, request = self._arms[effect.arm], request_of(effect)
+        if self.plans_to_fail > 0:
+            self.plans_to_fail -= 1
+            await self.robot.wait(PLANNING_S)
+            raise OpenArmError(Code.NO_PLAN, f"{effect.arm} arm: no path, on purpose")
         after = effect.after if isinstance(effect, effects.PlanPlace) else None
-        start = after.q[-1] if isinstance(after, Trajectory) else ()
-        now = self._situation(arm, start)
-        began = time.perf_counter()
-        try:
-            if self.plans_to_fail > 0:
-                self.plans_to_fail -= 1
-                raise OpenArmError(Code.NO_PLAN, f"{arm.name} arm: no path, on purpose")
-            plan = plan_approach(arm, now, request)
-        except ApproachFailedError as error:
-            raise NoWayError(error.code, error.message, _verdicts(error.refusals)) from error
-        finally:
-            self.planning_s.append(time.perf_counter() - began)
-            await self.pass_time(PLANNING_S)
-        self._held.expect(arm.name, (plan.transfer, plan.approach), request.attached)
-        self._held.expect(arm.name, (plan.retreat,), plan.held_after)
-        return Planned(
-            plan.chosen,
-            plan.transfer,
-            plan.approach,
-            plan.retreat,
-            self.planning_s[-1],
-            _verdicts(plan.refusals),
-            plan.limit_margins,
+        request = PlanApproachRequest(
+            effect.arm,
+            approach_of(effect),
+            after.q[-1] if isinstance(after, Trajectory) else np.zeros(0),
+            self._config.velocity_scale,
+            boxes_of(effect.gone),
         )
+        answer = await self._asked(lambda stopped: self.robot.motion.plan_approach(request, stopped))
+        refusals = {refused.id: Verdict(refused.code, refused.message) for refused in answer.refusals}
+        if answer.error is not None:
+            raise NoWayError(answer.code, answer.message, refusals) from answer.error
+        transfer, approach, retreat = answer.parts
+        took_s = self.robot.planning_s[-1]
+        return Planned(answer.chosen, transfer, approach, retreat, took_s, refusals, answer.limit_margins)
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
         """How far the arm's TCP stays from a point, in any orientation."""
-        solver = self._arms[arm]
-        best = solver.inverse.nearest(T_base_tcp, self._situation(solver).start, position_only=True)
-        return {arm: float(best.position_error)}
-
-    def _situation(self, arm: Arm, start: Sequence[float] | Array = ()) -> Situation:
-        state = self._traffic.arrived(arm.name, self.robot.states.latest()[1])
-        return arm.situation(state, list(start), self._config.velocity_scale)
-
-    async def pass_time(self, seconds: float) -> None:
-        """Let simulated time pass."""
-        end_ns = self.robot.t_ns + round(seconds * 1e9)
-        while self.robot.t_ns < end_ns:
-            await _Turn()
+        answer = self.robot.motion.compute_ik(arm, T_base_tcp, (), free_orientation=True)
+        return {arm: float(answer.position_error)}
 
     # --- moving
     async def follow(
@@ -255,74 +214,59 @@ class DirectLink:
         """
         if not isinstance(trajectory, Trajectory):
             raise OpenArmError(Code.INTERNAL, f"{type(trajectory).__name__} is no trajectory of the planner")
-        try:
-            await self._follow(self._arms[arm], trajectory, what, guard)
-        except OpenArmError as error:
-            if error.code in (Code.CANCELLED, Code.ROBOT_LOST, Code.GRASP_LOST):
-                raise
-            raise OpenArmError(error.code, f"{what}: {error.message}") from error
-
-    async def _follow(self, arm: Arm, plan: Trajectory, what: str, guard: Callable[[], None] | None) -> None:
-        robot, state = self.robot, self.robot.states.latest()[1]
-        motion = check_trajectory(arm, Motion.of(plan), state)
-        expected, known = self._held.expected(arm.name, motion), self._held.held
-        boxes = {**known, arm.name: known.get(arm.name, ()) if expected is None else expected}
-        wait = self._traffic.room(arm, motion, robot.t_ns, state, boxes, self.max_wait)
-        if expected is not None:
-            self._hold(arm, expected)
-        follower = robot.controller.arms[arm.name]
-        ends: list[TrajectoryOutcome] = []
-        start_ns = robot.t_ns + round(wait * 1e9)
-        self._traffic.enter(arm.name, motion, start_ns)
-        try:
-            await self.until(lambda: robot.t_ns >= start_ns, wait + 1.0, what, guard)
-            checked = follower.check(FollowedTrajectory(tuple(plan.names), plan.t, plan.q, plan.v, plan.a))
-            measured = robot.world.read_joints().position[robot.columns(arm.names)]
-            follower.start(checked, robot.t_ns, measured, ends.append)
-            limit = motion.duration + arm.config.execution.overtime
-            await self.until(lambda: bool(ends), limit, what, lambda: self._traffic.look_out(arm.name, guard))
-        except OpenArmError:
-            follower.cancel()
-            for _ in range(100 if robot.t_ns > start_ns else 0):
-                if ends:
-                    break
-                await _Turn()
-            raise
-        finally:
-            arrived = bool(ends) and ends[0].end is End.SUCCEEDED
-            self._traffic.leave(arm.name, robot.t_ns, robot.states.latest()[1], arrived=arrived)
-        if ends[0].end is not End.SUCCEEDED:
-            raise OpenArmError(Code.EXECUTION_FAILED, f"controller of the {arm.name} arm: {ends[0].text}")
+        request = ExecuteRequest(arm, Motion.of(trajectory), self.max_wait)
+        await self._moved(lambda stopped: self.robot.motion.execute(request, stopped), what, guard)
 
     async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
         """Move the TCP on a straight line."""
-        arm = self._arms[effect.arm]
-        await self._move(arm, lambda now: moves.to_pose_on_line(arm, now, effect.T_base_tcp, moves.Around()), what)
+        await self._move(MoveRequest(effect.arm, LineGoal(effect.T_base_tcp), **self._options()), what)
 
     async def move_named(self, arm: str, named: str, effect: GoHome, what: str) -> None:
         """Move an arm on a free path to a posture."""
-        solver, around = self._arms[arm], moves.Around(boxes_of(effect.obstacles))
-        await self._move(solver, lambda now: moves.to_named(solver, now, named, around), what)
+        obstacles = boxes_of(effect.obstacles)
+        await self._move(MoveRequest(arm, NamedGoal(named), obstacles, **self._options()), what)
 
-    async def _move(self, arm: Arm, plan: Callable[[Situation], Trajectory], what: str) -> None:
-        try:
-            trajectory = plan(self._situation(arm))
-        except OpenArmError as error:
-            raise OpenArmError(error.code, f"{what}: {error.message}") from error
-        self._hold(arm, ())
-        await self.pass_time(PLANNING_S)
-        await self.follow(arm.name, trajectory, what)
+    def _options(self) -> dict[str, Any]:
+        return {"hand_empty": True, "scale": self._config.velocity_scale, "max_start_delay": self.max_wait}
 
-    def _hold(self, arm: Arm, boxes: Sequence[Box]) -> None:
-        """Note what an arm holds, as the motion node does, for those who look at it."""
-        if self._held.hold(arm.name, boxes):
-            by_link = ((self._arms[name].kinematics.tool_link, held) for name, held in self._held.held.items())
-            self.robot.held = tuple(HeldBox(b.id, link, b.T, tuple(b.size)) for link, held in by_link for b in held)
+    async def _move(self, request: MoveRequest, what: str) -> None:
+        await self._moved(lambda stopped: self.robot.motion.move(request, stopped), what)
+
+    async def _moved(
+        self,
+        ask: Callable[[Callable[[], bool]], Awaitable[AnswerT]],
+        what: str,
+        guard: Callable[[], None] | None = None,
+    ) -> None:
+        answer = await self._asked(ask, guard)
+        if answer.error is not None:
+            raise OpenArmError(answer.code, f"{what}: {answer.message}") from answer.error
+
+    async def _asked(
+        self, ask: Callable[[Callable[[], bool]], Awaitable[AnswerT]], guard: Callable[[], None] | None = None
+    ) -> AnswerT:
+        """The service's answer; what `check` or `guard` raise meanwhile cancels the request, and is raised then."""
+        faults: list[OpenArmError] = []
+
+        def stopped() -> bool:
+            try:
+                if not faults:
+                    self.check()
+                    if guard is not None:
+                        guard()
+            except OpenArmError as error:
+                faults.append(error)
+            return bool(faults)
+
+        answer = await ask(stopped)
+        if faults:
+            raise faults[0]
+        return answer
 
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Move the fingers; whether they arrived or push against something."""
         robot = self.robot
-        follower = robot.controller.grippers[arm]
+        follower = robot.simulated.controller.grippers[arm]
         state, column = robot.world.read_joints(), robot.columns([joint])[0]
         ends: list[GripperOutcome] = []
         goal = follower.check(GripperGoal(position, effort))
@@ -335,5 +279,16 @@ class DirectLink:
         return ends[0].stalled or ends[0].reached_goal
 
 
-def _verdicts(refusals: Sequence[Refused]) -> dict[str, Verdict]:
-    return {refused.id: Verdict(refused.code, refused.message) for refused in refusals}
+def boxes_of(boxes: Sequence[GraspBox]) -> tuple[Box, ...]:
+    """Boxes of the grasp as the planner's."""
+    return tuple(Box(box.id, box.T_frame_box, box.size) for box in boxes)
+
+
+def approach_of(effect: effects.PlanGrasp | effects.PlanPlace) -> ApproachRequest:
+    """What the planner is asked for a grasp or a place."""
+    ways = effect.candidates if isinstance(effect, effects.PlanGrasp) else effect.targets
+    targets = tuple(Target(w.id, w.T_base_tcp, w.approach_offset, w.retreat_offset, w.score) for w in ways)
+    if isinstance(effect, effects.PlanGrasp):
+        obstacles, touchable = boxes_of((*effect.obstacles, effect.target)), frozenset({effect.target.id})
+        return ApproachRequest(targets, obstacles, touchable=touchable, attached_after=True)
+    return ApproachRequest(targets, boxes_of(effect.obstacles), boxes_of((effect.held,)), detached_after=True)

@@ -14,9 +14,9 @@ from openarm_evaluation.campaign.sets import make_task
 def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
     """Run one task in this process and return its row, whatever happens."""
     from openarm_evaluation.campaign.mounts import with_mounts
+    from openarm_evaluation.campaign.parameters import suite_config
     from openarm_evaluation.campaign.robot import SimulatedSenses
     from openarm_evaluation.campaign.trial import Trials, crashed_row
-    from openarm_grasp.config import GraspConfig, HeldConfig
 
     task = make_task(options.set_name, seed)
     mounts: Mapping[str, Any] = {}
@@ -25,8 +25,8 @@ def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
             task, mounts = with_mounts(task, options.mount_seeds, folder / "mounts")
         trials = Trials(
             task,
-            SimulatedSenses(depth_noise=options.noise, detector=options.detector),
-            GraspConfig(held=HeldConfig(use_effort=options.use_effort)),
+            SimulatedSenses(depth_noise=options.noise, detector=options.detector, sets=options.graph_parameters()),
+            suite_config(options.graph_parameters()).grasp,
             mounts=mounts,
             folder=folder / "failures" / str(seed),
             again=options.command(seed),

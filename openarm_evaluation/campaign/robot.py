@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated robot in this process: physics, controllers, cameras and detection, one control tick at a time.
+"""The simulated robot in this process: physics, controllers, cameras, detection, map and motion, tick by tick.
 
 The parts are those of the node graph (world, followers, renderer, pipeline, faults); what is missing is only what lies
 between them: DDS, processes and the wall clock. World frame = base frame, m, rad; simulated time in ns.
@@ -7,9 +7,12 @@ between them: DDS, processes and the wall clock. World frame = base frame, m, ra
 
 from __future__ import annotations
 
+import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Generator, Mapping, Sequence
 from functools import cache
+from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,26 +27,40 @@ from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
-from openarm_common.scene.scene import Scene
+from openarm_common.scene.scene import Scene, Table
 from openarm_common.types import Array
+from openarm_evaluation.campaign.map_feed import SimulatedMap
+from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.judging.judge import Sample
 from openarm_grasp.evidence.observation import Detection, Frame
+from openarm_motion.planning.arm import Arm
+from openarm_motion.service.motion_service import MotionService, make_arms, table_box
+from openarm_motion.service.robot import Outcome
+from openarm_motion.timing.checks import Motion
+from openarm_octomap.grid import DepthScan
+from openarm_octomap.mapper import Frame as MapFrame
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.detection.kinds import DetectorKind
-from openarm_perception.detection.localize import Localizer, LocalizerConfig
+from openarm_perception.detection.localize import Localizer
 from openarm_perception.detection.looking import make_pipeline
-from openarm_perception.detection.network import NetworkConfig
 from openarm_perception.detection.pipeline import Pipeline
-from openarm_perception.detection.robot import RobotConfig, RobotFinder
+from openarm_perception.detection.robot import RobotFinder
 from openarm_perception.geometry.depth import DepthImage, DepthLimits
 from openarm_sim_bridge.cameras.cameras import SimulatedCameras
-from openarm_sim_bridge.cameras.noise import ColourNoiseConfig, DepthNoiseConfig
 from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
+from openarm_sim_bridge.control.arm import End, TrajectoryFollower, TrajectoryOutcome
+from openarm_sim_bridge.control.trajectory import Trajectory as FollowedTrajectory
+from openarm_sim_bridge.control.trajectory import TrajectoryError
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.robot import SimulatedRobot
-from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
 
+T = TypeVar("T")
+
+#: Simulated time that a plan takes, s: a robot's world goes on while it thinks.
+PLANNING_S = 0.1
+#: Frames of a camera that the map chooses from at an update.
+_FRAMES = 5
 _TRUTH_NS = 50_000_000
 #: How long the joint trace reaches back, s.
 _TRACE_S = 60.0
@@ -54,8 +71,20 @@ class SimulatedSenses(Config):
 
     depth_noise: bool = Field(default=True, description="depth as noisy as a D435's")
     detector: DetectorKind = Field(default="color", description="what finds objects")
-    max_rate: float = Field(default=10.0, gt=0.0, description="most frames that are detected in, Hz")
     latency: float = Field(default=0.06, ge=0.0, le=1.0, description="from an image to its detections, s")
+    sets: tuple[str, ...] = Field(default=(), description="parameters of nodes, node.param=value")
+
+    def parameters(self) -> tuple[str, ...]:
+        """Return all of it as parameters of nodes."""
+        noise = f"mujoco_bridge.depth_noise.enabled={str(self.depth_noise).lower()}"
+        return (noise, *(f"{node}.detector={self.detector}" for node in ("detector", "wrist_detector")), *self.sets)
+
+
+class _Turn:
+    """Awaited by coroutines of this process: gives one control tick."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        yield
 
 
 class SimRobot:
@@ -83,16 +112,18 @@ class SimRobot:
         self.scene = scene
         self.description = RobotDescription.load()
         self.cameras = load_cameras()
-        self._senses = senses
-        stage = Stage(self.description, self.cameras, mount_seed, PhysicsConfig())
+        self._latency_s, self._sets = senses.latency, senses.parameters()
+        self.suite = suite = suite_config(self._sets)
+        stage = Stage(self.description, self.cameras, mount_seed, suite.bridge.physics)
         stage.home |= posture or {}
-        self.simulated = SimulatedRobot.on(stage, scene)
+        bridge = suite.bridge
+        self.simulated = SimulatedRobot.on(stage, scene, bridge.trajectory, bridge.gripper)
         self.world = self.simulated.world
-        self.controller = self.simulated.controller
         self.world_faults = self.simulated.faults
-        rng = np.random.default_rng([seed, 77])
-        noise = DepthNoiseConfig(enabled=senses.depth_noise)
-        self._drawing = SimulatedCameras(shared_renderer, self.cameras, noise, ColourNoiseConfig(), rng)
+        self._rng = np.random.default_rng([seed, 77])
+        self._drawing = SimulatedCameras(
+            shared_renderer, self.cameras, bridge.depth_noise, bridge.colour_noise, self._rng
+        )
         self.camera_faults = self._drawing.faults
         self.states = RobotStateBuffer(self.description)
         self.efforts: dict[str, float] = {}
@@ -102,7 +133,6 @@ class SimRobot:
         #: Share of the frames in which the detector misses an object, on purpose.
         self.missed = 0.0
         self._mounts = dict(mounts or {})
-        self._rng = rng
         self._arriving: deque[tuple[int, Frame]] = deque()
         self.frames: deque[Frame] = deque(maxlen=64)
         #: What the hands hold, as the planner believes; the detector takes it for a part of the robot.
@@ -111,6 +141,14 @@ class SimRobot:
         self._detected_ns = -(10**12)
         self._table_z = scene.table.top_z
         self._told_ns = 0
+        #: How long plans took, s of wall clock.
+        self.planning_s: list[float] = []
+        self.map = SimulatedMap(self.description, suite.octomap)
+        self._controllers = {arm: _ArmController(self, arm) for arm in self.simulated.controller.arms}
+        arms = arms_behind(self._sets, scene.table)
+        frames = (self.description.root,)
+        self.motion = MotionService(self, suite.motion, arms, self.map, frames)
+        self.motion.on_held = self._take_held
         self._note()
 
     # --- time
@@ -148,10 +186,60 @@ class SimRobot:
                 sample = Sample(state.t_ns, readout.T_world_object[:3, 3].copy(), q, readout.linear, readout.angular)
                 self.tracks[readout.object.name].append(sample)
 
-    @property
-    def silent_s(self) -> float:
+    # --- what the motion service asks (openarm_motion.service.robot.RobotInterface)
+    def state_age(self) -> float:
         """How long no joint state has come, s."""
         return (self.t_ns - self._told_ns) * 1e-9
+
+    def now(self) -> float:
+        """Simulated time, s."""
+        return self.t_ns * 1e-9
+
+    def controller(self, arm: str) -> _ArmController:
+        """The controller of an arm."""
+        return self._controllers[arm]
+
+    async def pause(self) -> None:
+        """Let one control tick pass."""
+        await _Turn()
+
+    async def wait(self, seconds: float) -> None:
+        """Let simulated time pass."""
+        end_ns = self.t_ns + round(seconds * 1e9)
+        while self.t_ns < end_ns:
+            await _Turn()
+
+    async def compute(self, work: Callable[[], T], nominal: float = PLANNING_S) -> T:
+        """Run work now; a constant time passes for the robot."""
+        began = time.perf_counter()
+        try:
+            return work()
+        finally:
+            if nominal == PLANNING_S:
+                self.planning_s.append(time.perf_counter() - began)
+            await self.wait(nominal)
+
+    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
+        """Run coroutines concurrently, tick by tick, until all have ended."""
+        left = [part().__await__() for part in parts]
+        faults: list[OpenArmError] = []
+        while left:
+            for work in list(left):
+                try:
+                    next(work)
+                except StopIteration:
+                    left.remove(work)
+                except OpenArmError as error:
+                    left.remove(work)
+                    faults.append(error)
+            if left:
+                await _Turn()
+        if faults:
+            raise faults[0]
+
+    def _take_held(self) -> None:
+        held = self.motion.held_on_links().values()
+        self.held = tuple(HeldBox(b.id, link, b.T, tuple(b.size)) for link, boxes in held for b in boxes)
 
     # --- faults
     def inject(self, fault: Fault) -> None:
@@ -175,16 +263,21 @@ class SimRobot:
             self.frames.clear()
 
     def _see(self) -> None:
+        if self.suite.motion.map.use != "off" and self.map.due(self.t_ns):
+            scans = (self._scan(name) for name in self.suite.octomap.cameras)
+            self.map.update(self.t_ns, [scan for scan in scans if scan is not None], self.held)
         while self._arriving and self._arriving[0][0] <= self.t_ns:
             self.frames.append(self._arriving.popleft()[1])
-        if not self._looking or self.t_ns - self._detected_ns < 0.999e9 / self._senses.max_rate:
+        if not self._looking:
+            return
+        if self.t_ns - self._detected_ns < 0.999e9 / self.suite.detectors[self._looking].max_rate:
             return
         self._detected_ns = self.t_ns
         if self.camera_faults.drops(self._looking):
             return
         frame = self.detect(self._looking)
         if frame is not None:
-            late = self._senses.latency + self.camera_faults.delay_s(self._looking)
+            late = self._latency_s + self.camera_faults.delay_s(self._looking)
             self._arriving.append((self.t_ns + round(late * 1e9), frame))
 
     def detect(self, name: str) -> Frame | None:
@@ -192,13 +285,12 @@ class SimRobot:
         camera = self.cameras[name]
         stamp_ns = self.camera_faults.stamp_ns(name, self.t_ns)
         rgb, depth = self.draw(name)
-        self.images[name] = (self.t_ns, rgb, depth)
         try:
             T_base_camera = self.camera_pose(camera, stamp_ns)
             optics = self._drawing.intrinsics(name)
             view = DepthView(depth, optics, T_base_camera, camera.near, camera.far)
-            perceived = _pipeline(name, self._table_z, self._senses.detector).run(
-                rgb, depth, optics, T_base_camera, self._robot_in(view, stamp_ns)
+            perceived = _pipeline(self._sets, name, self._table_z).run(
+                rgb, depth, optics, T_base_camera, self._robot_in(name, view, stamp_ns)
             )
         except OpenArmError:
             return None  # as the detector: the frame is skipped, the next may do
@@ -206,7 +298,23 @@ class SimRobot:
         found = (Detection(d.label, d.score, d.T_base_object, np.array(d.size), d.method == "circle") for d in seen)
         return Frame(stamp_ns, tuple(found))
 
-    def _robot_in(self, view: DepthView, stamp_ns: int) -> Mask | None:
+    def _scan(self, name: str) -> MapFrame | None:
+        """What the map takes of a camera now; None when the frame is lost or its posture is not known."""
+        camera = self.cameras[name]
+        # of the frames since the last update the newest counts: all of them must be lost
+        if all(self.camera_faults.drops(name) for _ in range(_FRAMES)):
+            return None
+        stamp_ns = self.camera_faults.stamp_ns(name, self.t_ns)
+        at_ns = min(stamp_ns, self.states.latest()[0])
+        try:
+            joints, T_base_camera = self.states.joints_at(at_ns), self.camera_pose(camera, at_ns)
+        except OpenArmError:
+            return None
+        optics = self._drawing.intrinsics(name)
+        scan = DepthScan(self.draw(name)[1], optics, T_base_camera, camera.near, camera.far)
+        return MapFrame(name, stamp_ns, scan, joints)
+
+    def _robot_in(self, name: str, view: DepthView, stamp_ns: int) -> Mask | None:
         """Pixels of the robot and what it holds; None in a gap of the joint states, as the detector has it."""
         newest_ns, _ = self.states.latest()
         try:
@@ -214,17 +322,18 @@ class SimRobot:
             joints = self.states.joints_at(min(stamp_ns, newest_ns))
         except OpenArmError:
             return None
-        return _finder().find(view, joints, self.held)[0]
+        return _finder(self._sets, name).find(view, joints, self.held)[0]
 
     def draw(self, name: str) -> tuple[NDArray[np.uint8], DepthImage]:
-        """Colour and depth (mm) that a camera sees now."""
-        camera = self.cameras[name]
-        if self.camera_faults.frozen(name) and name in self.images:
-            return self.images[name][1:]
+        """Colour and depth (mm) that a camera sees now; the same image for whoever asks in this tick."""
+        camera, drawn = self.cameras[name], self.images.get(name)
+        if drawn is not None and (drawn[0] == self.t_ns or self.camera_faults.frozen(name)):
+            return drawn[1:]
         self._drawing.load(self.world.snapshot())
         rgb = np.empty((camera.height, camera.width, 3), np.uint8)
         depth = np.empty((camera.height, camera.width), np.uint16)
         self._drawing.draw(name, rgb, depth if camera.depth else None)
+        self.images[name] = (self.t_ns, rgb, depth)
         return rgb, depth
 
     def camera_pose(self, camera: CameraConfig, stamp_ns: int) -> Array:
@@ -249,15 +358,64 @@ def shared_renderer() -> SnapshotRenderer:
     return SnapshotRenderer(load_cameras())
 
 
-@cache
-def _finder() -> RobotFinder:
-    return RobotFinder(RobotDescription.load(), RobotConfig())
+class _ArmController:
+    """Implements `openarm_motion.service.robot.ArmController`."""
+
+    def __init__(self, robot: SimRobot, arm: str) -> None:
+        self._robot, self._follower = robot, robot.simulated.controller.arms[arm]
+        self.name = f"the {arm} arm's controller"
+
+    def ready(self) -> bool:
+        return True
+
+    def start(self, motion: Motion, begin_ns: int) -> _Goal:
+        robot, goal = self._robot, _Goal(self._follower)
+        measured = robot.world.read_joints().position[robot.columns(motion.names)]
+        points = FollowedTrajectory(motion.names, motion.t, motion.q, motion.v, motion.a, begin_ns)
+        try:
+            self._follower.start(self._follower.check(points), robot.t_ns, measured, goal.end)
+        except TrajectoryError as error:
+            goal.outcome = Outcome(False, f"{error.result.name}: {error.message}")
+        return goal
+
+
+class _Goal:
+    """Implements `openarm_motion.service.robot.TrajectoryGoal`."""
+
+    accepted = True
+
+    def __init__(self, follower: TrajectoryFollower) -> None:
+        self._follower = follower
+        self.outcome: Outcome | None = None
+
+    def end(self, outcome: TrajectoryOutcome) -> None:
+        self.outcome = Outcome(outcome.end is End.SUCCEEDED, f"{outcome.result.name}: {outcome.text}")
+
+    def cancel(self) -> None:
+        if self.outcome is None:
+            self._follower.cancel()
+
+
+def arms_behind(sets: tuple[str, ...], table: Table) -> Mapping[str, Arm]:
+    """Return the arms of the motion service behind a table; made once a process."""
+    return _arms(sets, table.model_dump_json())
 
 
 @cache
-def _pipeline(camera_name: str, table_z: float, kind: DetectorKind) -> Pipeline:
-    camera = load_cameras()[camera_name]
-    colors = load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig)
-    limits = DepthLimits(near=camera.near, far=camera.far)
-    localizer = Localizer(LocalizerConfig(), limits, table_z)
-    return make_pipeline(kind, ColorDetector(colors), NetworkConfig(), localizer)
+def _arms(sets: tuple[str, ...], table: str) -> Mapping[str, Arm]:
+    fixed = (table_box(Table.model_validate_json(table)),)
+    return make_arms(suite_config(sets).motion, RobotDescription.load(), fixed)
+
+
+@cache
+def _finder(sets: tuple[str, ...], camera: str) -> RobotFinder:
+    return RobotFinder(RobotDescription.load(), suite_config(sets).detectors[camera].self_filter)
+
+
+@cache
+def _pipeline(sets: tuple[str, ...], name: str, table_z: float) -> Pipeline:
+    config, camera = suite_config(sets).detectors[name], load_cameras()[name]
+    path = Path(config.colors) if config.colors else config_dir() / "params" / "detector.yaml"
+    colors = ColorDetector(load_config(path, ColorDetectorConfig))
+    localizer = Localizer(config.localizer, DepthLimits(near=camera.near, far=camera.far), table_z)
+    return make_pipeline(config.detector, colors, config.network, localizer, config.policy, config.label)

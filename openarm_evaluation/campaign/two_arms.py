@@ -15,7 +15,8 @@ from openarm_common import se3
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import PALETTE, Scene, SceneObject, parse_scene, random_scene
-from openarm_evaluation.campaign.planner import arms_behind, request_of
+from openarm_evaluation.campaign.link import approach_of
+from openarm_evaluation.campaign.robot import arms_behind
 from openarm_evaluation.campaign.tasks import Task
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.observation import Detection
@@ -97,8 +98,8 @@ def _graspable(scene: Scene, arm: str) -> bool:
     table, item, config = scene.table, scene.objects[0], GraspConfig()
     T = se3.make(se3.rot_z(item.yaw), item.centre(table))
     target = Detection(item.label, 1.0, T, np.array(item.size))
-    solver = arms_behind(table.top_z, table.centre, table.extents)[arm]
-    request = request_of(PlanGrasp(arm, propose(target, config), (), target_box(target, config)))
+    solver = arms_behind((), table)[arm]
+    request = approach_of(PlanGrasp(arm, propose(target, config), (), target_box(target, config)))
     try:
         plan_approach(solver, solver.situation(_home()), request)
     except OpenArmError as error:

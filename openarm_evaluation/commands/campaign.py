@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 def campaign(
     *,
     seeds: str = "0-9",
-    set_: Annotated[str, Parameter(name="--set")] = "nominal",
+    suite: str = "nominal",
+    set_: Annotated[tuple[str, ...], Parameter(name="--set")] = (),
     workers: int = 1,
     noise: bool = False,
     mount_seeds: str | None = None,
@@ -31,14 +32,15 @@ def campaign(
     out: Path | None = None,
     accept: float = 0.99,
 ) -> Outcome:
-    """Run seeded scenes faster than real time, without DDS, through the same grasp, planner, detector and physics.
+    """Run seeded scenes faster than real time, without DDS, through the code that the nodes run, with their parameters.
 
     Leaves a folder with campaign.json, .csv, .html and, of every scene that did not go as expected, pictures, cloud,
     joint trace and reason. With --out of an earlier run, the seeds that are done are not run again.
 
     Args:
         seeds: Such as 0-99 or 1,4,7-9.
-        set_: nominal, clutter, faults, endurance, handover, push, pairs or pairs_in_turn.
+        suite: nominal, clutter, faults, endurance, handover, push, pairs or pairs_in_turn.
+        set_: A parameter of a node of the graph `sim`, as node.param=value; may be given several times.
         workers: Processes.
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.
@@ -57,7 +59,8 @@ def campaign(
     from openarm_evaluation.demo.demo import parse_seeds
 
     options = CampaignOptions(
-        set_name=set_,
+        set_name=suite,
+        parameters=set_,
         seeds=parse_seeds(seeds),
         workers=max(1, workers),
         noise=noise,

@@ -7,15 +7,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code
 from openarm_common.scene.scene import Table, random_scene
 from openarm_evaluation.campaign.gap import LEAST_GAP, Gap, least_gap, watch_gap
-from openarm_evaluation.campaign.planner import arms_behind
-from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
+from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses, arms_behind
 from openarm_evaluation.campaign.sets import make_task
-from openarm_evaluation.campaign.traffic import Traffic
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
+from openarm_motion.collision.seen import SeenMap
+from openarm_motion.service.requests import ExecuteRequest, MotionAnswer
 from openarm_motion.timing.checks import Motion
 
 
@@ -71,7 +71,7 @@ def test_the_judge_of_the_gap_measures_what_mujoco_measures_pair_by_pair() -> No
 def test_the_gap_of_joint_states_is_that_of_the_simulation_which_they_come_from() -> None:
     robot, table = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False)), Table()
     home = robot.states.latest()[1]
-    arms = arms_behind(table.top_z, table.centre, table.extents)
+    arms = arms_behind((), table)
 
     def over(arm: str, y: float) -> dict[str, float]:
         target = np.eye(4)
@@ -93,30 +93,89 @@ def test_the_gap_of_joint_states_is_that_of_the_simulation_which_they_come_from(
     assert least_gap(states) == pytest.approx(distances[1], abs=1e-9)
 
 
-def test_an_arm_under_way_leaves_room_or_makes_the_other_rest() -> None:
-    table = Table()
-    arms = arms_behind(table.top_z, table.centre, table.extents)
-    robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
+def sweep(robot: SimRobot, x: float = 0.27) -> dict[str, Motion]:
+    """A motion of each arm over the middle of the table and back, in 4 s."""
     state = robot.states.latest()[1]
-    traffic = Traffic(arms)
     target = np.eye(4)
     target[:3, :3] = np.diag([1.0, -1.0, -1.0])
-    target[:3, 3] = (0.27, 0.0, 0.50)
-    over: dict[str, Motion] = {}
-    for name, arm in arms.items():
+    target[:3, 3] = (x, 0.0, 0.50)
+    motions: dict[str, Motion] = {}
+    for name, arm in robot.motion.arms.items():
         start = np.array([state[joint] for joint in arm.names])
         there = arm.inverse.position_solutions(target, 0.05, start)[0].q
-        over[name] = Motion(arm.names, np.array([0.0, 2.0, 4.0]), np.array([start, there, start]))
-    assert traffic.room(arms["left"], over["left"], 0, state, {}, 20.0) == 0.0
-    traffic.enter("left", over["left"], 0)
-    rest = traffic.room(arms["right"], over["right"], 0, state, {}, 20.0)
-    assert 0.5 < rest < 4.0  # it comes when the left arm is about to be gone
-    with pytest.raises(OpenArmError, match="would have to wait longer") as error:
-        traffic.room(arms["right"], over["right"], 0, state, {}, 0.2)
-    assert error.value.code is Code.IN_COLLISION
-    # The left arm stops in the middle: the right one, on its way there, must stop, too.
-    traffic.enter("right", over["right"], 0)
-    stopped = dict(state) | dict(zip(over["left"].names, over["left"].q[1].tolist(), strict=True))
-    traffic.leave("left", 0, stopped, arrived=False)
-    with pytest.raises(OpenArmError, match="left arm stopped on its way"):
-        traffic.look_out("right", None)
+        motions[name] = Motion(arm.names, np.array([0.0, 2.0, 4.0]), np.array([start, there, start]), np.zeros((3, 7)))
+    return motions
+
+
+def test_an_arm_next_to_one_under_way_starts_later_and_keeps_clear() -> None:
+    robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
+    gap, motions = watch_gap(robot), sweep(robot)
+    answers: dict[str, MotionAnswer] = {}
+
+    def part(arm: str, delay: float):
+        async def run() -> None:
+            answers[arm] = await robot.motion.execute(ExecuteRequest(arm, motions[arm], delay))
+
+        return run
+
+    carry_out(robot, robot.together([part("left", 20.0), part("right", 20.0)]))
+    assert [answer.code for answer in answers.values()] == [Code.OK, Code.OK]
+    assert answers["left"].start_delay == 0.0
+    assert 0.5 < answers["right"].start_delay < 4.0  # it comes when the left arm is about to be gone
+    assert gap.least >= LEAST_GAP
+
+
+def test_an_arm_that_may_not_wait_long_enough_is_refused_and_one_whose_way_is_blocked_holds() -> None:
+    robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
+    gap, motions = watch_gap(robot), sweep(robot)
+    answers: dict[str, MotionAnswer] = {}
+
+    async def left() -> None:
+        # cancelled over the middle of the table, where the right arm is to come
+        stopped = lambda: robot.t_ns > 2_200_000_000  # noqa: E731
+        answers["left"] = await robot.motion.execute(ExecuteRequest("left", motions["left"], 20.0), stopped)
+
+    async def right() -> None:
+        await robot.wait(0.05)
+        answers["refused"] = await robot.motion.execute(ExecuteRequest("right", motions["right"], 0.2))
+        answers["right"] = await robot.motion.execute(ExecuteRequest("right", motions["right"], 20.0))
+
+    carry_out(robot, robot.together([left, right]))
+    assert answers["refused"].code is Code.IN_COLLISION
+    assert "would have to wait longer" in answers["refused"].message
+    assert answers["left"].code is Code.CANCELLED
+    assert answers["right"].code is Code.IN_COLLISION
+    assert "the left arm stopped on its way" in answers["right"].message
+    assert gap.least >= LEAST_GAP
+
+
+def test_plans_in_process_see_the_map_of_the_rendered_images() -> None:
+    robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
+    robot.pass_time(0.1)
+    state = robot.motion.scene_state()
+    assert state.map_used, state.map_message
+    cells = SeenMap.of(robot.map.latest()).centres
+    for item in robot.scene.objects:  # each object is in it, and hardly anything else above the table
+        assert np.min(np.linalg.norm(cells - item.centre(robot.scene.table), axis=1)) < 0.06
+    assert cells[:, 2].max() < robot.scene.table.top_z + 0.15
+    robot.pass_time(0.5)
+    assert robot.motion.scene_state().map_version == state.map_version + 1
+
+
+def test_parameters_of_nodes_hold_in_process() -> None:
+    sets = ("motion.map.use=off", "octomap.grid.resolution=0.04", "motion.limits.default_scale=0.2")
+    robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False, sets=sets))
+    robot.pass_time(0.1)
+    assert robot.motion.scene_state().map_message == "switched off"
+    assert robot.map.config.grid.resolution == 0.04
+    assert robot.motion.arms["left"].scale(0.0) == 0.2
+
+
+def carry_out(robot: SimRobot, work) -> None:
+    for _ in range(3000):
+        try:
+            work.send(None)
+        except StopIteration:
+            return
+        robot.tick()
+    pytest.fail("it did not end within 30 s")

@@ -118,7 +118,7 @@ def test_a_gap_that_changes_on_the_way_is_a_slip_and_stops_the_carry() -> None:
 
 @pytest.mark.requirement("A-78")
 def test_the_endurance_task_asks_for_its_objects_again_and_again_in_one_world() -> None:
-    """The command `openarm campaign --set endurance` carries it out; here, that it is what it says."""
+    """The command `openarm campaign --suite endurance` carries it out; here, that it is what it says."""
     task = endurance(7)
     assert len(task.labels) == 20
     assert len(task.scene.objects) == len(set(task.labels)) == 2
