@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The examples of docs/extending.md, as they are written there."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from openarm_bringup.supervision.graph import load_graph
+from openarm_common.camera.cameras import load_cameras
+from openarm_common.errors import OpenArmError
+from openarm_common.resources import config_dir
+from openarm_motion.planning.planner import PlanQuery
+from openarm_motion.planning.planners import make_planner
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+
+
+def example(section: str, language: str, number: int = 0) -> str:
+    """A block of code of a section of the page."""
+    text = re.split(r"^## ", PAGE, flags=re.MULTILINE)
+    (chosen,) = [part for part in text if part.startswith(f"{section}\n")]
+    blocks = re.findall(rf"^( *)```{language}\n(.*?)^ *```$", chosen, re.MULTILINE | re.DOTALL)
+    return textwrap.dedent(blocks[number][1])
+
+
+def module(source: str) -> dict[str, Any]:
+    """Names that a module defines."""
+    names: dict[str, Any] = {"__name__": "example"}
+    exec(compile(source, "docs/extending.md", "exec"), names)
+    return names
+
+
+def test_each_recipe_touches_at_most_three_files_that_there_are() -> None:
+    recipes = re.findall(r"^Files: (.*?)\n\n", PAGE, re.MULTILINE | re.DOTALL)
+    assert len(recipes) == PAGE.count("\n## ")
+    for recipe in recipes:
+        files = re.findall(r"`([^`]+)`( \(new\))?", recipe)
+        assert len(files) <= 3
+        for path, new in files:
+            assert (ROOT / path).exists() == (not new), path
+
+
+def test_the_camera_is_read_and_its_graph_is_valid(tmp_path: Path) -> None:
+    cameras = tmp_path / "cameras.yaml"
+    known = (config_dir() / "params" / "cameras.yaml").read_text(encoding="utf-8")
+    cameras.write_text(known + textwrap.indent(example("A camera", "yaml"), "  "))
+    side = load_cameras(cameras)["side"]
+    assert side.optical_frame == "side_color_optical_frame"
+    graph = tmp_path / "three_cameras.yaml"
+    graph.write_text(example("A camera", "yaml", 1))
+    loaded = load_graph(str(graph))
+    assert loaded.nodes["side_detector"].params["camera"] == side.name
+    assert side.name in loaded.nodes["octomap"].params["cameras"]
+
+
+def test_the_detector_finds_what_is_colourful() -> None:
+    detector = module(example("A detector", "python"))["SaturatedDetector"]()
+    image = np.full((120, 160, 3), 180, np.uint8)
+    assert detector.detect(image) == ()
+    image[40:60, 50:80] = (200, 20, 20)
+    image[0:40, 100:130] = (20, 20, 200)
+    cut, whole = detector.detect(image)
+    assert (whole.label, whole.centre, whole.size, whole.truncated) == ("colourful", (64.5, 49.5), (30, 20), False)
+    assert whole.mask.all()
+    assert cut.truncated
+
+
+def test_the_planner_is_named_by_a_parameter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_planners.py").write_text(example("A planner", "python"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    planner = make_planner("my_planners:StraightPlanner")
+    bound = np.ones(2)
+
+    def query(*blocked: int) -> PlanQuery:
+        goals = np.array([[0.5, 0.0], [0.0, 0.5]])
+        free = {tuple(goal): number not in blocked for number, goal in enumerate(goals.tolist())}
+        return PlanQuery(np.zeros(2), goals, -bound, bound, lambda q: False, lambda a, b: free[tuple(b.tolist())])
+
+    path = planner.plan(query(0))
+    assert path.goal == 1
+    np.testing.assert_array_equal(path.waypoints, [[0.0, 0.0], [0.0, 0.5]])
+    with pytest.raises(OpenArmError, match="no straight line to 2 goals is free"):
+        planner.plan(query(0, 1))
