@@ -32,7 +32,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.domain import reserve_domain
 from openarm_common.scene.scene import SHAPES, Scene, random_scene
-from openarm_evaluation.detector.looks import surface
+from openarm_evaluation.detector.appearance import surface
 from openarm_evaluation.detector.training.report import evaluate
 from openarm_evaluation.detector.training.samples import Samples
 from openarm_evaluation.detector.yolo_text import write_classes, write_labels
@@ -65,7 +65,7 @@ def boxes_of(scene: Scene, poses: dict[str, NDArray[np.float64]]) -> tuple[NDArr
 
 def take(observer: Observer, seeds: range, folder: Path, scenes: Path) -> None:
     """Write a frame and its labels for every seed."""
-    observer.look(TOPIC)
+    observer.watch_camera(TOPIC)
     for seed in seeds:
         scene = scene_of(seed)
         path = scenes / f"scene_{seed}.yaml"

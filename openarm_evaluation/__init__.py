@@ -1,2 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluation: campaigns judged by ground truth, the demo, and the network detector's data and training."""
+"""Evaluation: campaigns judged by ground truth, the demonstration, data and training of the network detector.
+
+Example:
+    >>> from pathlib import Path
+    >>> from openarm_evaluation import CampaignOptions, run_campaign
+    >>> campaign = run_campaign(CampaignOptions("nominal", seeds=(0, 1, 2)), Path("runs/three"))  # doctest: +SKIP
+    >>> [row["outcome"] for row in campaign.rows]  # doctest: +SKIP
+    ['placed', 'placed', 'placed']
+
+A campaign runs in this process, on several or on several machines; with `rows_of_graph` as its runner, through the node
+graph.
+"""
+
+from typing import TYPE_CHECKING
+
+from openarm_common.lazy import attach
+
+if TYPE_CHECKING:
+    from openarm_evaluation.campaign.agree import compare
+    from openarm_evaluation.campaign.campaign import Campaign, run_campaign
+    from openarm_evaluation.campaign.options import CampaignOptions
+    from openarm_evaluation.campaign.sets import make_task
+    from openarm_evaluation.campaign.tasks import Task
+    from openarm_evaluation.demo.demo import DemoOptions, run_demo
+    from openarm_evaluation.judging.judge import JudgeConfig, Verdict, judge
+    from openarm_evaluation.judging.statistics import summarise
+
+__all__ = [
+    "Campaign",
+    "CampaignOptions",
+    "DemoOptions",
+    "JudgeConfig",
+    "Task",
+    "Verdict",
+    "compare",
+    "judge",
+    "make_task",
+    "run_campaign",
+    "run_demo",
+    "summarise",
+]
+
+__getattr__, __dir__ = attach(__name__, __file__)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether two campaigns of the same scenes came to the same: one in one process, one through the node graph.
+"""Agreement of two campaigns of the same scenes: one in process, one through the node graph.
 
-A scene agrees when it ended alike (placed, refused or failed, with the same code) and each object in it was taken by
-the same arm in as many attempts. Times and place errors are compared, but decide nothing: the machine has its part in
-them.
+A scene agrees when it ended alike (placed, refused or failed, with the same code) and each object in it was grasped by
+the same arm in as many attempts. Times and place errors are compared, but decide nothing: they depend on the machine.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ Row = Mapping[str, Any]
 
 
 def rows_of(folder: Path) -> list[Row]:
-    """Rows of a campaign that has ended, or been interrupted.
+    """Read the rows of a campaign that has ended, or been interrupted.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the folder has none.
@@ -33,10 +32,10 @@ def rows_of(folder: Path) -> list[Row]:
 
 
 def compare(rows: Sequence[Row], others: Sequence[Row]) -> dict[str, Any]:
-    """How far two campaigns agree on the scenes that both have.
+    """Compare two campaigns on the scenes that both have.
 
     Raises:
-        OpenArmError: INVALID_ARGUMENT, when they share no scene, or a seed stands for different scenes in them.
+        OpenArmError: INVALID_ARGUMENT, when they share no scene, or a seed means different scenes in them.
     """
     there = {(row["set"], row["seed"]): row for row in others}
     pairs = [(row, there[row["set"], row["seed"]]) for row in rows if (row["set"], row["seed"]) in there]
@@ -45,7 +44,7 @@ def compare(rows: Sequence[Row], others: Sequence[Row]) -> dict[str, Any]:
     changed = [a["seed"] for a, b in pairs if a["scene_hash"] != b["scene_hash"]]
     if changed:
         raise OpenArmError(
-            Code.INVALID_ARGUMENT, f"seeds {changed} stand for other scenes there: it was made with another version"
+            Code.INVALID_ARGUMENT, f"seeds {changed} mean other scenes there: it was made with another version"
         )
     differ = {a["seed"]: why for a, b in pairs if (why := _difference(a, b))}
     errors = [abs(x - y) for a, b in pairs for x, y in _both(a, b, "place_error_mm")]
@@ -59,7 +58,7 @@ def compare(rows: Sequence[Row], others: Sequence[Row]) -> dict[str, Any]:
 
 
 def _difference(a: Row, b: Row) -> str:
-    """What differs, "" when nothing does."""
+    """Return what differs; "" when nothing does."""
     faults: list[str] = []
     for key in ("outcome", "code"):
         if a[key] != b[key]:
@@ -67,7 +66,7 @@ def _difference(a: Row, b: Row) -> str:
     for x, y in zip(a["grasps"], b["grasps"], strict=False):
         faults += [f"{x['label']}: {key} {x[key]}, there {y[key]}" for key in ("arm", "attempts") if x[key] != y[key]]
     if len(a["grasps"]) != len(b["grasps"]):
-        faults.append(f"{len(a['grasps'])} objects were asked for, there {len(b['grasps'])}")
+        faults.append(f"{len(a['grasps'])} objects were requested, there {len(b['grasps'])}")
     return "; ".join(faults)
 
 
@@ -78,7 +77,7 @@ def _both(a: Row, b: Row, key: str) -> list[tuple[float, float]]:
 
 
 def text_of(result: Mapping[str, Any]) -> str:
-    """Lines for people."""
+    """Return lines for people."""
     agree = result["agree"]
     lines = [
         f"agree on {agree['count']} of {agree['n']} scenes = {100 * agree['rate']:.1f} % (95 %:"

@@ -62,7 +62,7 @@ def rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Genera
 
     Raises:
         OpenArmError: ENVIRONMENT, when Ray is not installed, no cluster is there, it has fewer processors than workers
-            are asked for, or a machine has another version of the suite; EXECUTION_FAILED, when workers are lost again
+            are requested, or a machine has another version of the suite; EXECUTION_FAILED, when workers are lost again
             and again.
     """
     ray = _connect(options)
@@ -122,7 +122,7 @@ def _connect(options: CampaignOptions) -> Any:
         ray.shutdown()
         raise OpenArmError(
             Code.ENVIRONMENT,
-            f"the cluster at {options.ray} has {cores} processors, {options.workers} workers were asked for; ask for"
+            f"the cluster at {options.ray} has {cores} processors, {options.workers} workers were requested; use"
             f" --workers {cores} or add machines",
         )
     return ray

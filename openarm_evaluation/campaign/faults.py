@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tasks in which one thing goes wrong, and how they may end: placed, or refused with the right code.
+"""Fault injection: tasks with one fault each, and how they may end: placed, or refused with the right code.
 
 Positions are in the base frame, m; the kind is the seed modulo the number of kinds, so that every kind comes as often.
 """
@@ -18,13 +18,13 @@ from openarm_common.scene.scene import Scene, SceneObject
 from openarm_evaluation.campaign.tasks import MISSES, PLAN_FAILS, FaultPlan, Task, nominal
 
 _NOTHING_HELD = (Code.GRASP_MISSED, Code.GRASP_LOST)
-#: The hand is somewhere else than planned: it meets the object, misses it, or is stopped.
+#: The hand is off its plan: it meets the object, misses it, or is stopped.
 _ASTRAY = (*_NOTHING_HELD, Code.HAND_COLLISION, Code.EXECUTION_FAILED, Code.PLACE_FAILED, Code.STALE_DATA)
 _NO_WAY = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN)
 
 
 def fault_task(seed: int) -> Task:
-    """The task of a seed."""
+    """Make the task of a seed."""
     names = list(KINDS)
     kind = names[seed % len(names)]
     return KINDS[kind](replace(_single(seed), set_name="faults", kind=kind), np.random.default_rng([seed, 3]))
@@ -39,7 +39,7 @@ Maker = Callable[[Task, np.random.Generator], Task]
 
 
 def _fault(name: str, *codes: Code, when: str = "", until_attempt: int = 0, **parameters: Any) -> Maker:
-    """A fault with fixed parameters; a pair (low, high) is drawn from."""
+    """Return a maker of a fault with fixed parameters; a pair (low, high) is drawn from."""
 
     def make(task: Task, rng: np.random.Generator) -> Task:
         drawn = {k: float(rng.uniform(*v)) if isinstance(v, tuple) else v for k, v in parameters.items()}
@@ -93,7 +93,7 @@ def _far(task: Task, rng: np.random.Generator) -> Task:
 
 
 def _walled(task: Task, rng: np.random.Generator) -> Task:
-    """The object stands in a close court of boxes a little higher."""
+    """Surround the object closely by boxes that are a little higher."""
     side = float(rng.choice((-1.0, 1.0)))
     x, y = float(rng.uniform(0.22, 0.30)), side * float(rng.uniform(0.18, 0.30))
     low = _target(task).model_copy(update={"shape": "box", "size": (0.05, 0.05, 0.05), "position": (x, y), "yaw": 0.0})
@@ -110,7 +110,7 @@ def _walled(task: Task, rng: np.random.Generator) -> Task:
 
 
 def _corridor(task: Task, rng: np.random.Generator) -> Task:
-    """A tall screen stands between the object and where the arm comes from."""
+    """Put a tall screen between the object and the side of the arm."""
     side = float(rng.choice((-1.0, 1.0)))
     x, y = float(rng.uniform(0.20, 0.28)), side * float(rng.uniform(0.15, 0.25))
     item = _target(task).model_copy(update={"position": (x, y)})
@@ -150,7 +150,7 @@ def _two_alike(task: Task, rng: np.random.Generator) -> Task:
 
 
 def _arm_in_the_way(task: Task, rng: np.random.Generator) -> Task:
-    """Both arms stand over the table, between the camera and the objects, when the request comes."""
+    """Hold both arms over the table, between the camera and the objects, when the request arrives."""
     right = (0.14, 2.46, -1.17, 1.79, -0.3, -0.4, 0.71)
     posture: dict[str, float] = {}
     for side, sign in (("right", (1,) * 7), ("left", (-1, -1, -1, 1, -1, -1, -1))):
@@ -178,7 +178,7 @@ KINDS: Mapping[str, Maker] = MappingProxyType(
         "arms_in_the_way": _arm_in_the_way,
         "corridor_blocked": _corridor,
         "intrinsics_off": _fault("intrinsics_bias", camera="overhead", focal=(-0.01, 0.01)),
-        # what may be recovered from, and must be told truly when not
+        # what may be recovered from, and must be reported truly when not
         "mount_knocked": _fault("mount_knocked", Code.OK, *_ASTRAY, *_NO_WAY, camera="overhead", mm=10.0, deg=1.0),
         "depth_patch": _depth_patch,
         "joints_late": _fault("joint_late", Code.OK, Code.EXECUTION_FAILED, ms=(50.0, 150.0)),

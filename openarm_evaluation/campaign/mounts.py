@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Camera mounts of a campaign: true ones that no configuration knows, each calibrated once by the suite itself.
 
-The robot stands in random postures in which the nominal mounts promise a view of the board; images are drawn from the
-true mounts, the marks are detected in them and the calibration is solved as on a real robot. World = base frame, m.
+The robot takes random postures in which the board is visible by the nominal mounts; images are rendered from the true
+mounts, the marks are detected in them and the calibration is solved as on a real robot. World = base frame, m.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from openarm_sim_bridge.world.model import build_spec
 from openarm_sim_bridge.world.world import Snapshot
 
 HAND = "openarm_right_link7"
-#: The board between the fingers, seen by a standing camera; and lying on the table, seen by one on the hand.
+#: The board between the fingers, for a fixed camera; and lying on the table, for one on the hand.
 _HELD = se3.make(se3.rotation_from_z_y((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.37))
 _PLACED = se3.make(se3.rotation_from_z_y((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)), (0.33, -0.2, 0.405))
 _SAMPLES = 15
 _SPREAD = 0.4  # rad, of each joint around the middle of the postures
-_NOT_SEEN = 200
+_MAX_MISSED = 200
 
 
 def with_mounts(
@@ -53,7 +53,7 @@ def with_mounts(
         task: The task.
         mount_seeds: To go through.
         folder: Of calibrations; those that it lacks are made.
-        names: Cameras that the grasp looks through.
+        names: Cameras that the grasp uses.
     """
     seed = mount_seeds[task.seed % len(mount_seeds)]
     store = CalibrationStore(folder / str(seed))
@@ -87,10 +87,10 @@ class Bench:
 
     def __init__(self, camera: CameraConfig, seed: int, folder: Path) -> None:
         self._camera, self._board, self._description = camera, CircleGrid(), RobotDescription.load()
-        self._standing = camera.parent != HAND
+        self._fixed = camera.parent != HAND
         posture = self._description.group_state
         self._home = {**posture("right_arm", "home"), **posture("left_arm", "home")}
-        self._T_carrier_board, carrier = (_HELD, HAND) if self._standing else (_PLACED, "")
+        self._T_carrier_board, carrier = (_HELD, HAND) if self._fixed else (_PLACED, "")
         write_board(self._board, folder / "board.xml")
         spec = build_spec(self._description, load_scene("empty"), load_cameras(), seed)
         child = mujoco.MjSpec.from_file(str(folder / "board.xml"))
@@ -105,7 +105,7 @@ class Bench:
         numbers = (optics.width, optics.height, optics.fx, optics.fy, optics.cx, optics.cy)
         head = SessionHead(
             camera=camera.name,
-            setup="to_hand" if self._standing else "in_hand",
+            setup="to_hand" if self._fixed else "in_hand",
             parent=camera.parent,
             carrier=HAND,
             intrinsics=numbers,
@@ -119,14 +119,14 @@ class Bench:
         """Take `count` samples.
 
         Raises:
-            OpenArmError: From the detector, when the board is hardly ever seen.
+            OpenArmError: From the detector, when the board is hardly ever visible.
         """
         lower, upper = self._description.limits(self.samples.joint_names)
         middle = self._middle()
         missed = 0
         while len(self.samples) < count:
             joints = self._joints(np.clip(middle + rng.uniform(-_SPREAD, _SPREAD, len(middle)), lower, upper))
-            if not self._seen(joints) or not self._free(joints):
+            if not self._visible(joints) or not self._free(joints):
                 continue
             renderer = shared_renderer()
             renderer.load(Snapshot(self._model, 0, self._data.qpos.copy()))
@@ -136,7 +136,7 @@ class Bench:
                 found = detect(self._board, grey)
             except OpenArmError:
                 missed += 1
-                if missed > _NOT_SEEN:
+                if missed > _MAX_MISSED:
                     raise
                 continue
             self.samples.take(0, Matched(joints, 0, 0.0), found)
@@ -148,21 +148,21 @@ class Bench:
         best, most = lower, 0
         for _ in range(tries):
             q = rng.uniform(lower + 0.1, upper - 0.1)
-            if not self._seen(self._joints(q)):
+            if not self._visible(self._joints(q)):
                 continue
             near = np.clip(q + rng.uniform(-_SPREAD, _SPREAD, (20, len(q))), lower, upper)
-            count = sum(self._seen(self._joints(k)) for k in near) if self._free(self._joints(q)) else 0
+            count = sum(self._visible(self._joints(k)) for k in near) if self._free(self._joints(q)) else 0
             if count > most:
                 best, most = q, count
         return best
 
-    def _seen(self, joints: dict[str, float]) -> bool:
+    def _visible(self, joints: dict[str, float]) -> bool:
         hand = self._description.link_pose(HAND, joints)
-        if self._standing:
+        if self._fixed:
             T = se3.inverse(self._camera.T_parent_optical) @ hand @ self._T_carrier_board
         else:
             T = se3.inverse(hand @ self._camera.T_parent_optical) @ self._T_carrier_board
-        # a board farther from the standing camera is below the table
+        # a board farther from the fixed camera is below the table
         return bool(T[2, 3] < 0.62) and visible(self._board, T, self._optics, (self._camera.width, self._camera.height))
 
     def _joints(self, q: Array) -> dict[str, float]:

@@ -104,7 +104,7 @@ def figures(data: Mapping[str, Any]) -> list[tuple[str, str]]:
     """The figures of a campaign as names and texts."""
     s = data["summary"]
     out = [
-        ("scenes", f"{s['n']} of {data['asked']} asked for"),
+        ("scenes", f"{s['n']} of {data['asked']} requested"),
         ("placed within the attempts", _rate(s["success_rate"])),
         ("placed at the first attempt", _rate(s["first_attempt_rate"])),
     ]
@@ -129,7 +129,7 @@ def figures(data: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _rate(v: Mapping[str, Any]) -> str:
     if not v["n"]:
-        return "none asked for"
+        return "none requested"
     return f"{v['count']} of {v['n']} = {100 * v['rate']:.1f} % (95 %: {100 * v['low']:.1f} to {100 * v['high']:.1f} %)"
 
 

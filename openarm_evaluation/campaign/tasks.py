@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a campaign asks: a scene, what to grasp in it, and what goes wrong on purpose; all of it from a set and a seed.
+"""Tasks of a campaign: a scene, the requested objects, and an injected fault; all of it from a set and a seed.
 
 Positions are in the base frame, m; the same set and seed always give the same task.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from openarm_common.errors import Code
 from openarm_common.scene.scene import PALETTE, SPACING, Scene, random_scene
 
-#: Faults of the campaign's own: as many plans as the parameter `times` says find no way,
+#: Faults of the campaign itself: the first `times` plans fail,
 PLAN_FAILS = "plan_fails"
 #: and the detector misses each object in a `share` of the frames.
 MISSES = "detection_missed"
@@ -50,17 +50,17 @@ class Task:
         set_name: Of `SETS`.
         seed: Of everything that is drawn.
         scene: What is on the table.
-        labels: What is asked for, one after the other.
+        labels: Requested objects, one after the other.
         arm: auto, left or right.
         kind: What is special, for the report.
         fault: What goes wrong; None: nothing.
-        codes: How it may end; OK stands for placed. Without OK it is impossible and must be refused.
+        codes: Allowed results; OK is placed. Without OK it is impossible and must be refused.
         mount_seed: Of the true camera mounts; None: nominal.
-        place: (x, y) of the footprint centre that is asked for, base frame, m; None: chosen by the suite.
+        place: (x, y) of the requested footprint centre, base frame, m; None: chosen by the suite.
         posture: Joints that start elsewhere than at home, rad by name.
-        clear: Labels that come more than once are so many objects: what was placed stays where it is.
+        clear: Repeated labels are several objects: what was placed stays where it is.
         route: By which it must come to its place, as `GraspOutcome.route`; "": any.
-        together: Both labels are asked for at once, of both arms.
+        together: Both labels are requested simultaneously, of both arms.
     """
 
     set_name: str
@@ -80,12 +80,12 @@ class Task:
 
     @property
     def possible(self) -> bool:
-        """Whether it may end with all that was asked for placed."""
+        """Whether it may end with all requested objects placed."""
         return Code.OK in self.codes
 
 
 def nominal(seed: int) -> Task:
-    """A random scene, one or two objects asked for, the others in the way."""
+    """Make a random scene with one or two requested objects; the others are obstacles."""
     scene = random_scene(seed)
     rng = np.random.default_rng([seed, 1])
     wanted = min(len(scene.objects), 1 + int(rng.random() < 0.5))
@@ -93,14 +93,14 @@ def nominal(seed: int) -> Task:
 
 
 def clutter(seed: int) -> Task:
-    """Five to eight objects, all asked for; where there are more than colours, two of a colour are two tasks."""
+    """Request all of five to eight objects; where there are more than colours, two of a colour are two requests."""
     rng = np.random.default_rng([seed, 2])
     scene = crowded_scene(seed, int(rng.integers(5, 9)))
     return Task("clutter", seed, scene, tuple(item.label for item in scene.objects), kind="clutter", clear=True)
 
 
 def crowded_scene(seed: int, count: int) -> Scene:
-    """Objects of a random scene, more than there are colours: those beyond get the colours anew."""
+    """Make a random scene with more objects than colours: colours are used again."""
     whole = random_scene(seed, count=min(count, len(PALETTE)))
     objects, k = list(whole.objects), 0
     while len(objects) < count:
@@ -113,7 +113,7 @@ def crowded_scene(seed: int, count: int) -> Scene:
 
 
 def endurance(seed: int) -> Task:
-    """Two objects, picked and placed ten times each in one world: nothing is reset, and no failure is made good."""
+    """Request two objects ten times each in one world: nothing is reset or repaired in between."""
     scene = random_scene(seed, count=2)
     labels = tuple(item.label for item in scene.objects)
     return Task("endurance", seed, scene, _ENDURANCE * labels, kind="endurance")

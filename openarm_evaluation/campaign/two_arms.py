@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tasks that take both arms: a place that only the other arm reaches, an object that none can grasp where it stands.
+"""Dual-arm tasks: a place that only the other arm reaches, an object that neither arm can grasp where it is.
 
-Base frame, m; all is drawn from the seed. `Task.route` says by which way the object must have come to its place.
+Base frame, m; all is drawn from the seed. `Task.route` is the route by which the object must come to its place.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.strategy.effects import PlanGrasp
 from openarm_motion.planning.approach import plan_approach
 
-#: Objects of the hand-over stand, and are wanted, at least so far on one arm's side: the other reaches over to 0.21, m.
+#: Least distance of an object of a hand-over, and of its place, from the middle, m: the other arm reaches over to 0.21.
 _ASIDE = 0.26
 #: Between the middles of a place and any object, m.
-_ROOM = 0.13
-#: Where objects are looked for that no arm can grasp and a hand comes behind: before the robot, between the arms.
+_APART = 0.13
+#: Region of objects that no arm can grasp but a hand can push: in front of the robot, between the arms.
 _BAND_X, _BAND_ABS_Y = (0.37, 0.43), 0.03
 
 
 def handover_task(seed: int) -> Task:
-    """An object on one arm's side, wanted on the other's; none to two others stand about, and the middle is free."""
+    """Request an object on one arm's side to be placed on the other's; up to two others around, not in the middle."""
     rng = np.random.default_rng([seed, 4])
     while True:
         scene = random_scene(int(rng.integers(1 << 31)), count=int(rng.integers(1, 4)))
@@ -44,7 +44,7 @@ def handover_task(seed: int) -> Task:
             continue
         side = -np.sign(first.position[1])
         place = np.array([rng.uniform(0.18, 0.34), side * rng.uniform(_ASIDE, 0.40)]).round(3)
-        if all(np.linalg.norm(place - p) >= _ROOM for p in others):
+        if all(np.linalg.norm(place - p) >= _APART for p in others):
             break
     named = scene.model_copy(update={"name": f"handover_{seed}"})
     xy = (float(place[0]), float(place[1]))
@@ -52,7 +52,7 @@ def handover_task(seed: int) -> Task:
 
 
 def pair_task(seed: int) -> Task:
-    """Two objects, one for each arm, asked for at once; up to two others stand about."""
+    """Request two objects simultaneously, one for each arm; up to two others around."""
     rng = np.random.default_rng([seed, 6])
     while True:
         scene = random_scene(int(rng.integers(1 << 31)), count=int(rng.integers(2, 5)))
@@ -65,12 +65,12 @@ def pair_task(seed: int) -> Task:
 
 
 def in_turn_task(seed: int) -> Task:
-    """The same, one after the other: what the time of a pair is held against."""
+    """Request the same one after the other, to compare the time of a pair."""
     return replace(pair_task(seed), set_name="pairs_in_turn", kind="pair in turn", together=False)
 
 
 def push_task(seed: int) -> Task:
-    """An object before the robot, between the arms, so turned that neither can grasp it where it stands."""
+    """Request an object between the arms, turned so that neither can grasp it where it is."""
     rng = np.random.default_rng([seed, 5])
     while True:
         scene = _one_object(seed, rng)

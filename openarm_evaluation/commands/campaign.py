@@ -48,8 +48,8 @@ def campaign(
         detector: What finds objects: their colour, the network, or both checking each other.
         ray: Address of a Ray cluster, such as HOST:6379 or auto, whose machines share the workers.
         graph: Through a node graph of its own, over DDS and in real time, instead of in one process.
-        against: Folder of another campaign; how far both agree on the scenes that they share is told, and accepted by
-            the same share.
+        against: Folder of another campaign; agreement on the scenes of both is reported, and accepted by the same
+            share.
         out: Folder of the campaign; a new one below runs/ when not given.
         accept: Share of scenes that must go as expected.
     """

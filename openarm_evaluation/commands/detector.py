@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from openarm_evaluation.detector.training.report import Evaluation
 
-detector = App(name="detector", help="Make data for, train, measure and look at the network detector.")
+detector = App(name="detector", help="Data, training and evaluation of the network detector; objects by description.")
 
 DATA, RUN = Path("runs/detector/data"), Path("runs/detector/train")
 
@@ -33,7 +33,7 @@ def data(*, out: Path = DATA, train: int = 4000, select: int = 400, report: int 
 
     Args:
         out: Folder of the data set.
-        train: Pictures that are learnt from.
+        train: Pictures for training.
         select: Pictures that choose the best weights.
         report: Pictures for the report, of which nothing else knows.
         seed: Of all of them; same seed, same pictures.
@@ -45,7 +45,7 @@ def data(*, out: Path = DATA, train: int = 4000, select: int = 400, report: int 
         made = make_data(out, config, lambda name, _: advance(name))
     sheet = write_sheet(out, "train" if train else "report")
     text = ", ".join(f"{name} {count}" for name, count in config.counts().items())
-    message = f"{text} pictures in {out}, {sum(made.values())} of them made now; a look at them: {sheet}"
+    message = f"{text} pictures in {out}, {sum(made.values())} of them made now; preview: {sheet}"
     return Outcome(True, message, data={"made": made, "folder": str(out)})
 
 
@@ -62,7 +62,7 @@ def train(
     first: Path | None = None,
     name: str = "shapes",
 ) -> Outcome:
-    """Train a network, write it as ONNX files, and a report on pictures that it has not seen; needs the extra `train`.
+    """Train a network, write it as ONNX files, and evaluate it on other pictures; needs the extra `train`.
 
     Stopped, it goes on where it was with the same command. For a data set of your own, see docs/detector.md.
 
@@ -99,14 +99,14 @@ def train(
     files = export(network, run.names, out, name)
     facts = {"steps": run.step, "cpu_s": round(run.cpu_s), "pictures": len(run.train)}
     page, results = _report(data, files, out / "report.html", facts, run.curve)
-    return _told(page, results, {"steps": run.step, "cpu_s": run.cpu_s, "files": [str(file) for file in files]})
+    return _outcome(page, results, {"steps": run.step, "cpu_s": run.cpu_s, "files": [str(file) for file in files]})
 
 
 @detector.command
 def report(
     *models: str, data: Path = DATA, out: Path = Path("runs/detector/report.html"), accept: float = 0.9
 ) -> Outcome:
-    """Measure networks on the report set: average precision by class, centre error, confusion, failures to look at.
+    """Measure networks on the report set: average precision by class, centre error, confusion, failures.
 
     Args:
         models: ONNX files, or names in models/detector; the suite's when none is given.
@@ -120,17 +120,17 @@ def report(
     files = [model_path(model) for model in models or ("shapes_320x256", "shapes_640x480")]
     facts = {str(file): f"sha256 {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in files}
     page, results = _report(data, files, out, facts, [])
-    return _told(page, results, {"report": str(page)}, accept)
+    return _outcome(page, results, {"report": str(page)}, accept)
 
 
 @detector.command
 def find(*words: str, domain: Domain = None, timeout: float = 20.0) -> Outcome:
-    """Find the object that is asked for in words among those that the running detector sees: its label and place.
+    """Find the object that words describe among those that the running detector observes: its label and position.
 
     `openarm detector find red cube left of the can`. Sides are the robot's: left is +y of the base frame.
 
     Args:
-        words: Colour, shape, size, and how it stands to another object.
+        words: Colour, shape, size, and relation to another object.
         timeout: Longest wait for a detection, s.
     """
     join_graph(domain)
@@ -166,7 +166,7 @@ def _report(
     return page, results
 
 
-def _told(page: Path, results: dict[str, Evaluation], extra: dict[str, Any], accept: float = 0.0) -> Outcome:
+def _outcome(page: Path, results: dict[str, Evaluation], extra: dict[str, Any], accept: float = 0.0) -> Outcome:
     figures = json.loads(page.with_suffix(".json").read_text(encoding="utf-8"))["models"]
     lines: list[str] = []
     for name, scores in ((name, result.scores) for name, result in results.items()):

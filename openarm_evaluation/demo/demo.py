@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demonstration: a graph of its own, grasps asked for over DDS and judged by ground truth, report and pictures."""
+"""The demonstration: a graph of its own, grasps requested over DDS and judged by ground truth, report and pictures."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class DemoOptions:
 
 @dataclass
 class Listeners:
-    """Who is told what while it happens; each is called in some thread."""
+    """Callbacks while it happens; each is called in some thread."""
 
     on_event: Callable[[Event], None] = lambda event: None
     on_ready: Callable[[float], None] = lambda seconds: None
@@ -95,13 +95,13 @@ def run_demo(options: DemoOptions, listeners: Listeners | None = None) -> DemoRe
     for seed in options.seeds or (graph.seed,):
         choose_target(load_scene(graph.scene, seed), options.ask.label)
     result = DemoResult(runs.new_run_dir())
-    told = listeners or Listeners()
+    listeners = listeners or Listeners()
     try:
         if graph.mount_seed != "none":
             if not options.uncalibrated:
-                mounts.calibrate_once(graph.mount_seed, told.on_note)
+                mounts.calibrate_once(graph.mount_seed, listeners.on_note)
             result.mounts = mounts.errors(graph.mount_seed, nominal=options.uncalibrated)
-        asyncio.run(_demo(options, graph, result, told))
+        asyncio.run(_demo(options, graph, result, listeners))
     except OpenArmError as error:
         result.error = error
     write_report(options, graph, result)
@@ -182,11 +182,11 @@ class Studio:
         if self.observer is None:
             return
         self._filming = True
-        self.observer.look(SPECTATOR, self._film.add)
+        self.observer.watch_camera(SPECTATOR, self._film.add)
         self._save_next(SPECTATOR, "before.png")
-        self.observer.look(DETECTION)
+        self.observer.watch_camera(DETECTION)
         self._save_next(DETECTION, "detection.png")
-        self.observer.look_away(DETECTION)
+        self.observer.unwatch_camera(DETECTION)
 
     def on_step(self, step: Step) -> None:
         """Take the picture of the held object when it has been lifted."""
@@ -197,7 +197,7 @@ class Studio:
         """Take the last picture and finish the film."""
         if self.observer is not None and self._filming:
             self._save_newest("after.png")
-            self.observer.look_away(SPECTATOR)
+            self.observer.unwatch_camera(SPECTATOR)
         if self._film.close():
             self._result.pictures.append("grasp.mp4")
         if self._film.save_animation(self._folder / "grasp.webp"):

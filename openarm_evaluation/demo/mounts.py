@@ -26,7 +26,7 @@ def uncalibrated(mount_seed: int) -> tuple[str, ...]:
     )
 
 
-def calibrate_once(mount_seed: int, tell: Callable[[str], None]) -> None:
+def calibrate_once(mount_seed: int, on_note: Callable[[str], None]) -> None:
     """Calibrate the cameras that are not yet, in a graph of its own, and store the result for next time.
 
     Raises:
@@ -35,9 +35,9 @@ def calibrate_once(mount_seed: int, tell: Callable[[str], None]) -> None:
     cameras = uncalibrated(mount_seed)
     if not cameras:
         return
-    tell(f"no calibration of mount seed {mount_seed} yet: {', '.join(cameras)} are calibrated first, once")
+    on_note(f"no calibration of mount seed {mount_seed} yet: {', '.join(cameras)} are calibrated first, once")
     store = default_folder() / f"mount_seed_{mount_seed}"
-    listeners = CalibrationListeners(on_camera=lambda camera: tell(f"calibrating {camera}"))
+    listeners = CalibrationListeners(on_camera=lambda camera: on_note(f"calibrating {camera}"))
     run = run_calibration(CalibrationOptions(cameras, mount_seed=mount_seed, save=True, store=store), listeners)
     if run.error is not None:
         raise run.error

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Data for the network detector, and what a running detector sees."""
+"""Data, training and evaluation of the network detector."""

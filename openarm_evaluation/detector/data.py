@@ -32,9 +32,9 @@ _VERSION = 1
 class DataConfig(Config):
     """How many pictures, and their seed."""
 
-    train: int = Field(default=4000, ge=0, le=1_000_000, description="pictures that are learnt from")
+    train: int = Field(default=4000, ge=0, le=1_000_000, description="pictures for training")
     select: int = Field(default=400, ge=0, le=1_000_000, description="pictures that choose the best weights")
-    report: int = Field(default=600, ge=0, le=1_000_000, description="pictures that are looked at once, for the report")
+    report: int = Field(default=600, ge=0, le=1_000_000, description="pictures that are used once, for the report")
     seed: int = Field(default=0, ge=0, description="of all three")
 
     def counts(self) -> dict[str, int]:
@@ -120,7 +120,7 @@ def _claim(folder: Path, seed: int) -> None:
         if there != mine:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,
-                f"{folder} holds pictures of seed {there.get('seed')} (format {there.get('version')}), asked for is"
+                f"{folder} holds pictures of seed {there.get('seed')} (format {there.get('version')}), requested is"
                 f" seed {seed} (format {_VERSION}); take another folder, or remove that one",
             )
     else:

@@ -21,7 +21,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES, RobotDescription
 from openarm_common.scene.scene import SHAPES, Scene, SceneObject, Table
 from openarm_common.types import Array
-from openarm_evaluation.detector.looks import colour, draw_shape, pattern, sensor, surface
+from openarm_evaluation.detector.appearance import colour, draw_shape, pattern, sensor, surface
 from openarm_sim_bridge.cameras.renderer import create_gl_context
 from openarm_sim_bridge.world.model import build_spec
 
@@ -33,7 +33,7 @@ VIEWS = {"overhead": 0.65, "wrist": 0.35}
 EMPTY = 0.15
 _SLOTS = {"box": 5, "cylinder": 5, "sphere": 4}
 _SHEETS, _BARS, _TEXTURES = 3, 3, 9
-#: An object is labelled when this share of its silhouette and this many pixels are seen.
+#: An object is labelled when this share of its silhouette and this many pixels are visible.
 _SEEN, _PIXELS = 0.35, 150
 _AWAY = (0.0, 0.0, -8.0)
 _NAMES = {"box": "box_{}", "cylinder": "cylinder_{}", "sphere": "sphere_{}"}
@@ -46,7 +46,7 @@ class Picture:
     Attributes:
         rgb: (h, w, 3) uint8.
         classes: (n,) index in `SHAPES`.
-        boxes: (n, 4) left, top, right, bottom of what is seen, pixels.
+        boxes: (n, 4) left, top, right, bottom of the visible part, pixels.
     """
 
     rgb: NDArray[np.uint8]
@@ -143,7 +143,7 @@ class RandomViews:
             material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = f"pattern_{i}"
         return spec.compile()
 
-    # --- surroundings
+    # --- environment
     def _light(self, rng: Rng) -> None:
         model = self._model
         head = model.vis.headlight
@@ -173,9 +173,9 @@ class RandomViews:
         joints: dict[str, float] = {}
         for side in SIDES:
             names = description.arm_joints(side)
-            looks = camera == "wrist" and side == "right"
-            state = description.group_state(f"{side}_arm", "wrist_look" if looks else "home")
-            if looks:
+            observes = camera == "wrist" and side == "right"
+            state = description.group_state(f"{side}_arm", "wrist_look" if observes else "home")
+            if observes:
                 joints |= {name: state[name] + float(rng.normal(0.0, 0.10)) for name in names}
             elif rng.random() < 0.55:
                 joints |= {name: state[name] + float(rng.normal(0.0, 0.05)) for name in names}
@@ -269,7 +269,7 @@ class RandomViews:
         *,
         inside: bool,
     ) -> tuple[float, float] | None:
-        """A place on the table apart from the others, in the picture where that is asked for; None after many tries."""
+        """Find a free place on the table, in the picture if `inside`; None after many tries."""
         for _ in range(60):
             spot = self._spot(rng)
             if any(math.hypot(spot[0] - x, spot[1] - y) < reach + other for x, y, other in taken):
@@ -317,7 +317,7 @@ class RandomViews:
 def _label(
     placed: list[_Placed], geoms: NDArray[np.int64], lens: Intrinsics, T_world_optical: Array
 ) -> list[tuple[int, tuple[int, int, int, int]]]:
-    """Class and box of everything that is seen well enough to be named."""
+    """Return class and box of every object that is visible enough to be labelled."""
     labels: list[tuple[int, tuple[int, int, int, int]]] = []
     T_optical_world = se3.inverse(T_world_optical)
     for item in placed:

@@ -41,7 +41,7 @@ def read_labels(text: str, width: int, height: int, classes: int, where: str) ->
         width: Of the picture, pixels.
         height: Of the picture, pixels.
         classes: How many there are.
-        where: Stands in front of every fault, such as the path of the file.
+        where: Prefix of every fault, such as the path of the file.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming line and value that are wrong.

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One grasp, watched and judged by ground truth, with what a report says beside it."""
+"""One grasp, observed and judged by ground truth; statistics and provenance for reports."""

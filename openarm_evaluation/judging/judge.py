@@ -26,7 +26,7 @@ class JudgeConfig(Config):
     lift: float = Field(default=0.05, gt=0, description="m, least rise of the centre during the run")
     tilt: float = Field(default=math.radians(10.0), gt=0, description="rad, between the upward axis before and after")
     height: float = Field(
-        default=0.005, gt=0, description="m, centre after against centre before (it stands, and on the table)"
+        default=0.005, gt=0, description="m, change of the height of the centre: it is upright, and on the table"
     )
     speed: float = Field(default=0.005, gt=0, description="m/s at rest")
     turn: float = Field(default=0.05, gt=0, description="rad/s at rest")
@@ -46,7 +46,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What ground truth says of one run.
+    """Result of one run by ground truth.
 
     Args:
         placed: Lifted, then upright and at rest within tolerance of the target.
@@ -99,12 +99,12 @@ def judge(
         reasons.append("no place was chosen for it")
     elif error > rules.place_tolerance:
         reasons.append(
-            f"stands {1e3 * error:.1f} mm from the target, at most {1e3 * rules.place_tolerance:.0f} are allowed"
+            f"is {1e3 * error:.1f} mm from the target, at most {1e3 * rules.place_tolerance:.0f} are allowed"
         )
     if tilt > rules.tilt:
         reasons.append(f"not upright: tilted by {math.degrees(tilt):.0f} degrees")
     if abs(sink) > rules.height:
-        reasons.append(f"does not stand on the table as before: its centre is {1e3 * sink:+.0f} mm higher")
+        reasons.append(f"is not on the table as before: its centre is {1e3 * sink:+.0f} mm higher")
     if speed > rules.speed or turn > rules.turn:
         reasons.append(f"not at rest: {1e3 * speed:.0f} mm/s, {turn:.2f} rad/s")
     placed = not reasons
@@ -112,7 +112,7 @@ def judge(
 
 
 def at_rest(sample: Sample, config: JudgeConfig | None = None) -> bool:
-    """Tell whether an object moves no more than resting contact lets it."""
+    """Return whether an object moves no more than in resting contact."""
     rules = config or JudgeConfig()
     return bool(np.linalg.norm(sample.linear) <= rules.speed and np.linalg.norm(sample.angular) <= rules.turn)
 

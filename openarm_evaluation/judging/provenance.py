@@ -53,7 +53,7 @@ def machine() -> dict[str, Any]:
 
 
 def scene_hash(scene: Config) -> str:
-    """Return what tells two scenes apart, 12 hexadecimal digits."""
+    """Return a hash of a scene, 12 hexadecimal digits."""
     return hashlib.sha256(scene.model_dump_json().encode()).hexdigest()[:12]
 
 

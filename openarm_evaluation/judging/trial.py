@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One grasp, asked for, watched and judged."""
+"""Request a grasp, observe it and judge it by ground truth."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Ask:
-    """What is asked of a grasp.
+    """Request of a grasp.
 
     Args:
         label: Of the object; None takes the first of the scene.
@@ -56,11 +56,11 @@ class Ask:
 
 @dataclass(frozen=True)
 class Trial:
-    """How it went.
+    """Result of a grasp that was observed.
 
     Args:
         claimed: The grasp reported success.
-        verdict: Of ground truth; None when the object could not be watched.
+        verdict: Of ground truth; None when the object could not be observed.
         states: (state, s of simulated time, attempt, reason it was entered for), in order.
         sim_s: Simulated s from the request's first state to the last one's beginning.
         route: By which the object came to its place.
@@ -89,7 +89,7 @@ class Trial:
 
     @property
     def outcome(self) -> str:
-        """placed, failed (and said so), or false success."""
+        """Placed, failed (and reported so), or false success."""
         if self.placed:
             return "placed"
         return "false success" if self.claimed else "failed"
@@ -112,7 +112,7 @@ class Trial:
             "false_success": self.outcome == "false success",
             "code": self.code,
             "message": self.message,
-            "reasons": list(verdict.reasons) if verdict else ["the object could not be watched"],
+            "reasons": list(verdict.reasons) if verdict else ["the object could not be observed"],
             "attempts": self.attempts,
             "place_error_mm": round(error, 2) if math.isfinite(error) else None,
             "rise_mm": round(verdict.rise * 1e3, 1) if verdict else None,
@@ -140,7 +140,7 @@ def choose_target(scene: Scene, label: str | None) -> SceneObject:
 
 
 def shows(scene: Scene, positions: dict[str, Sample], rules: JudgeConfig) -> bool:
-    """Tell whether ground truth is of this scene, untouched and at rest."""
+    """Return whether ground truth is of this scene, untouched and at rest."""
     if set(positions) != {item.name for item in scene.objects}:
         return False
     return all(
@@ -185,17 +185,17 @@ def run_trial(
     before: Callable[[], None] | None = None,
     moved: bool = False,
 ) -> Trial:
-    """Wait for the scene, ask for a grasp, wait until all is at rest, and judge.
+    """Wait for the scene, request a grasp, wait until all is at rest, and judge.
 
     Args:
-        observer: Watches the graph.
-        client: Asks for the grasp.
+        observer: Observes the graph.
+        client: Requests the grasp.
         scene: What is on the table now.
         ask: What to grasp and where to place it.
         seed: Of the scene, for the report.
         after_ns: Ground truth up to this time is of an earlier scene.
         rules: Of the judge.
-        before: Called when the scene stands, before the grasp is asked for.
+        before: Called when the scene is at rest, before the grasp is requested.
         moved: Earlier grasps have moved its objects, so it is not waited for.
 
     Raises:
@@ -231,7 +231,7 @@ def run_pair(
     after_ns: int = 0,
     rules: JudgeConfig | None = None,
 ) -> list[Trial]:
-    """As `run_trial`, for two objects that are asked for at once; joint states are kept by the observer meanwhile."""
+    """As `run_trial`, for two objects that are requested simultaneously; the observer keeps joint states meanwhile."""
     rules = rules or JudgeConfig()
     first, second = items = [choose_target(scene, label) for label in labels]
     wait_scene(observer, scene, after_ns, rules)
@@ -303,7 +303,7 @@ def _wait_idle(observer: Observer) -> None:
 
 
 def _wait_rest(observer: Observer, name: str, rules: JudgeConfig) -> None:
-    """Wait until the object has been at rest for as long as the judge looks back; one that never rests is judged so."""
+    """Wait until the object has been at rest for as long as the judge requires; one that never rests is judged so."""
 
     def resting() -> bool:
         track = observer.track(name)

@@ -35,7 +35,7 @@ def test_scenes_agree_by_outcome_code_arm_and_attempts() -> None:
 def test_what_cannot_be_compared_is_refused(tmp_path) -> None:
     with pytest.raises(OpenArmError, match="no scene in common"):
         compare([row(0)], [row(1)])
-    with pytest.raises(OpenArmError, match=r"seeds \[0\] stand for other scenes"):
+    with pytest.raises(OpenArmError, match=r"seeds \[0\] mean other scenes"):
         compare([row(0)], [row(0, scene="other")])
     with pytest.raises(OpenArmError, match="no folder of a campaign"):
         rows_of(tmp_path)

@@ -38,7 +38,7 @@ def test_sets_are_the_same_for_a_seed_share_nothing_and_go_on_after_a_stop(tmp_p
     (tmp_path / "a" / "images" / "report" / "000000.jpg").unlink()
     assert make_data(tmp_path / "a", SIZE) == {"train": 0, "select": 1, "report": 1}
     assert files(tmp_path / "a") == first
-    with pytest.raises(OpenArmError, match=r"holds pictures of seed 7 .*asked for is seed 8"):
+    with pytest.raises(OpenArmError, match=r"holds pictures of seed 7 .*requested is seed 8"):
         make_data(tmp_path / "a", SIZE.model_copy(update={"seed": 8}))
     sheet = cv2.imread(str(write_sheet(tmp_path / "a", "train", columns=2)))
     assert sheet.shape == (480, 640, 3)

@@ -42,8 +42,8 @@ class FitConfig(Config):
     falling: float = Field(default=0.6, gt=0.0, le=1.0, description="share of the steps in which the rate falls to 2 %")
     decay: float = Field(default=0.02, ge=0.0, description="of the weights")
     box_weight: float = Field(default=3.0, gt=0.0, description="of the box loss against the class loss")
-    every: int = Field(default=1000, ge=1, description="batches between two looks at the selection set")
-    patience: int = Field(default=3, ge=1, description="looks without a better one until it stops early")
+    every: int = Field(default=1000, ge=1, description="batches between two evaluations on the selection set")
+    patience: int = Field(default=3, ge=1, description="evaluations without a better one until it stops early")
     threads: int = Field(default=1, ge=1, le=64, description="of torch; one a process is most work per CPU second")
     seed: int = Field(default=0, ge=0, description="of weights, order and variations")
 
@@ -94,8 +94,8 @@ class Fit:
         network.load_state_dict(self._mean)
         return network.eval()
 
-    def run(self, tell: Callable[[dict[str, float]], None], advance: Callable[[], None] = lambda: None) -> None:
-        """Train to the end; `tell` is called with each row of the curve, `advance` after each batch."""
+    def run(self, on_row: Callable[[dict[str, float]], None], advance: Callable[[], None] = lambda: None) -> None:
+        """Train to the end; `on_row` is called with each row of the curve, `advance` after each batch."""
         config, losses = self.config, np.zeros((0, 2))
         batches = self._batches()
         self.network.train()
@@ -119,7 +119,7 @@ class Fit:
                 self.best, self._since_best = mean, 0
                 save(self.folder / "best.pt", {"weights": self._mean, "names": self.names, "step": self.step})
             self._keep()
-            tell(row)
+            on_row(row)
 
     def _learn(self, samples: list[Sample]) -> tuple[float, float]:
         for group in self._optimizer.param_groups:

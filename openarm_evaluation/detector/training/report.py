@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a detector does on a set that it was not made with: figures, worst pictures, one page to look at. No torch."""
+"""Evaluation of a detector on a set that it was not trained with: figures, worst pictures, one page. No torch."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def write_page(
     curve: Sequence[dict[str, float]],
     facts: dict[str, Any],
 ) -> None:
-    """Write the page, and its figures as JSON beside it.
+    """Write the page, and its figures as JSON next to it.
 
     Args:
         path: Of the HTML file.

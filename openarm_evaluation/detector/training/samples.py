@@ -21,9 +21,9 @@ from openarm_evaluation.detector.yolo_text import read_classes, read_labels
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
 
-#: What stands where a picture does not reach.
+#: Grey level outside a picture.
 FILL = 114
-#: An object of which a crop leaves less than this share is not asked for.
+#: An object of which a crop leaves less than this share is not labelled.
 _LEFT = 0.35
 _SCALES = (0.45, 1.15)
 

@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Watches a run from outside: ground truth for the judge, states of the grasp, pictures; resets the world.
-
-Runs in a thread and a ROS context of its own, so that whoever asks for grasps is free to block.
-"""
+"""Observer of a run: ground truth for the judge, states of the grasp, pictures; resets the world."""
 
 from __future__ import annotations
 
@@ -107,8 +104,8 @@ class Observer(BackgroundNode):
             self._steps.clear()
             self._joints.clear()
 
-    def look(self, topic: str, on_frame: Callable[[int, Picture], None] | None = None) -> None:
-        """Begin to receive a colour image topic; its newest frame is kept, `on_frame` gets every one."""
+    def watch_camera(self, topic: str, on_frame: Callable[[int, Picture], None] | None = None) -> None:
+        """Subscribe to a colour image topic; its newest frame is kept, `on_frame` gets every one."""
 
         def receive(message: Image) -> None:
             try:
@@ -126,8 +123,8 @@ class Observer(BackgroundNode):
         if topic not in self._cameras:
             self._cameras[topic] = self._node.create_subscription(Image, topic, receive, _NEWEST)
 
-    def look_away(self, topic: str) -> None:
-        """Stop receiving a topic, so that nothing is rendered for it."""
+    def unwatch_camera(self, topic: str) -> None:
+        """Unsubscribe from a topic, so that nothing is rendered for it."""
         if topic in self._cameras:
             self._node.destroy_subscription(self._cameras.pop(topic))
 

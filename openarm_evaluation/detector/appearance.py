@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the objects of training pictures look: shapes, colours, patterns of tables, and what a camera adds.
+"""Appearance of training pictures: shapes, colours, patterns of tables, and sensor effects.
 
 Lengths in m in the object's frame: origin in its middle, z along the axis of a cylinder.
 """
@@ -19,7 +19,7 @@ from openarm_common.types import Array
 
 Rng = np.random.Generator
 
-#: Shares of cylinders that lie, and of objects that have no colour.
+#: Shares of cylinders that lie on their side, and of objects without colour.
 LYING, GREY = 0.12, 0.15
 
 
