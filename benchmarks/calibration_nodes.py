@@ -27,7 +27,7 @@ from benchmarks.report import Row, write_report
 from openarm_bringup.calibration.run import CalibrationOptions, as_row, run_calibration
 from openarm_calibration.handeye.offline import calibrate
 from openarm_calibration.handeye.refine import mount_error
-from openarm_calibration.sampling.session_file import load_session
+from openarm_calibration.sampling.samples import load_session
 from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription

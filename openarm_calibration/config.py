@@ -13,7 +13,7 @@ from openarm_calibration.handeye.offline import ALGORITHMS
 from openarm_calibration.handeye.verdict import Limits
 from openarm_calibration.sampling.gate import GateConfig
 from openarm_calibration.sampling.next_pose import SearchConfig
-from openarm_calibration.store.store_config import StoreConfig
+from openarm_calibration.store.store import StoreConfig
 from openarm_common import se3
 from openarm_common.config import Config
 

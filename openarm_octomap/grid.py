@@ -20,10 +20,9 @@ from openarm_common.octree.codec import Leaves, OctreeEncoder, Payload
 from openarm_common.octree.lattice import DEPTH, Lattice
 from openarm_common.robot.self_filter import Shapes
 from openarm_common.types import Array, Bytes, Floats
-from openarm_octomap import end_kernels, kernels
+from openarm_octomap import kernels
 from openarm_octomap.config import GridConfig, UnknownPolicy
-from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN
-from openarm_octomap.reset_kernels import reset_cells
+from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN, reset_cells
 
 #: Keys outside of the box that one scan may end in.
 _TABLE = 1 << 20
@@ -44,7 +43,7 @@ class DepthScan(DepthView):
         out = np.empty((self.depth.size, 3), np.float32)
         near, far = np.float32(self.near), np.float32(self.far)
         T = np.ascontiguousarray(self.T_base_camera[:3], dtype=np.float32)
-        n = end_kernels.image_points(self.depth, self.scale, near, far, *self.rays, T, out)
+        n = kernels.image_points(self.depth, self.scale, near, far, *self.rays, T, out)
         return out[:n]
 
 
@@ -260,7 +259,7 @@ class OccupancyGrid:
         if isinstance(scan, DepthScan):
             origin = scan.T_base_camera[:3, 3].astype(np.float32)
             label = np.zeros(scan.depth.shape, np.uint8) if scan.label is None else scan.label
-            ends, valid, cleared = end_kernels.image_ends(
+            ends, valid, cleared = kernels.image_ends(
                 scan.depth, scan.scale, np.float32(scan.near), np.float32(scan.far),
                 config.no_return_block if config.clear_without_return else 0, self._stride(scan.intrinsics),
                 np.float32(config.no_return_range),
@@ -270,7 +269,7 @@ class OccupancyGrid:
         else:
             origin, cleared = scan.origin.astype(np.float32), 0
             label = np.zeros(size, np.uint8) if scan.label is None else scan.label
-            ends, valid = end_kernels.cloud_ends(
+            ends, valid = kernels.cloud_ends(
                 scan.points, label, config.resolution, self._key_min, origin, config.max_range, *kept
             )
         kernels.walk_rays(self._ends, ends, config.resolution, self._key_min, origin, config.max_range, self._marks)

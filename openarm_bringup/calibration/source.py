@@ -105,7 +105,7 @@ def with_solved(
 
 
 def _from_session(path: Path, source: Source) -> tuple[SampleSet, str]:
-    from openarm_calibration.sampling.session_file import load_session
+    from openarm_calibration.sampling.samples import load_session
     from openarm_common.robot.description import RobotDescription
 
     given = [f"--{name.replace('_', '-')}" for name in _OF_BAGS if getattr(source, name) != getattr(ALL_SAMPLES, name)]

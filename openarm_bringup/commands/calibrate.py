@@ -114,9 +114,9 @@ def together(*sessions: Path, save: bool = False, store: Path | None = None) -> 
         save: Store the results, unless one fails.
         store: Folder of stored calibrations.
     """
-    from openarm_calibration.handeye.together import calibrate_together
+    from openarm_calibration.handeye.offline import calibrate_together
     from openarm_calibration.report.report import summary
-    from openarm_calibration.sampling.session_file import load_session
+    from openarm_calibration.sampling.samples import load_session
     from openarm_common.robot.description import RobotDescription
 
     if len(sessions) < 2:

@@ -196,7 +196,7 @@ def _page(session: Path, out: Path) -> None:
     """Write the page of a session, when there is one that can be solved."""
     from openarm_calibration.handeye.offline import calibrate
     from openarm_calibration.report.report import page
-    from openarm_calibration.sampling.session_file import load_session
+    from openarm_calibration.sampling.samples import load_session
     from openarm_common.robot.description import RobotDescription
 
     if not session.is_file():

@@ -20,12 +20,201 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from openarm_calibration.handeye.projection import COLUMNS, fit_poses
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.types import Array
+
+Indices = NDArray[np.int64]
+
+#: Twist (6), scale (1), intrinsics (4).
+COLUMNS = 11
+#: Nearer than this in front of the camera a mark has no image, m.
+_NEAR = 1e-3
+
+
+@njit(cache=True, nogil=True)
+def _mark(
+    p: Array, radius: float, T: Array, intrinsics: Array, scale: float, rows: Array, pixel: Array
+) -> bool:  # pragma: no cover - compiled
+    """Pixel (2,) and derivative rows (2, 11) of one mark; False behind the camera."""
+    o = np.empty(3)
+    arm = np.empty(3)
+    for k in range(3):
+        arm[k] = T[k, 0] * p[0] + T[k, 1] * p[1] + T[k, 2] * p[2]
+        o[k] = scale * arm[k] + T[k, 3]
+    if not o[2] > _NEAR:
+        return False
+    nx, ny, nz = T[0, 2], T[1, 2], T[2, 2]
+    rr = radius * radius * scale * scale
+    den = o[2] * o[2] - rr * (1.0 - nz * nz)
+    if not den > 0.0:
+        return False
+    n = np.empty(3)
+    n[0], n[1], n[2] = nx, ny, nz
+    g = np.empty(3)
+    h = np.empty(3)
+    for axis in range(2):
+        other = 1 - axis
+        value = (o[axis] * o[2] + rr * n[axis] * nz) / den
+        g[axis] = o[2] / den
+        g[other] = 0.0
+        g[2] = (o[axis] - 2.0 * value * o[2]) / den
+        h[axis] = rr * nz / den
+        h[other] = 0.0
+        h[2] = rr * (n[axis] - 2.0 * value * nz) / den
+        by_rr = (n[axis] * nz + value * (1.0 - nz * nz)) / den
+        f = intrinsics[axis]
+        pixel[axis] = f * value + intrinsics[2 + axis]
+        rows[axis, 0], rows[axis, 1], rows[axis, 2] = f * g[0], f * g[1], f * g[2]
+        rows[axis, 3] = f * (o[1] * g[2] - o[2] * g[1] + n[1] * h[2] - n[2] * h[1])
+        rows[axis, 4] = f * (o[2] * g[0] - o[0] * g[2] + n[2] * h[0] - n[0] * h[2])
+        rows[axis, 5] = f * (o[0] * g[1] - o[1] * g[0] + n[0] * h[1] - n[1] * h[0])
+        rows[axis, 6] = f * (g[0] * arm[0] + g[1] * arm[1] + g[2] * arm[2] + by_rr * 2.0 * radius * radius * scale)
+        rows[axis, 7 + axis] = value
+        rows[axis, 7 + other] = 0.0
+        rows[axis, 9 + axis] = 1.0
+        rows[axis, 9 + other] = 0.0
+    return True
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(
+    points: Array,
+    pixels: Array,
+    offsets: Indices,
+    radii: Array,
+    poses: Array,
+    intrinsics: Array,
+    scale: float,
+) -> tuple[Array, Array, Array]:  # pragma: no cover - compiled
+    """Normal equations of each view, in px².
+
+    Args:
+        points: (marks, 3) of all views, board frame, m.
+        pixels: (marks, 2) measured.
+        offsets: (views + 1,) first mark of each view.
+        radii: (views,) radius of the circles, m; 0 for points.
+        poses: (views, 4, 4) T_camera_board.
+        intrinsics: (views, 4) fx, fy, cx, cy.
+        scale: Of the board.
+
+    Returns:
+        (views, 11, 11) JᵀJ, (views, 11) Jᵀr and (views,) rᵀr; the last is infinite with a mark behind the camera.
+    """
+    count = len(offsets) - 1
+    squares = np.zeros((count, COLUMNS, COLUMNS))
+    slopes = np.zeros((count, COLUMNS))
+    costs = np.zeros(count)
+    rows = np.zeros((2, COLUMNS))
+    pixel = np.zeros(2)
+    for view in range(count):
+        for mark in range(offsets[view], offsets[view + 1]):
+            if not _mark(points[mark], radii[view], poses[view], intrinsics[view], scale, rows, pixel):
+                costs[view] = np.inf
+                break
+            for axis in range(2):
+                residual = pixels[mark, axis] - pixel[axis]
+                costs[view] += residual * residual
+                for i in range(COLUMNS):
+                    slopes[view, i] += rows[axis, i] * residual
+                    for j in range(i + 1):
+                        squares[view, i, j] += rows[axis, i] * rows[axis, j]
+        for i in range(COLUMNS):
+            for j in range(i):
+                squares[view, j, i] = squares[view, i, j]
+    return squares, slopes, costs
+
+
+@njit(cache=True, nogil=True)
+def project(
+    points: Array, radius: float, pose: Array, intrinsics: Array, scale: float = 1.0
+) -> Array:  # pragma: no cover - compiled
+    """Pixels (n, 2) of marks (n, 3); NaN behind the camera."""
+    out = np.full((len(points), 2), np.nan)
+    rows = np.zeros((2, COLUMNS))
+    pixel = np.zeros(2)
+    for mark in range(len(points)):
+        if _mark(points[mark], radius, pose, intrinsics, scale, rows, pixel):
+            out[mark] = pixel
+    return out
+
+
+@njit(cache=True, nogil=True)
+def turned(R: Array, w: Array) -> Array:  # pragma: no cover - compiled
+    """`exp(w) R` for a rotation vector w (3,)."""
+    angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    K = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    if angle < 1e-9:
+        E = np.eye(3) + K
+    else:
+        E = np.eye(3) + np.sin(angle) / angle * K + (1.0 - np.cos(angle)) / (angle * angle) * (K @ K)
+    return E @ R
+
+
+@njit(cache=True, nogil=True)
+def fit_poses(
+    points: Array,
+    pixels: Array,
+    offsets: Indices,
+    radii: Array,
+    poses: Array,
+    intrinsics: Array,
+    iterations: int = 12,
+) -> tuple[Array, Array]:  # pragma: no cover - compiled
+    """Least-squares pose of the board in each view by itself.
+
+    Args:
+        points: (marks, 3).
+        pixels: (marks, 2).
+        offsets: (views + 1,).
+        radii: (views,).
+        poses: (views, 4, 4) to start from; kept where no step makes the residual smaller.
+        intrinsics: (views, 4).
+        iterations: At most.
+
+    Returns:
+        (views, 4, 4) T_camera_board and (views,) sums of squared residuals, px².
+    """
+    out = poses.copy()
+    _, _, first = normal_equations(points, pixels, offsets, radii, out, intrinsics, 1.0)
+    final = first.copy()
+    for view in range(len(offsets) - 1):
+        marks = slice(offsets[view], offsets[view + 1])
+        own_points, own_pixels = points[marks], pixels[marks]
+        own_offsets = np.array([0, offsets[view + 1] - offsets[view]])
+        own_radii, own_intrinsics = radii[view : view + 1], intrinsics[view : view + 1]
+        pose = out[view : view + 1].copy()
+        damping = 1e-9
+        for _ in range(iterations):
+            A, b, cost = normal_equations(own_points, own_pixels, own_offsets, own_radii, pose, own_intrinsics, 1.0)
+            H = A[0, :6, :6].copy()
+            for k in range(6):
+                H[k, k] *= 1.0 + damping
+            step = np.linalg.solve(H, b[0, :6].copy())
+            trial = pose.copy()
+            trial[0, :3, :3] = turned(np.ascontiguousarray(pose[0, :3, :3]), step[3:])  # pyright: ignore[reportArgumentType]
+            w = step[3:]
+            t = pose[0, :3, 3]
+            trial[0, 0, 3] = t[0] + step[0] + w[1] * t[2] - w[2] * t[1]
+            trial[0, 1, 3] = t[1] + step[1] + w[2] * t[0] - w[0] * t[2]
+            trial[0, 2, 3] = t[2] + step[2] + w[0] * t[1] - w[1] * t[0]
+            _, _, reached = normal_equations(own_points, own_pixels, own_offsets, own_radii, trial, own_intrinsics, 1.0)
+            if reached[0] <= cost[0]:
+                pose = trial
+                final[view] = reached[0]
+                damping = max(damping * 0.1, 1e-12)
+                if cost[0] - reached[0] <= 1e-12 * cost[0]:
+                    break
+            else:
+                damping = max(damping, 1e-6) * 30.0
+                if damping > 1e6:
+                    break
+        out[view] = pose[0]
+    return out, final
+
 
 Indices = NDArray[np.int64]
 

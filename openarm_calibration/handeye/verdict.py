@@ -14,8 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
-from openarm_calibration.handeye.problem import Problem, Setup, chain
-from openarm_calibration.handeye.projection import project
+from openarm_calibration.handeye.problem import Problem, Setup, chain, project
 from openarm_calibration.handeye.refine import mount_error, refine
 from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
 from openarm_calibration.sampling.samples import SampleSet

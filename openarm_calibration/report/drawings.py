@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from openarm_calibration.handeye.offline import Result
-from openarm_calibration.handeye.problem import chain
-from openarm_calibration.handeye.projection import project
+from openarm_calibration.handeye.problem import chain, project
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common import se3
 from openarm_common.figures import data_uri, render_figure, sheet

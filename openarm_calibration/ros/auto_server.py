@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -10,23 +11,40 @@ from typing import TYPE_CHECKING
 import numpy as np
 from openarm_interfaces.action import AutoCalibrate, MoveArm
 from openarm_interfaces.msg import CollisionBox
+from openarm_interfaces.srv import ComputeCalibration
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 
 from openarm_calibration.handeye.offline import Result
 from openarm_calibration.handeye.verdict import estimate_delay
-from openarm_calibration.ros.convert import fill
 from openarm_calibration.ros.photo_client import wait_until
 from openarm_calibration.sampling.next_pose import PoseSearch, Proposal
-from openarm_calibration.sampling.samples import Sample, without
-from openarm_calibration.sampling.session_file import session_path
+from openarm_calibration.sampling.samples import Sample, session_path, without
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose, vector
 from openarm_common.types import Array
 
 if TYPE_CHECKING:
-    from openarm_calibration.ros.session_node import SessionNode
+    from openarm_calibration.ros.node import CalibrationNode
+
+
+def fill(message: AutoCalibrate.Result | ComputeCalibration.Response, solved: Result, child: str) -> None:
+    """Write a solved calibration into an answer.
+
+    Args:
+        message: Of the action, or of compute_calibration.
+        solved: The result.
+        child: Frame whose mount it is.
+    """
+    calibration, verdict = solved.calibration, solved.verdict
+    message.grade, message.reasons = verdict.grade, list(verdict.reasons)
+    message.message = f"{verdict.grade}: {'; '.join(verdict.reasons) or 'within all limits'}"
+    message.parent, message.child = calibration.parent, child
+    message.mount = matrix_to_pose(calibration.T_parent_link)
+    message.sigma_translation, message.sigma_rotation = calibration.sigma_translation, calibration.sigma_rotation
+    message.outliers = [outlier.name for outlier in solved.solution.outliers]
+    message.report = json.dumps(solved.as_json())
 
 
 #: What says that a pose can't be had, while another one may.
@@ -48,7 +66,7 @@ class AutoCalibrator:
         node: That has the samples, the solver and the store.
     """
 
-    def __init__(self, node: SessionNode) -> None:
+    def __init__(self, node: CalibrationNode) -> None:
         self._node = node
         self._config = node.config.auto
         self._mover = ActionClient(node, MoveArm, "/motion/move")
@@ -81,7 +99,7 @@ class _Run:
     """One goal."""
 
     def __init__(
-        self, node: SessionNode, mover: ActionClient, handle: ServerGoalHandle, result: AutoCalibrate.Result
+        self, node: CalibrationNode, mover: ActionClient, handle: ServerGoalHandle, result: AutoCalibrate.Result
     ) -> None:
         self._node, self._mover, self._handle, self._result = node, mover, handle, result
         self._goal: AutoCalibrate.Goal = handle.request

@@ -9,8 +9,15 @@ states are subscribed to only while a sample is taken. The action /calibration/a
 
 from __future__ import annotations
 
+import datetime
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from openarm_interfaces.srv import (
     ComputeCalibration,
     GetSampleList,
@@ -22,22 +29,59 @@ from openarm_interfaces.srv import (
     TakeSample,
 )
 
-from openarm_calibration.handeye.offline import ALGORITHMS, checked_algorithm
-from openarm_calibration.ros.auto_server import AutoCalibrator
-from openarm_calibration.ros.convert import fill
-from openarm_calibration.ros.session_node import SessionNode
-from openarm_calibration.sampling.poses import advice
-from openarm_calibration.sampling.session_file import load_session, session_path
+from openarm_calibration.board.board import read_board
+from openarm_calibration.board.detect import Detection, detect
+from openarm_calibration.config import CalibrationConfig
+from openarm_calibration.handeye.offline import ALGORITHMS, Result, calibrate, checked_algorithm
+from openarm_calibration.ros.auto_server import AutoCalibrator, fill
+from openarm_calibration.ros.photo_client import Photographer, grey
+from openarm_calibration.sampling.gate import Matched, match
+from openarm_calibration.sampling.next_pose import advice
+from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead, load_session, session_path, setup_of
+from openarm_calibration.store.store import CalibrationStore, default_folder
+from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.node import run
+from openarm_common.ros.answers import ResponseT, answer, answer_async
+from openarm_common.ros.convert import intrinsics_from_info
+from openarm_common.ros.node import BaseNode, run
+from openarm_common.ros.tf import RobotStateListener
 
 
-class CalibrationNode(SessionNode):
-    """The session behind services and an action."""
+@dataclass(frozen=True, eq=False)
+class View:
+    """The board in an image, and the robot at its stamp."""
+
+    t_ns: int
+    matched: Matched
+    detection: Detection
+    pixels: NDArray[np.uint8]
+
+
+class CalibrationNode(BaseNode[CalibrationConfig]):
+    """Takes samples of one camera, solves and stores, behind services and an action.
+
+    Attributes:
+        camera: The camera that is calibrated.
+        samples: Of this camera, so far.
+        algorithm: What `compute_calibration` uses.
+        photographer: Takes images of this camera.
+    """
+
+    camera: CameraConfig
+    samples: SampleSet
+    photographer: Photographer
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        for name, kind, answer in (
+        super().__init__("calibration", CalibrationConfig, **kwargs)
+        config = self.config
+        self._cameras = load_cameras(Path(config.cameras) if config.cameras else None)
+        self._store = CalibrationStore(Path(config.store) if config.store else default_folder())
+        self._states = RobotStateListener(self, self.description, joints=False, depth=100, wait=config.state_timeout)
+        self._busy = ""
+        self._result: Result | None = None
+        self.algorithm = config.algorithm
+        self.use(config.camera)
+        for name, kind, handler in (
             ("take_sample", TakeSample, self._on_take),
             ("remove_sample", RemoveSample, self._on_remove),
             ("get_sample_list", GetSampleList, self._on_list),
@@ -48,57 +92,168 @@ class CalibrationNode(SessionNode):
             ("save_samples", SampleFile, self._on_save_samples),
             ("load_samples", SampleFile, self._on_load_samples),
         ):
-            self.create_service(kind, f"/calibration/{name}", answer)
+            self.create_service(kind, f"/calibration/{name}", handler)
         self._auto = AutoCalibrator(self)
 
-    async def _on_take(self, _: TakeSample.Request, response: TakeSample.Response) -> TakeSample.Response:
+    # --- the session
+    def use(self, name: str) -> None:
+        """Begin anew with a camera, without samples.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, listing the cameras.
+        """
+        if name not in self._cameras:
+            raise OpenArmError(Code.CONFIG_INVALID, f"no camera {name!r}; cameras: {', '.join(self._cameras)}")
+        self.camera = self._cameras[name]
+        self.photographer = Photographer(self, self._states, name, self.config)
+        self._change(SampleSet(self._head(self.camera.intrinsics), self.description))
+
+    def _change(self, samples: SampleSet) -> None:
+        """Go on with these samples, of which nothing is computed yet."""
+        self.samples, self._result = samples, None
+        self._report()
+
+    async def look(self, *, moving: bool = False) -> View:
+        """Detect the board in the next image, with the robot at its stamp.
+
+        Args:
+            moving: Whether the robot may move meanwhile.
+
+        Raises:
+            OpenArmError: NOT_READY, STALE_DATA, MOVING, NOTHING_DETECTED, BAD_IMAGE.
+        """
+        frame = await self.photographer.take(self.config.gate.track if moving else 0.0)
+        pixels, t_ns = grey(frame.items["image"]), frame.t_ns
+        self._check_optics(intrinsics_from_info(frame.items["camera_info"]))
+        matched = match(self._states.buffer, t_ns, self.samples.joint_names, self.config.gate, moving=moving)
+        return View(t_ns, matched, await self.in_thread(detect, self.samples.board, pixels), pixels)
+
+    async def take(self) -> Sample:
+        """Take a sample; errors as `look`."""
+        view = await self.look()
+        sample = self.samples.take(view.t_ns, view.matched, view.detection, view.pixels)
+        self._change(self.samples)
+        return sample
+
+    async def solve(self, algorithm: str = "") -> Result:
+        """Solve the samples and judge the result.
+
+        Raises:
+            OpenArmError: DEGENERATE, INVALID_ARGUMENT.
+        """
+        name = checked_algorithm(algorithm or self.algorithm)
+        found = self._store.find(self.camera.name)
+        stored = found.calibration if found is not None else None
+        if stored is not None and stored.mount_seed != self.samples.head.mount_seed:
+            stored = None  # of other mounts: its distance says nothing
+        result: Result = await self.in_thread(
+            calibrate, self.samples, algorithm=name, limits=self.config.limits, created=_now(), stored=stored
+        )
+        self._result = result
+        self._report()
+        return result
+
+    def save(self, *, force: bool = False) -> Path:
+        """Store the last result.
+
+        Raises:
+            OpenArmError: NOT_READY, when there is none; DEGENERATE, when it fails the limits.
+        """
+        if self._result is None:
+            raise OpenArmError(
+                Code.NOT_READY, "nothing was computed since the samples changed; call compute_calibration first"
+            )
+        if self._result.verdict.grade == "fail" and not force:
+            reasons = "; ".join(self._result.verdict.reasons)
+            raise OpenArmError(Code.DEGENERATE, f"not stored, the calibration fails: {reasons}; `force` stores it")
+        return self._store.save(self._result.calibration)
+
+    @contextmanager
+    def work(self, what: str) -> Iterator[None]:
+        """Be busy with something while the context is open.
+
+        Raises:
+            OpenArmError: BUSY, when the node is already.
+        """
+        self._require_idle()
+        self._busy = what
         try:
+            yield
+        finally:
+            self._busy = ""
+
+    def _require_idle(self) -> None:
+        if self._busy:
+            raise OpenArmError(Code.BUSY, f"the node is {self._busy}; wait for its answer")
+
+    def _report(self) -> None:
+        grade = self._result.verdict.grade if self._result is not None else "not computed"
+        self.diagnose(True, f"{len(self.samples)} samples of {self.camera.name!r}", result=grade)
+
+    def _head(self, optics: Intrinsics) -> SessionHead:
+        board = read_board(self.config.board, "parameter board")
+        setup = setup_of(self.description, self.camera.parent)
+        return SessionHead(
+            camera=self.camera.name, setup=setup, parent=self.camera.parent,
+            carrier=self.config.carrier if setup == "to_hand" else self.camera.parent,
+            intrinsics=(optics.width, optics.height, optics.fx, optics.fy, optics.cx, optics.cy),
+            board=board.model_dump(), created=_now(),
+            mount_seed=self.config.seed if self.camera.mount_error else None,
+        )  # fmt: skip
+
+    def _check_optics(self, optics: Intrinsics) -> None:
+        """Take the intrinsics of the first image; refuse others after it."""
+        if optics == self.samples.head.optics:
+            return
+        if len(self.samples):
+            raise OpenArmError(
+                Code.BAD_IMAGE,
+                f"the intrinsics of {self.camera.name!r} changed: fx {optics.fx:.2f} at"
+                f" {optics.width}x{optics.height}, the samples have fx {self.samples.head.optics.fx:.2f};"
+                " remove the samples or restore the camera",
+            )
+        self.samples = SampleSet(self._head(optics), self.description)
+
+    # --- services
+    async def _on_take(self, _: TakeSample.Request, response: TakeSample.Response) -> TakeSample.Response:
+        async def take() -> str:
             with self.work("taking a sample"):
                 sample = await self.take()
             response.sample = sample.name
-            response.success, response.code = True, Code.OK.value
-            response.message = (
+            return (
                 f"{sample.name}: {len(sample.detection.ids)} marks, residual {sample.detection.residual:.2f} px, stamps"
                 f" {(sample.t_joints_ns - sample.t_image_ns) / 1e6:+.1f} ms apart"
             )
-        except OpenArmError as error:
-            response.code, response.message = error.code.value, error.message
+
+        await answer_async(response, take)
         response.samples = self._names()
-        self.tell()
         return response
 
     def _on_remove(self, request: RemoveSample.Request, response: RemoveSample.Response) -> RemoveSample.Response:
-        try:
-            self.free()
+        def remove() -> str:
+            self._require_idle()
             removed = self.samples.remove(request.sample)
-            self.changed()
-            response.success, response.code, response.message = True, Code.OK.value, f"removed {removed.name}"
-        except OpenArmError as error:
-            response.code, response.message = error.code.value, error.message
-        response.samples = self._names()
-        self.tell()
-        return response
+            self._change(self.samples)
+            return f"removed {removed.name}"
+
+        return self._with_samples(response, remove)
 
     def _on_list(self, _: GetSampleList.Request, response: GetSampleList.Response) -> GetSampleList.Response:
-        response.success, response.code = True, Code.OK.value
-        response.camera, response.samples = self.camera.name, self._names()
+        response.camera = self.camera.name
         response.advice = advice([self.samples.pose(sample.joints) for sample in self.samples.samples])
-        response.message = f"{len(self.samples)} samples of {self.camera.name!r} and {self.samples.board.label}"
-        return response
+        text = f"{len(self.samples)} samples of {self.camera.name!r} and {self.samples.board.label}"
+        return self._with_samples(response, lambda: text)
 
     def _on_save_samples(self, request: SampleFile.Request, response: SampleFile.Response) -> SampleFile.Response:
-        try:
+        def save() -> str:
             digest = self.samples.save(session_path(request.path))
-            response.success, response.code = True, Code.OK.value
-            response.message = f"{len(self.samples)} samples in {request.path}, hash {digest[:12]}"
-        except OpenArmError as error:
-            response.code, response.message = error.code.value, error.message
-        response.samples = self._names()
-        return response
+            return f"{len(self.samples)} samples in {request.path}, hash {digest[:12]}"
+
+        return self._with_samples(response, save)
 
     def _on_load_samples(self, request: SampleFile.Request, response: SampleFile.Response) -> SampleFile.Response:
-        try:
-            self.free()
+        def load() -> str:
+            self._require_idle()
             samples, digest = load_session(session_path(request.path), self.description)
             if samples.head.camera != self.camera.name or samples.head.parent != self.camera.parent:
                 raise OpenArmError(
@@ -106,56 +261,57 @@ class CalibrationNode(SessionNode):
                     f"{request.path} is of camera {samples.head.camera!r} on {samples.head.parent!r}, this node"
                     f" calibrates {self.camera.name!r} on {self.camera.parent!r}",
                 )
-            self.load(samples)
-            response.success, response.code = True, Code.OK.value
-            response.message = f"{len(samples)} samples from {request.path}, hash {digest[:12]}"
-        except OpenArmError as error:
-            response.code, response.message = error.code.value, error.message
-        response.samples = self._names()
-        self.tell()
-        return response
+            self._change(samples)
+            return f"{len(samples)} samples from {request.path}, hash {digest[:12]}"
+
+        return self._with_samples(response, load)
 
     async def _on_compute(
         self, request: ComputeCalibration.Request, response: ComputeCalibration.Response
     ) -> ComputeCalibration.Response:
-        try:
+        async def compute() -> str:
             checked_algorithm(request.algorithm or self.algorithm)
             with self.work("solving"):
                 result = await self.solve(request.algorithm)
             fill(response, result, self.camera.link_frame)
             response.held_out_px = result.verdict.figures["leave_one_out_px"]
             response.held_out = result.verdict.figures["leave_one_out"]
-            response.success, response.code = True, Code.OK.value
-        except OpenArmError as error:
-            response.code, response.message = error.code.value, error.message
-        self.tell()
-        return response
+            return str(response.message)
+
+        return await answer_async(response, compute)
 
     def _on_save(
         self, request: SaveCalibration.Request, response: SaveCalibration.Response
     ) -> SaveCalibration.Response:
-        try:
+        def save() -> str:
             response.path = str(self.save(force=request.force))
-            response.success, response.code, response.message = True, Code.OK.value, f"stored in {response.path}"
-        except OpenArmError as error:
-            response.code, response.message = error.code.value, error.message
-        return response
+            return f"stored in {response.path}"
+
+        return answer(response, save)
 
     def _on_algorithms(self, _: ListAlgorithms.Request, response: ListAlgorithms.Response) -> ListAlgorithms.Response:
-        response.success, response.code = True, Code.OK.value
         response.algorithms, response.current = list(ALGORITHMS), self.algorithm
-        return response
+        return answer(response, lambda: f"{self.algorithm} is set")
 
     def _on_set(self, request: SetAlgorithm.Request, response: SetAlgorithm.Response) -> SetAlgorithm.Response:
-        try:
+        def use() -> str:
             self.algorithm = checked_algorithm(request.algorithm)
-            response.success, response.code, response.message = True, Code.OK.value, f"{self.algorithm} is set"
-        except OpenArmError as error:
-            response.code, response.message = error.code.value, error.message
+            return f"{self.algorithm} is set"
+
+        return answer(response, use)
+
+    def _with_samples(self, response: ResponseT, work: Callable[[], str]) -> ResponseT:
+        """Answer with the names of the samples, too."""
+        filled: Any = answer(response, work)
+        filled.samples = self._names()
         return response
 
     def _names(self) -> list[str]:
         return [sample.name for sample in self.samples.samples]
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
 def main() -> None:

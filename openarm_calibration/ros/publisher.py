@@ -14,8 +14,7 @@ from typing import Any
 
 from tf2_msgs.msg import TFMessage
 
-from openarm_calibration.store.store import default_folder, of_these_mounts, places
-from openarm_calibration.store.store_config import PublisherConfig
+from openarm_calibration.store.store import PublisherConfig, default_folder, of_these_mounts, places
 from openarm_common.camera.cameras import T_LINK_OPTICAL, CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_transform

@@ -10,26 +10,74 @@ Whether the way there is free is for the planner to say. m, rad, px.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from openarm_calibration.handeye.observability import UNITS
-from openarm_calibration.handeye.problem import View, assemble, inverses
-from openarm_calibration.handeye.projection import project
+from openarm_calibration.board.board import Board
+from openarm_calibration.handeye.observability import UNITS, motion
+from openarm_calibration.handeye.problem import View, assemble, inverses, project
 from openarm_calibration.handeye.refine import Noise, information_at, invert_scaled, mount_error
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.sampling.bodies import Bodies, chain_poses
-from openarm_calibration.sampling.poses import visible
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common import se3
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
+
+#: Marks nearer to the edge of the image do not count as seen, px.
+EDGE = 12.0
+#: Views that are tilted more are not detected well.
+MOST_TILT = math.radians(55.0)
+#: Samples that people are asked for.
+ENOUGH = 12
+
+
+def visible(board: Board, T_camera_board: Array, row: Array, size: tuple[int, int]) -> bool:
+    """Whether all marks would be in the image (width, height), not tilted too far, and seen from the front."""
+    direction = T_camera_board[:3, 3] / max(float(np.linalg.norm(T_camera_board[:3, 3])), 1e-9)
+    if float(T_camera_board[:3, 2] @ direction) < math.cos(MOST_TILT):
+        return False
+    pixels = project(board.points, board.radius, T_camera_board, row)
+    inside = (pixels > EDGE) & (pixels < np.array(size) - 1.0 - EDGE)
+    return bool(np.isfinite(pixels).all() and inside.all())
+
+
+def advice(A: Sequence[Array] | Array) -> str:
+    """What to do next, in words, for someone who moves the arm by hand.
+
+    Args:
+        A: Robot poses so far, (n, 4, 4).
+    """
+    poses = np.asarray(A, dtype=np.float64).reshape(-1, 4, 4)
+    if len(poses) == 0:
+        return "take a first sample with all of the board in the image, as large as it fits"
+    seen = motion(poses)
+    least = _least_turned(poses)
+    if len(poses) < 3 or seen.rotation < math.radians(30.0) or seen.second < math.radians(15.0):
+        return (
+            f"rotate about the wrist's {least} axis by 30° or more (so far {math.degrees(seen.rotation):.0f}°, and"
+            f" {math.degrees(seen.second):.0f}° about a second axis), with the board in the image"
+        )
+    if seen.translation < 0.05:
+        return "move 5 cm or more nearer to the board, or farther from it, and tilt"
+    if len(poses) < ENOUGH:
+        return f"{ENOUGH - len(poses)} more of this kind; rotate about the wrist's {least} axis, which turned least"
+    return "enough; solve, and look at the predicted error"
+
+
+def _least_turned(poses: Array) -> str:
+    """Axis of the gripper about which the poses turned least."""
+    n = len(poses)
+    logs = [se3.log_so3(poses[i, :3, :3].T @ poses[j, :3, :3]) for i in range(n) for j in range(i + 1, n)]
+    spread = np.sum(np.square(logs), axis=0) if logs else np.zeros(3)
+    return "xyz"[int(np.argmin(spread))]
+
 
 #: Before the board was seen, its place is known as a person measures it, 1 cm and a few degrees: px of the image.
 _RULER = 45.0

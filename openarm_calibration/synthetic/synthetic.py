@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openarm_calibration.board.board import CircleGrid
-from openarm_calibration.handeye.problem import Problem, Setup, View, assemble, inverses, moved
-from openarm_calibration.handeye.projection import project
+from openarm_calibration.handeye.problem import Problem, Setup, View, assemble, inverses, moved, project
 from openarm_calibration.handeye.refine import Noise, information_at
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics

@@ -11,7 +11,7 @@ import numpy as np
 
 from openarm_calibration.board.board import Board, CircleGrid
 from openarm_calibration.board.detect import Detection
-from openarm_calibration.handeye.projection import project
+from openarm_calibration.handeye.problem import project
 from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics, load_cameras, true_mount

@@ -21,7 +21,7 @@ from openarm_calibration.board.board_files import write_board
 from openarm_calibration.board.detect import detect
 from openarm_calibration.handeye.offline import Result, calibrate
 from openarm_calibration.sampling.gate import Matched
-from openarm_calibration.sampling.poses import visible
+from openarm_calibration.sampling.next_pose import visible
 from openarm_calibration.sampling.samples import SampleSet, SessionHead
 from openarm_calibration.store.store import CalibrationStore
 from openarm_common import se3

@@ -42,8 +42,7 @@ from openarm_octomap.mapper import Frame as MapFrame
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer
-from openarm_perception.detection.looking import make_pipeline
-from openarm_perception.detection.pipeline import Pipeline
+from openarm_perception.detection.pipeline import Pipeline, make_pipeline
 from openarm_perception.detection.robot import RobotFinder
 from openarm_perception.geometry.depth import DepthImage, DepthLimits
 from openarm_sim_bridge.cameras.cameras import SimulatedCameras

@@ -17,13 +17,12 @@ from rclpy.node import Node
 from std_srvs.srv import Empty
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.answers import answer
 from openarm_common.ros.convert import ns_to_stamp, xyz
 from openarm_octomap.config import UnknownPolicy
 from openarm_octomap.kernels import FREE, UNKNOWN
 from openarm_octomap.mapper import Mapper
 from openarm_octomap.ros import convert
-
-ResponseT = TypeVar("ResponseT")
 
 _STATES = {"free": FREE, "unknown": UNKNOWN}
 _POLICIES: dict[str, UnknownPolicy] = {"occupied": "occupied", "free": "free"}
@@ -71,12 +70,12 @@ class MapServices:
         return response
 
     def _answer_at(self, depth: int) -> Any:
-        def answer(_: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
+        def respond(_: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
             lattice, payload = self._mapper.coarse(depth)
             response.map = convert.octomap_msg(payload, lattice.resolution, self._stamp())
             return response
 
-        return answer
+        return respond
 
     def _on_clear_bbox(
         self, request: BoundingBoxQuery.Request, response: BoundingBoxQuery.Response
@@ -101,7 +100,7 @@ class MapServices:
             self._show()
             return f"{response.cells} cells are {request.state or 'free'}"
 
-        return _answer(response, clear)
+        return answer(response, clear)
 
     def _on_query(self, request: QueryMap.Request, response: QueryMap.Response) -> QueryMap.Response:
         def query() -> str:
@@ -112,7 +111,7 @@ class MapServices:
             response.states, response.blocked = found.states.tolist(), found.blocked.tolist()
             return f"{int(found.blocked.sum())} of {len(points)} points are blocked at {found.resolution:g} m"
 
-        return _answer(response, query)
+        return answer(response, query)
 
     def _on_save(self, request: MapFile.Request, response: MapFile.Response) -> MapFile.Response:
         def save() -> str:
@@ -120,7 +119,7 @@ class MapServices:
             response.nodes = self._mapper.save(path)
             return f"{path}: {response.nodes} nodes"
 
-        return _answer(response, save)
+        return answer(response, save)
 
     def _on_load(self, request: MapFile.Request, response: MapFile.Response) -> MapFile.Response:
         def load() -> str:
@@ -129,18 +128,7 @@ class MapServices:
             self._show()
             return f"{path}: {response.nodes} nodes; {response.outside} leaves outside of the workspace"
 
-        return _answer(response, load)
-
-
-def _answer(response: ResponseT, work: Callable[[], str]) -> ResponseT:
-    """Fill in what became of the work: its sentence, or the reason why it was refused."""
-    answer: Any = response
-    try:
-        answer.message = work()
-        answer.success, answer.code = True, Code.OK.value
-    except OpenArmError as error:
-        answer.success, answer.code, answer.message = False, error.code.value, error.message
-    return response
+        return answer(response, load)
 
 
 ChoiceT = TypeVar("ChoiceT")

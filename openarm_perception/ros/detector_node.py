@@ -25,6 +25,7 @@ from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.robot.posture import JointNeed, Posture
+from openarm_common.ros.answers import answer
 from openarm_common.ros.camera_stream import CameraStream
 from openarm_common.ros.convert import array_to_image, depth_image, intrinsics_from_info, rgb_image
 from openarm_common.ros.detections import detections_to_msg
@@ -34,13 +35,10 @@ from openarm_perception.config import DetectNodeConfig, camera_of
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.detection.draw import annotate
 from openarm_perception.detection.localize import Localizer
-from openarm_perception.detection.looking import make_pipeline
-from openarm_perception.detection.pipeline import Perceived, Pipeline
+from openarm_perception.detection.pipeline import Perceived, Pipeline, View, make_pipeline
 from openarm_perception.detection.robot import RobotFinder
-from openarm_perception.detection.view import View
 from openarm_perception.geometry.depth import DepthLimits
 from openarm_perception.ros import convert
-from openarm_perception.ros.table_server import answer
 
 #: A measurement is made of an image that is not older than this, s.
 _FRESH = 1.0
@@ -210,7 +208,24 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self, request: MeasureTable.Request, response: MeasureTable.Response
     ) -> MeasureTable.Response:
         self._asked_until = time.monotonic() + 5.0
-        return answer(request, response, self._newest if self.measurable else None, self._pipeline, self.config.camera)
+
+        def measure() -> str:
+            if self._newest is None or not self.measurable:
+                camera = self.config.camera
+                raise OpenArmError(
+                    Code.NOT_READY, f"no image of {camera} yet; it is subscribed to now: ask again in a second"
+                )
+            table = self._pipeline.measure_table(self._newest, request.block_height, request.label)
+            response.height, response.std, response.tilt = table.height, table.std, table.tilt
+            response.points = table.points
+            before = self._localizer.table_height
+            message = f"the table is {table.height:.4f} m high; the detector took it for {before:.4f} m"
+            if request.apply:
+                self._localizer.table_height = table.height
+                message += ", and takes what was measured now"
+            return message
+
+        return answer(response, measure)
 
     def _refuse(self, error: OpenArmError) -> None:
         late = error.code in (Code.STALE_DATA, Code.NO_TRANSFORM)

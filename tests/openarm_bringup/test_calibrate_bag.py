@@ -19,7 +19,7 @@ from openarm_bringup import cli
 from openarm_bringup.bags.bag import BagWriter
 from openarm_bringup.bags.ros.recorder import from_profile
 from openarm_calibration.handeye.refine import mount_error
-from openarm_calibration.sampling.session_file import load_session
+from openarm_calibration.sampling.samples import load_session
 from openarm_calibration.store.store import CalibrationStore
 from openarm_calibration.synthetic.synthetic_session import BOARD, Known, make_session, photograph
 from openarm_common import se3

@@ -15,9 +15,8 @@ import pytest
 
 from openarm_calibration.board.board import Board, Charuco, CircleGrid, parse_board
 from openarm_calibration.board.board_files import pdf, png, write_board
-from openarm_calibration.board.centroids import refined
-from openarm_calibration.board.detect import detect, guess_pose
-from openarm_calibration.handeye.projection import project
+from openarm_calibration.board.detect import detect, guess_pose, refined
+from openarm_calibration.handeye.problem import project
 from openarm_calibration.synthetic import synthetic_session
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics

@@ -11,8 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from openarm_calibration.board.board import CircleGrid
-from openarm_calibration.board.centroids import refined
-from openarm_calibration.board.detect import detect
+from openarm_calibration.board.detect import detect, refined
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
 

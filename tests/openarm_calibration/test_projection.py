@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from openarm_calibration.board.board import CircleGrid
-from openarm_calibration.handeye.projection import fit_poses, normal_equations, project
+from openarm_calibration.handeye.problem import fit_poses, normal_equations, project
 from openarm_common import se3
 
 ROW = np.array([900.0, 910.0, 640.0, 360.0])

@@ -15,8 +15,7 @@ from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.handeye.verdict import assess, estimate_delay, side_by_side
 from openarm_calibration.sampling.gate import GateConfig, match
-from openarm_calibration.sampling.samples import without
-from openarm_calibration.sampling.session_file import load_session
+from openarm_calibration.sampling.samples import load_session, without
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer

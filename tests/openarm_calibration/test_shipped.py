@@ -11,7 +11,7 @@ import pytest
 
 from openarm_calibration.handeye.offline import calibrate
 from openarm_calibration.handeye.refine import mount_error
-from openarm_calibration.sampling.session_file import load_session
+from openarm_calibration.sampling.samples import load_session
 from openarm_calibration.store.store import CalibrationStore, StoredCalibration, of_these_mounts, places
 from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras, true_mount

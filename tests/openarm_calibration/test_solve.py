@@ -194,7 +194,7 @@ def test_both_set_ups_in_one_solve_share_the_robots_error_and_a_board() -> None:
         views.append(View(view.points, view.pixels, view.A, "to_hand", view.radius, 1, 1, 100 + view.pose))
         guesses.append(free)
     T = se3.inverse(overhead.X) @ wrist.Z  # the table's board from above
-    from openarm_calibration.handeye.projection import project
+    from openarm_calibration.handeye.problem import project
 
     pixels = project(synthetic.BOARD.points, synthetic.BOARD.radius, T, np.array([900.0, 900.0, 640.0, 360.0]))
     pixels = pixels + rng.normal(0.0, noise.px, pixels.shape)

@@ -9,11 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from openarm_calibration.handeye.offline import calibrate
+from openarm_calibration.handeye.offline import calibrate, calibrate_together, join
 from openarm_calibration.handeye.problem import moved
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig
-from openarm_calibration.handeye.together import calibrate_together, join
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_calibration.synthetic.synthetic_session import Known
 from openarm_common.camera.cameras import T_LINK_OPTICAL

@@ -15,8 +15,8 @@ from openarm_common.ros.detections import class_ids
 from openarm_common.scene.scene import SHAPES, random_scene
 from openarm_perception.config import DetectNodeConfig
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
-from openarm_perception.detection.looking import make_pipeline
 from openarm_perception.detection.network import NetworkConfig, NetworkDetector
+from openarm_perception.detection.pipeline import make_pipeline
 from openarm_perception.geometry.depth import DepthLimits
 
 FOLDER = models_dir() / "detector"

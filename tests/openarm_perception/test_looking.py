@@ -14,9 +14,8 @@ from openarm_common.ros.detections import class_ids
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
-from openarm_perception.detection.looking import make_pipeline
 from openarm_perception.detection.network import NetworkConfig
-from openarm_perception.detection.pipeline import Perceived, Pipeline
+from openarm_perception.detection.pipeline import Perceived, Pipeline, make_pipeline
 from openarm_perception.geometry.depth import DepthLimits
 from tests.openarm_perception.onnx_file import boxes, write_network
 

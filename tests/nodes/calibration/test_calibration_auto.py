@@ -18,7 +18,7 @@ from rclpy.task import Future
 
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.ros.node import CalibrationNode
-from openarm_calibration.sampling.session_file import load_session
+from openarm_calibration.sampling.samples import load_session
 from openarm_calibration.store.store import CalibrationStore
 from openarm_calibration.synthetic.synthetic_session import Known, make_session
 from openarm_common import se3
