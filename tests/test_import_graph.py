@@ -33,7 +33,7 @@ OUTER = ("openarm_bringup", "openarm_evaluation")
 #: Modules of the longest import chain that a package may have.
 LONGEST = 10
 #: Packages whose chain is longer today. These figures may only become smaller; the aim is that none is left.
-STILL_LONGER = {"openarm_calibration": 11, "openarm_grasp": 20, "openarm_motion": 16}
+STILL_LONGER = {"openarm_calibration": 11, "openarm_grasp": 16, "openarm_motion": 15}
 ROS = ("rclpy", "rosidl", "ament", "tf2_ros", "rpyutils")
 
 

@@ -134,7 +134,7 @@ def test_set_up_hands_over_its_arguments_and_the_next_run_does_nothing(machine: 
     took = time.monotonic() - started
     assert (second.stdout, second.stderr) == ("args: a b c\nPYTHONPATH: unset\n", "")
     assert machine.uv_calls() == []
-    assert took < 0.5  # some 0.03 s on an idle machine
+    assert took < 2.0  # some 0.03 s on an idle machine
 
 
 def test_a_changed_message_rebuilds_its_package_only_and_a_second_clone_builds_nothing(machine: Machine) -> None:

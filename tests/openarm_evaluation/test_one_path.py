@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A campaign runs what the nodes run: their motion service, their parameters, and a map of the same images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from openarm_bringup.supervision.environment import node_arguments
+from openarm_bringup.supervision.graph import load_graph
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene.scene import load_scene
+from openarm_evaluation.campaign.parameters import suite_config
+from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
+from openarm_motion.config import MotionConfig
+from openarm_motion.service.motion_service import MotionService
+
+
+@pytest.mark.requirement("R-27")
+def test_the_robot_in_process_has_the_motion_service_and_a_map_that_shows_the_objects() -> None:
+    scene = load_scene("demo")
+    robot = SimRobot(scene, SimulatedSenses(depth_noise=False))
+    assert type(robot.motion) is MotionService
+    with pytest.raises(OpenArmError) as early:
+        robot.map.latest()
+    assert early.value.code is Code.NOT_READY
+    robot.pass_time(2.0)
+    field = robot.map.latest()
+    tops = [(*item.position[:2], scene.table.top_z + item.size[2] - 0.01) for item in scene.objects]
+    assert np.asarray(field.at(tops)).max() < 0.03
+    assert field.at([(0.3, 0.0, scene.table.top_z + 0.25)])[0] > 0.05  # nothing is in the air
+    field.require_fresh(robot.t_ns, 2.0)
+
+
+@pytest.mark.requirement("R-27")
+def test_parameters_are_those_that_the_supervisor_gives_the_nodes_and_set_changes_both(tmp_path: Path) -> None:
+    sets = ("motion.planning.seed=7", "motion.map.use=required")
+    graph = load_graph("sim", sets=sets)
+    node_arguments(graph, "motion", tmp_path)
+    written = yaml.safe_load((tmp_path / "params" / "motion.yaml").read_text())["motion"]["ros__parameters"]
+    motion = suite_config(sets).motion
+    for name, value in written.items():
+        here: object = motion
+        for part in name.split("."):
+            here = getattr(here, part)
+        assert here == value, name
+    assert (motion.planning.seed, motion.map.use) == (7, "required")
+    assert suite_config().motion != motion
+    assert suite_config().motion == load_graph("sim").config("motion", MotionConfig)
+    with pytest.raises(OpenArmError, match="no node 'motoin'"):
+        suite_config(("motoin.planning.seed=7",))
