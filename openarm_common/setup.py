@@ -9,7 +9,7 @@ SHARED = [path for folder in ("models", "config") for path in Path("..", folder)
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     packages=[NAME, *(f"{NAME}.{part}" for part in find_packages("."))],
     package_dir={NAME: "."},
     package_data={NAME: ["py.typed"]},

@@ -6,7 +6,7 @@ NAME = "openarm_octomap"
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     packages=[NAME, *(f"{NAME}.{part}" for part in find_packages("."))],
     package_dir={NAME: "."},
     package_data={NAME: ["py.typed"]},
