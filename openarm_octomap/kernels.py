@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numba kernels of the map: the exact walk along each ray, log-odds.
+"""Numba kernels of the map: the cells that rays end in, the exact walk along each ray, log-odds.
 
-Together with `end_kernels` they do what liboctomap does for a cloud whose points are first made unique by cell, with
+They do what liboctomap does for a cloud whose points are first made unique by cell, with
 the same types in the same order, so that the cells come out identical. Coordinates are in the frame of the map, m;
 keys are those of `octree.lattice`. Marks of a scan: bit 0 a ray went through, bit 1 a ray ended there. The GIL
 is released.
