@@ -189,19 +189,6 @@ def depth_image(message: Image) -> NDArray[np.uint16] | NDArray[np.float32]:
     return cast("NDArray[np.uint16]", image_to_array(message))
 
 
-def depth_to_metres(message: Image) -> NDArray[np.float32]:
-    """Depth (height, width) in metres, NaN where invalid (REP-118).
-
-    16UC1 is millimetres with 0 invalid; 32FC1 is metres with NaN, ±Inf and 0 invalid.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, for another encoding.
-    """
-    depth = depth_image(message).astype(np.float32) * np.float32(0.001 if message.encoding == "16UC1" else 1.0)
-    depth[~((depth > 0.0) & np.isfinite(depth))] = np.nan
-    return depth
-
-
 def intrinsics_from_info(info: CameraInfo) -> Intrinsics:
     """Intrinsics of a rectified camera.
 

@@ -12,10 +12,10 @@ import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, FiniteFloat, ValidationError, field_validator, model_validator
 
 from openarm_common import se3
 from openarm_common.config import Config, describe_faults, load_yaml
@@ -36,11 +36,13 @@ PALETTE: Mapping[str, Rgba] = MappingProxyType(
         "purple": (0.46, 0.10, 0.66, 1.0),
     }
 )
-SHAPES = ("box", "cylinder", "sphere")
+Shape = Literal["box", "cylinder", "sphere"]
+SHAPES: tuple[Shape, ...] = ("box", "cylinder", "sphere")
 RESERVED_NAMES = ("world", "floor", "table", "table_top")
 DENSITY = 700.0  # kg/m3, of an object without a mass: hard wood
 MAX_EDGE = 0.30  # m
 MIN_EDGE = 0.01  # m
+Edge = Annotated[float, Field(ge=MIN_EDGE, le=MAX_EDGE)]
 #: The front of the pedestal's column; a table that reaches further back would stand in it.
 _COLUMN_FRONT = 0.035
 #: Where an arm can grasp a cube of any yaw from above with a tilt up to 30°: x, and y to its own side.
@@ -94,12 +96,14 @@ class SceneObject(Config):
 
     name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")
     label: str = Field(default="", description="what the detector calls it; the colour where it is not given")
-    shape: str = Field(description="box, cylinder or sphere")
-    size: tuple[float, float, float] = Field(description="extents, m")
+    shape: Shape
+    size: tuple[Edge, Edge, Edge] = Field(description="extents, m")
     color: str = Field(description="a colour of the palette")
     mass: float = Field(default=0.0, ge=0.0, le=10.0, description="kg; 0 is the volume times the density of hard wood")
-    position: tuple[float, float] | tuple[float, float, float] = Field(description="of the centre, m")
-    yaw: float = Field(default=0.0, description="rad")
+    position: tuple[FiniteFloat, FiniteFloat] | tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field(
+        description="of the centre, m"
+    )
+    yaw: FiniteFloat = Field(default=0.0, description="rad")
 
     @model_validator(mode="before")
     @classmethod
@@ -116,32 +120,11 @@ class SceneObject(Config):
             )
         return value
 
-    @field_validator("shape")
-    @classmethod
-    def _known_shape(cls, value: str) -> str:
-        if value not in SHAPES:
-            raise ValueError(f"unknown shape; shapes: {', '.join(SHAPES)}")
-        return value
-
     @field_validator("color")
     @classmethod
     def _known_color(cls, value: str) -> str:
         if value not in PALETTE:
             raise ValueError(f"unknown colour; colours: {', '.join(PALETTE)}")
-        return value
-
-    @field_validator("size")
-    @classmethod
-    def _possible_size(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        if not all(MIN_EDGE <= edge <= MAX_EDGE for edge in value):
-            raise ValueError(f"too large or too small; expected every extent in {MIN_EDGE} .. {MAX_EDGE} m")
-        return value
-
-    @field_validator("position", "yaw")
-    @classmethod
-    def _finite(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        if not np.isfinite(value).all():
-            raise ValueError("expected finite numbers")
         return value
 
     @model_validator(mode="after")

@@ -146,9 +146,9 @@ class TrajectoryFollower(Follower):
         """
         if self._goal is not None and self._config.new_goal == "refuse":
             raise TrajectoryError(
-                Code.BUSY,
                 f"the arm follows a trajectory for another {self._goal.spline.end_s - self._goal.tau_s:.2f} s, and new"
                 " goals are refused meanwhile (parameter trajectory.new_goal); cancel it or wait for its end",
+                code=Code.BUSY,
             )
         goal = self._goal_of(trajectory, t_ns, measured, done)
         self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, "a newer trajectory took its place")
@@ -225,14 +225,12 @@ class TrajectoryFollower(Follower):
         t, q, v, a = trajectory.t, trajectory.q, trajectory.v, trajectory.a
         if t[-1] < elapsed:
             raise TrajectoryError(
-                Code.INVALID_ARGUMENT,
                 f"the trajectory ended {elapsed - t[-1]:.2f} s ago (stamp {start_ns * 1e-9:.2f} s, now"
                 f" {t_ns * 1e-9:.2f} s); leave the stamp zero to start at once",
                 TrajectoryResult.OLD_HEADER_TIMESTAMP,
             )
         if start_ns - t_ns > _MAX_DELAY_NS:
             raise TrajectoryError(
-                Code.INVALID_ARGUMENT,
                 f"the trajectory would start in {(start_ns - t_ns) * 1e-9:.0f} s (stamp {start_ns * 1e-9:.2f} s, now"
                 f" {t_ns * 1e-9:.2f} s); leave the stamp zero, or set use_sim_time so that the stamp is simulated time",
             )
@@ -267,10 +265,10 @@ class TrajectoryFollower(Follower):
         j = int(np.argmax(speed / self.group.max_velocity))
         if speed[j] > self.group.max_velocity[j]:
             raise TrajectoryError(
-                Code.LIMITS,
                 f"{self.group.names[j]} would have to move at {speed[j]:.2f} rad/s to be at the first point"
                 f" ({first[j]:.3f} rad) in {seconds:.3f} s from {self._command.position[j]:.3f} rad; its limit is"
                 f" {self.group.max_velocity[j]:.2f}",
+                code=Code.LIMITS,
             )
 
     def _check_start(self, first: Array, measured: Array, tolerance: Array) -> None:
@@ -278,7 +276,6 @@ class TrajectoryFollower(Follower):
         j = int(np.argmax(np.abs(first - measured) - allowed))
         if abs(first[j] - measured[j]) > allowed[j]:
             raise TrajectoryError(
-                Code.INVALID_ARGUMENT,
                 f"the trajectory starts with {self.group.names[j]} at {first[j]:.3f} rad, but it is at"
                 f" {measured[j]:.3f}, more than {allowed[j]:.3f} away; plan from the present position",
                 TrajectoryResult.PATH_TOLERANCE_VIOLATED,

@@ -37,7 +37,13 @@ class TrajectoryResult(IntEnum):
 class TrajectoryError(OpenArmError):
     """A trajectory that will not be followed, with the result that the controller reports."""
 
-    def __init__(self, code: Code, message: str, result: TrajectoryResult = TrajectoryResult.INVALID_GOAL) -> None:
+    def __init__(
+        self,
+        message: str,
+        result: TrajectoryResult = TrajectoryResult.INVALID_GOAL,
+        *,
+        code: Code = Code.INVALID_ARGUMENT,
+    ) -> None:
         super().__init__(code, message)
         self.result = result
 
@@ -98,7 +104,7 @@ def checked(trajectory: Trajectory, group: JointGroup) -> Trajectory:
     order = _order(trajectory.names, group)
     t = np.asarray(trajectory.t, dtype=np.float64)
     if t.size == 0:
-        raise TrajectoryError(Code.INVALID_ARGUMENT, "the trajectory has no points, expected at least one")
+        raise TrajectoryError("the trajectory has no points, expected at least one")
     q = _column(trajectory.q, t.size, order, group, "position")
     v = None if trajectory.v is None else _column(trajectory.v, t.size, order, group, "velocity")
     a = None if trajectory.a is None or v is None else _column(trajectory.a, t.size, order, group, "acceleration")
@@ -109,7 +115,6 @@ def checked(trajectory: Trajectory, group: JointGroup) -> Trajectory:
         for tolerance in tolerances:
             if tolerance.name not in group.names or not np.isfinite(tolerance.position):
                 raise TrajectoryError(
-                    Code.INVALID_ARGUMENT,
                     f"{what} tolerance {tolerance.position} of joint {tolerance.name!r}: expected a number for one of"
                     f" {', '.join(group.names)}",
                 )
@@ -126,7 +131,6 @@ def _order(names: Sequence[str], group: JointGroup) -> list[int]:
     for fault, which in (("unknown", unknown), ("duplicate", duplicate), ("missing", missing)):
         if which:
             raise TrajectoryError(
-                Code.INVALID_ARGUMENT,
                 f"{fault} joint {', '.join(repr(name) for name in which)} in the trajectory; expected each of"
                 f" {', '.join(group.names)} once",
                 TrajectoryResult.INVALID_JOINTS,
@@ -137,15 +141,12 @@ def _order(names: Sequence[str], group: JointGroup) -> list[int]:
 def _column(values: Array, points: int, order: list[int], group: JointGroup, what: str) -> Array:
     array = np.asarray(values, dtype=np.float64)
     if array.shape != (points, len(order)):
-        raise TrajectoryError(
-            Code.INVALID_ARGUMENT, f"{what} array of shape {array.shape}, expected ({points}, {len(order)})"
-        )
+        raise TrajectoryError(f"{what} array of shape {array.shape}, expected ({points}, {len(order)})")
     array = array[:, order]
     bad = np.argwhere(~np.isfinite(array))
     if bad.size:
         i, j = bad[0]
         raise TrajectoryError(
-            Code.INVALID_ARGUMENT,
             f"{what} of {group.names[j]} at point {i} is {array[i, j]}, expected a finite number",
         )
     return array
@@ -153,12 +154,11 @@ def _column(values: Array, points: int, order: list[int], group: JointGroup, wha
 
 def _check_times(t: Array) -> None:
     if not np.all(np.isfinite(t)) or t[0] < 0.0:
-        raise TrajectoryError(Code.INVALID_ARGUMENT, f"time of point 0 is {t[0]} s, expected 0 or more")
+        raise TrajectoryError(f"time of point 0 is {t[0]} s, expected 0 or more")
     late = np.flatnonzero(np.diff(t) <= 0.0)
     if late.size:
         i = int(late[0])
         raise TrajectoryError(
-            Code.INVALID_ARGUMENT,
             f"time of point {i + 1} is {t[i + 1]:.6f} s after {t[i]:.6f} s of point {i}, expected strictly increasing"
             " times",
         )
@@ -169,9 +169,9 @@ def _check_limits(q: Array, group: JointGroup) -> None:
     if out.size:
         i, j = out[0]
         raise TrajectoryError(
-            Code.LIMITS,
             f"position of {group.names[j]} at point {i} is {q[i, j]:.4f}, out of its limits {group.lower[j]:.4f} to"
             f" {group.upper[j]:.4f}",
+            code=Code.LIMITS,
         )
 
 
@@ -183,15 +183,14 @@ def _check_speed(t: Array, q: Array, v: Array | None, group: JointGroup) -> None
         if fast.size:
             i, j = fast[0]
             raise TrajectoryError(
-                Code.LIMITS,
                 f"{group.names[j]} would have to move at {speeds[i, j]:.2f} rad/s {where.format(i)}, its limit is"
                 f" {group.max_velocity[j]:.2f}",
+                code=Code.LIMITS,
             )
     moving = np.flatnonzero(at[-1] > _END_VELOCITY)
     if moving.size:
         j = int(moving[0])
         raise TrajectoryError(
-            Code.INVALID_ARGUMENT,
             f"velocity of {group.names[j]} at the last point is {at[-1, j]:.3f} rad/s, expected 0: a trajectory ends at"
             " rest",
         )

@@ -72,10 +72,14 @@ def compile_world(
         model = spec.compile()
     except ValueError as error:
         raise OpenArmError(Code.CONFIG_INVALID, f"MuJoCo refuses the model: {error}") from error
-    joints = [_joint(model, name) for name in joint_names]
+    try:
+        joints = [model.joint(name).id for name in joint_names]
+        free = [_free_joint(model, tracked.name) for tracked in objects]
+        start = start_qpos(model, home)
+    except KeyError as error:  # MuJoCo's message lists the valid names
+        raise OpenArmError(Code.CONFIG_INVALID, f"the model lacks a joint or body: {error.args[0]}") from error
     actuator = _actuators(model, joint_names, joints)
     limited = model.actuator_forcelimited[actuator].astype(bool)
-    free = [_free_joint(model, tracked.name) for tracked in objects]
     return CompiledWorld(
         model=model,
         timestep_ns=_timestep_ns(model.opt.timestep, period_ns),
@@ -83,7 +87,7 @@ def compile_world(
         dof=model.jnt_dofadr[joints].astype(np.intp),
         actuator=actuator,
         effort_limit=np.where(limited, model.actuator_forcerange[actuator, 1], np.inf),
-        start_qpos=start_qpos(model, home),
+        start_qpos=start,
         objects=tuple(objects),
         object_qpos=tuple(int(model.jnt_qposadr[j]) for j in free),
         object_dof=tuple(int(model.jnt_dofadr[j]) for j in free),
@@ -108,14 +112,6 @@ def _timestep_ns(timestep: float, period_ns: int) -> int:
     return timestep_ns
 
 
-def _joint(model: mujoco.MjModel, name: str) -> int:
-    joint = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
-    if joint < 0:
-        known = ", ".join(model.joint(j).name for j in range(model.njnt))
-        raise OpenArmError(Code.CONFIG_INVALID, f"the model has no joint {name!r}; it has {known}")
-    return joint
-
-
 def _actuators(model: mujoco.MjModel, names: Sequence[str], joints: Sequence[int]) -> Index:
     by_joint = {
         int(model.actuator_trnid[i, 0]): i
@@ -129,8 +125,7 @@ def _actuators(model: mujoco.MjModel, names: Sequence[str], joints: Sequence[int
 
 
 def _free_joint(model: mujoco.MjModel, body_name: str) -> int:
-    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body_name)
-    joint = int(model.body_jntadr[body]) if body >= 0 else -1
+    joint = int(model.body(body_name).jntadr[0])
     if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
         raise OpenArmError(Code.CONFIG_INVALID, f"object {body_name!r} is not a body with a free joint in the model")
     return joint
@@ -140,11 +135,11 @@ def start_qpos(model: mujoco.MjModel, home: Mapping[str, float]) -> Array:
     """Configuration (nq,) with joints at given positions by name, those coupled to them too, the rest at its reference.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, when a joint is missing.
+        KeyError: When a joint is missing.
     """
     start = model.qpos0.copy()
     for name, value in home.items():
-        start[model.jnt_qposadr[_joint(model, name)]] = value
+        start[model.joint(name).qposadr[0]] = value
     for equality in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
         follower, leader = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
         if leader >= 0:

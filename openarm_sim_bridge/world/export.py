@@ -16,6 +16,7 @@ from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES, RobotDescription
 from openarm_common.scene.scene import load_scene
+from openarm_sim_bridge.world.compiled import start_qpos
 from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, robot_spec
 
 Kind = Literal["urdf", "mjcf", "srdf"]
@@ -96,10 +97,7 @@ def render(
     spec.visual.global_.offwidth, spec.visual.global_.offheight = max(width, 640), max(height, 480)
     model = spec.compile()
     data = mujoco.MjData(model)
-    for name, joint in description.joints.items():
-        leader = joint.mimic or name
-        if leader in q:
-            data.qpos[model.joint(name).qposadr[0]] = q[leader]
+    data.qpos[:] = start_qpos(model, q)
     mujoco.mj_forward(model, data)
     camera: Any = view
     if view in VIEWS:

@@ -20,7 +20,6 @@ from openarm_calibration.ros.publisher import PublisherNode
 from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.ros.convert import (
-    depth_to_metres,
     image_to_array,
     intrinsics_from_info,
     pose_to_matrix,
@@ -28,6 +27,14 @@ from openarm_common.ros.convert import (
     transform_to_matrix,
 )
 from openarm_common.ros.node import QOS_SENSOR, QOS_STATIC_TF, QOS_TF, reliable
+
+
+def depth_to_metres(message: Image) -> np.ndarray:
+    """Depth (height, width), m, NaN where invalid."""
+    pixels = image_to_array(message)
+    depth = pixels * np.float32(0.001) if message.encoding == "16UC1" else pixels.copy()
+    depth[~(depth > 0.0)] = np.nan
+    return depth
 
 
 @pytest.mark.requirement("A-26", "A-28", "A-30")

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
@@ -28,10 +30,16 @@ def test_camera_drop_delay_and_freeze(seeing) -> None:
     images = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
     seeing.fresh(images, 5)
     seeing.inject("camera_drop", "{camera: overhead, share: 1.0}")
-    seeing.spin_sim(0.3)
-    n = len(images)
-    seeing.spin_sim(0.5)
-    assert len(images) == n
+    count, since_ns = len(images), seeing.t_ns
+
+    def quiet() -> bool:
+        """Whether no image has come for half a second of simulated time."""
+        nonlocal count, since_ns
+        if len(images) != count:
+            count, since_ns = len(images), seeing.t_ns
+        return seeing.t_ns > since_ns + 500_000_000
+
+    seeing.ros.spin_until(quiet, 20.0, "the end of the images")
     seeing.inject("camera_drop", "{camera: wrist, share: 1.0}")  # takes the new values
     seeing.fresh(images, 2)
     seeing.clear()
@@ -66,45 +74,49 @@ def test_stamp_offset_and_intrinsics_bias(seeing) -> None:
     true = seeing.fresh(infos)[0]
     assert np.all(stamps(infos[-3:]) % 10_000_000 == 0)
     seeing.inject("stamp_offset", "{ms: 23}")
+    seeing.ros.spin_until(lambda: stamps(infos[-1:])[0] % 10_000_000 == 3_000_000, 20.0, "stamps with an offset")
     assert np.all(stamps(seeing.fresh(infos, 3)) % 10_000_000 == 3_000_000)
     seeing.inject("intrinsics_bias", "{focal: 0.05, cx: 4.0}")
-    wrong = seeing.fresh(infos, 2)[-1]
+    seeing.ros.spin_until(lambda: infos[-1].k[0] != true.k[0], 20.0, "wrong intrinsics")
+    wrong = infos[-1]
     np.testing.assert_allclose([wrong.k[0], wrong.k[4]], [1.05 * true.k[0], 1.05 * true.k[4]])
     assert wrong.k[2] == pytest.approx(true.k[2] + 4.0)
     assert wrong.p[0] == wrong.k[0]
     seeing.clear()
-    right = seeing.fresh(infos, 2)[-1]
-    assert list(right.k) == list(true.k)
-    assert stamp_to_ns(right.header.stamp) % 10_000_000 == 0
+    seeing.ros.spin_until(lambda: list(infos[-1].k) == list(true.k), 20.0, "the true intrinsics")
+    seeing.ros.spin_until(lambda: stamps(infos[-1:])[0] % 10_000_000 == 0, 20.0, "stamps without an offset")
 
 
 def test_mount_knocked_light_and_depth_patch(seeing) -> None:
     images = seeing.collect(Image, "/overhead/color/image_raw", QOS_SENSOR)
     depths = seeing.collect(Image, "/overhead/depth/image_raw", QOS_SENSOR)
 
-    def depth() -> np.ndarray:
-        return image_to_array(seeing.fresh(depths, 2)[-1]).astype(float)
+    def shown(got: list, shows: Callable[[np.ndarray], object], what: str) -> np.ndarray:
+        """The first picture in which it shows."""
+        seeing.ros.spin_until(lambda: got and shows(image_to_array(got[-1]).astype(float)), 20.0, what)
+        return image_to_array(got[-1]).astype(float)
 
-    def colour() -> np.ndarray:
-        return image_to_array(seeing.fresh(images, 2)[-1]).astype(float)
+    def same(one: np.ndarray, other: np.ndarray, atol: float) -> bool:
+        return bool(np.allclose(one, other, atol=atol))
 
-    plain_depth, plain = depth(), colour()
+    seeing.fresh(depths, 2), seeing.fresh(images, 2)
+    plain_depth, plain = (image_to_array(got[-1]).astype(float) for got in (depths, images))
     seeing.inject("depth_patch", "{u: 300, v: 220, width: 40, height: 20, metres: -0.05}")
-    change = depth() - plain_depth
+    change = shown(depths, lambda d: not same(d, plain_depth, 1.0), "the patch") - plain_depth
     np.testing.assert_allclose(change[220:240, 300:340], -50.0, atol=1.0)
     assert np.abs(change[:200]).max() <= 1.0
     seeing.clear()
     seeing.inject("light_changed", "{scale: 0.3}")
-    assert colour()[100:].mean() < 0.6 * plain[100:].mean()
+    shown(images, lambda c: c[100:].mean() < 0.6 * plain[100:].mean(), "less light")
     seeing.clear()
+    shown(depths, lambda d: same(d, plain_depth, 1.0), "the depth without the patch")
     seeing.inject("mount_knocked", "{camera: overhead, mm: 20, deg: 3}", seed=5)
-    knocked = depth()
-    assert np.abs(knocked - plain_depth).mean() > 3.0
+    knocked = shown(depths, lambda d: np.abs(d - plain_depth).mean() > 3.0, "the knock")
     seeing.inject("mount_knocked", "{camera: overhead, mm: 20, deg: 3}", seed=5)
-    np.testing.assert_allclose(depth(), knocked, atol=1.0)  # the same seed, the same knock
+    np.testing.assert_allclose(image_to_array(seeing.fresh(depths, 3)[-1]), knocked, atol=1.0)  # the same seed
     seeing.clear()
-    np.testing.assert_allclose(depth(), plain_depth, atol=1.0)
-    np.testing.assert_allclose(colour(), plain, atol=2.0)
+    shown(depths, lambda d: same(d, plain_depth, 1.0), "the true mount in depth")
+    shown(images, lambda c: same(c, plain, 2.0), "the true mount and light in colour")
 
 
 # --- robot and world

@@ -37,7 +37,7 @@ def test_rows_with_padding_are_read() -> None:
 def test_big_endian_depth_is_read() -> None:
     message = Image(height=1, width=2, encoding="16UC1", step=4, is_bigendian=1)
     message.data = bytes([0x03, 0xE8, 0x00, 0x01])
-    assert convert.depth_to_metres(message) == pytest.approx(np.array([[1.0, 0.001]]))
+    assert np.array_equal(convert.image_to_array(message), [[1000, 1]])
 
 
 @pytest.mark.parametrize(("encoding", "size"), [("yuv422", 12), ("mono8", 11), ("rgb8", 12)])
@@ -49,21 +49,6 @@ def test_a_bad_image_is_refused_by_name(encoding: str, size: int) -> None:
         convert.image_to_array(message)
     assert caught.value.code is Code.BAD_IMAGE
     assert encoding in caught.value.message
-
-
-@pytest.mark.requirement("A-47")
-def test_depth_in_millimetres_and_metres_is_the_same() -> None:
-    millimetres = np.array([[0, 1500], [65535, 250]], dtype=np.uint16)
-    metres = np.array([[np.nan, 1.5], [np.inf, 0.25]], dtype=np.float32)
-    a = convert.depth_to_metres(convert.array_to_image(millimetres, "16UC1", "c", 0))
-    b = convert.depth_to_metres(convert.array_to_image(metres, "32FC1", "c", 0))
-    assert np.isnan(a[0, 0])
-    assert np.isnan(b[0, 0])
-    assert np.isnan(b[1, 0])
-    assert a[0, 1] == pytest.approx(1.5)
-    assert a[1, 1] == b[1, 1] == pytest.approx(0.25)
-    with pytest.raises(OpenArmError, match="depth encoding"):
-        convert.depth_to_metres(convert.array_to_image(np.zeros((1, 1), np.uint8), "mono8", "c", 0))
 
 
 @pytest.mark.requirement("A-30")

@@ -269,10 +269,13 @@ def test_a_diverged_simulation_is_reported_and_a_reset_mends_it(
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"joint_names": ("shoulder", "wrist")}, "no joint 'wrist'; it has ball, shoulder"),
+        (
+            {"joint_names": ("shoulder", "wrist")},
+            "lacks a joint or body: Invalid name 'wrist'. Valid names: .*ball",
+        ),
         ({"joint_names": ("mimic",)}, "no actuator for the joints mimic"),
         ({"objects": (TrackedObject("upper", "x", (1, 1, 1)),)}, "'upper' is not a body with a free joint"),
-        ({"home": {"knee": 0.0}}, "no joint 'knee'"),
+        ({"home": {"knee": 0.0}}, "lacks a joint or body: Invalid name 'knee'"),
     ],
 )
 def test_what_the_model_lacks_is_named(kwargs: dict, message: str) -> None:
