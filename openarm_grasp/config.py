@@ -3,12 +3,22 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from openarm_common.config import Config
 from openarm_grasp.evidence.drift import DriftConfig
+
+
+def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] < ends[1]:
+        raise ValueError(f"{list(ends)} must ascend")
+    return ends
+
+
+#: Two ends, the lower first.
+Interval = Annotated[tuple[float, float], AfterValidator(_ascending)]
 
 
 class ApproachConfig(Config):
@@ -152,10 +162,8 @@ class PlaceConfig(Config):
         default=0.02, gt=0.0, le=0.1, description="seen this near to the target counts as placed, m"
     )
     yaw_step_deg: float = Field(default=30.0, gt=0.0, le=180.0, description="turns of the object that are tried, deg")
-    region_x: tuple[float, float] = Field(default=(0.16, 0.36), description="x of free spots, base frame, m")
-    region_abs_y: tuple[float, float] = Field(
-        default=(0.06, 0.42), description="|y| of free spots on the arm's side, m"
-    )
+    region_x: Interval = Field(default=(0.16, 0.36), description="x of free spots, base frame, m")
+    region_abs_y: Interval = Field(default=(0.06, 0.42), description="|y| of free spots on the arm's side, m")
     spot_step: float = Field(default=0.04, gt=0.0, le=0.2, description="grid of free spots, m")
     spots: int = Field(default=6, ge=1, le=50, description="free spots that are offered to the planner")
     neighbour_distance: float = Field(default=0.10, ge=0.0, le=0.5, description="least distance to other objects, m")
@@ -166,19 +174,11 @@ class PlaceConfig(Config):
         default=0.08, ge=0.0, le=0.5, description="least distance to where the object came from, m"
     )
 
-    @model_validator(mode="after")
-    def _ranges_ascend(self) -> Self:
-        for name in ("region_x", "region_abs_y"):
-            low, high = getattr(self, name)
-            if not low < high:
-                raise ValueError(f"{name} {[low, high]} must ascend")
-        return self
-
 
 class HandOverConfig(Config):
     """Where objects change hands: on the table, on a strip in the middle that both arms reach."""
 
-    x: tuple[float, float] = Field(default=(0.20, 0.32), description="ends of the strip, base frame, m")
+    x: Interval = Field(default=(0.20, 0.32), description="ends of the strip, base frame, m")
     abs_y: float = Field(default=0.03, gt=0.0, le=0.2, description="half of its width, m")
     step: float = Field(default=0.03, gt=0.0, le=0.2, description="grid of spots, m")
     tries: int = Field(default=9, ge=1, le=50, description="spots and turns that the other arm is asked about")
@@ -189,12 +189,6 @@ class HandOverConfig(Config):
     rounds: int = Field(
         default=3, ge=1, le=5, description="times that the object is brought to the middle until the other arm takes it"
     )
-
-    @model_validator(mode="after")
-    def _ascends(self) -> Self:
-        if not self.x[0] < self.x[1]:
-            raise ValueError(f"x {list(self.x)} must ascend")
-        return self
 
 
 class PushConfig(Config):

@@ -135,29 +135,32 @@ def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> Gr
         config: Thresholds.
         was_held: The object was held before: an empty hand has lost it.
     """
-    return GripVerdict(*_grip(e, config, Grip.LOST if was_held else Grip.EMPTY))
-
-
-def _grip(e: Evidence, config: HeldConfig, empty: Grip) -> tuple[Grip, str]:
+    empty = Grip.LOST if was_held else Grip.EMPTY
     gap, width = f"gap {e.gap * 1e3:.1f} mm", f"the object's {e.expected * 1e3:.1f} mm"
     if e.tcp_error > config.max_tcp_error:
         off, limit = e.tcp_error * 1e3, config.max_tcp_error * 1e3
-        return Grip.HAND_COLLISION, f"the hand is {off:.1f} mm from the grasp, expected at most {limit:.0f} mm"
+        return GripVerdict(
+            Grip.HAND_COLLISION, f"the hand is {off:.1f} mm from the grasp, expected at most {limit:.0f} mm"
+        )
     if e.gap <= config.closed_below:
-        return empty, f"{gap}: the fingers are closed on nothing"
+        return GripVerdict(empty, f"{gap}: the fingers are closed on nothing")
     if e.gap > e.expected + config.width_tolerance:
-        return Grip.HAND_COLLISION, f"{gap} is wider than {width}: the fingers are not around it"
+        return GripVerdict(Grip.HAND_COLLISION, f"{gap} is wider than {width}: the fingers are not around it")
     if e.gap < e.expected - config.width_tolerance:
-        return empty, f"{gap} is narrower than {width}: something else is between the fingers"
+        return GripVerdict(empty, f"{gap} is narrower than {width}: something else is between the fingers")
     if abs(e.speed) >= config.max_speed:
-        return Grip.MOVING, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest"
+        return GripVerdict(Grip.MOVING, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest")
     if config.use_effort and abs(e.effort) <= config.min_effort:
-        return empty, f"{gap}, but the fingers press with {abs(e.effort):.1f} N, expected over {config.min_effort:g} N"
+        return GripVerdict(
+            empty, f"{gap}, but the fingers press with {abs(e.effort):.1f} N, expected over {config.min_effort:g} N"
+        )
     if config.use_finger_force and min(e.pads, default=0.0) < config.min_pad_force:
         felt = f"a finger pad feels {min(e.pads):.1f} N" if e.pads else "no sensor tells what the finger pads feel"
-        return empty, f"{gap}, but {felt}, expected {config.min_pad_force:g} N on each (held.use_finger_force)"
+        return GripVerdict(
+            empty, f"{gap}, but {felt}, expected {config.min_pad_force:g} N on each (held.use_finger_force)"
+        )
     force = f", {abs(e.effort):.0f} N" if config.use_effort else ""
-    return Grip.HELD, f"{gap} for {e.expected * 1e3:.1f} mm{force}: held"
+    return GripVerdict(Grip.HELD, f"{gap} for {e.expected * 1e3:.1f} mm{force}: held")
 
 
 def judge_sight(

@@ -8,7 +8,7 @@ rad.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,14 +22,6 @@ from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import PlaceTarget, other_grasps, place_targets
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategy.effects import PlanGrasp, Planned, PlanPlace
-
-
-@dataclass(frozen=True)
-class Pick:
-    """A grasp that can be made, and its plan."""
-
-    candidate: GraspCandidate
-    plan: Planned
 
 
 class FeasibilityCheck:
@@ -50,7 +42,7 @@ class FeasibilityCheck:
         others: Sequence[Detection],
         offered: Sequence[GraspCandidate] | None = None,
         now: Detection | None = None,
-    ) -> Pick:
+    ) -> tuple[GraspCandidate, Planned]:
         """Plan a grasp of an object that stands there.
 
         Args:
@@ -60,6 +52,9 @@ class FeasibilityCheck:
             offered: The grasps to choose from; every one when not given.
             now: The object where it stands until then, when that is elsewhere.
 
+        Returns:
+            The grasp that can be made, and its plan.
+
         Raises:
             OpenArmError: One of `NO_WAY`; what the robot raises.
         """
@@ -68,25 +63,11 @@ class FeasibilityCheck:
         gone = () if now is None else (target_box(now, config),)
         effect = PlanGrasp(arm, offered, obstacle_boxes(others, config), target_box(target, config), gone)
         plan = await self._robot.plan(effect)
-        return Pick(offered[plan.chosen], plan)
+        return offered[plan.chosen], plan
 
     def _offered(self, arm: str, target: Detection, others: Sequence[Detection]) -> tuple[GraspCandidate, ...]:
         shoulder = self._context.shoulders.get(arm, (0.0, 0.0))
         return propose(target, self._context.config, shoulder_xy=shoulder, others=others)
-
-    async def place(
-        self, arm: str, pick: Pick, target: Detection, others: Sequence[Detection], ways: Sequence[PlaceTarget]
-    ) -> PlaceTarget:
-        """Plan how an object that was picked so is put down one of these ways.
-
-        Raises:
-            OpenArmError: As `pick`.
-        """
-        config = self._context.config
-        held = held_box(target, pick.candidate, config)
-        stood = (target_box(target, config),)
-        effect = PlanPlace(arm, tuple(ways), obstacle_boxes(others, config), held, pick.plan.retreat, stood)
-        return ways[(await self._robot.plan(effect)).chosen]
 
     async def pick_and_place(
         self,
@@ -111,23 +92,26 @@ class FeasibilityCheck:
         Raises:
             OpenArmError: As `pick`.
         """
-        left = self._offered(arm, target, others)
+        config, left = self._context.config, self._offered(arm, target, others)
         refused: OpenArmError | None = None
         while True:
             try:
-                pick = await self.pick(arm, target, others, left)
+                candidate, plan = await self.pick(arm, target, others, left)
             except OpenArmError as error:
                 if refused is None or error.code not in NO_WAY:
                     raise
                 raise refused from error
-            offered = place_targets(target, pick.candidate, spots, self._context.config, yaw=yaw)
+            offered = place_targets(target, candidate, spots, config, yaw=yaw)
             ways = [way for way in offered if not any(_same(way, other, any_turn=target.round) for other in used)]
             try:
                 if not ways:
                     raise OpenArmError(Code.UNREACHABLE, "no other way to put it down is left")
-                return await self.place(arm, pick, target, others, ways)
+                held, stood = held_box(target, candidate, config), (target_box(target, config),)
+                obstacles = obstacle_boxes(others, config)
+                end = await self._robot.plan(PlanPlace(arm, tuple(ways), obstacles, held, plan.retreat, stood))
+                return ways[end.chosen]
             except OpenArmError as error:
-                left = other_grasps(left, pick.candidate, error.code, target, yaw)
+                left = other_grasps(left, candidate, error.code, target, yaw)
                 if error.code not in NO_WAY or not left:
                     raise
                 refused = error

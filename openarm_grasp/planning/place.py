@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
+from math import hypot, inf
 
 import numpy as np
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_grasp.config import GraspConfig
+from openarm_grasp.config import GraspConfig, PlaceConfig
 from openarm_grasp.evidence.evidence import SQUARE_WITHIN
 from openarm_grasp.evidence.observation import Detection, Frame
 from openarm_grasp.planning.candidates import UP, GraspCandidate, hold_of
@@ -145,14 +147,10 @@ def _failed(used: Sequence[PlaceTarget], spot: Array, yaw: float, *, any_turn: b
 
 def yaw_offsets(step_deg: float) -> tuple[float, ...]:
     """Turns to try, rad, in (-pi, pi]: 0, then ± one step, ± two steps, and so on."""
-    offsets = [0.0]
-    k = 1
-    while k * step_deg < 180.0 - 1e-9:
-        offsets += [float(np.radians(k * step_deg)), -float(np.radians(k * step_deg))]
-        k += 1
-    if abs(k * step_deg - 180.0) < 1e-9:
-        offsets.append(float(np.pi))
-    return tuple(offsets)
+    steps = range(1, int((180.0 - 1e-9) // step_deg) + 1)
+    offsets = [sign * float(np.radians(k * step_deg)) for k in steps for sign in (1.0, -1.0)]
+    half_turn = [float(np.pi)] if abs((len(steps) + 1) * step_deg - 180.0) < 1e-9 else []
+    return (0.0, *offsets, *half_turn)
 
 
 def turns_to(target: Detection, yaw: float) -> tuple[float, ...]:
@@ -180,17 +178,11 @@ def free_spots(arm: str, target: Detection, others: Sequence[Detection], config:
         OpenArmError: PLACE_FAILED, when nothing is free.
     """
     place = config.place
-    side = 1.0 if arm == "left" else -1.0
-    ranked: list[tuple[bool, float, float, float]] = []
-    for x in grid(*place.region_x, place.spot_step):
-        for abs_y in grid(*place.region_abs_y, place.spot_step):
-            spot = np.array([x, side * abs_y])
-            origin = float(np.linalg.norm(spot - target.p_base[:2]))
-            room = min((float(np.linalg.norm(spot - d.p_base[:2])) for d in others), default=np.inf)
-            if origin < place.origin_distance or room < place.neighbour_distance:
-                continue
-            cost = origin - min(room, 2.0 * place.neighbour_distance)
-            ranked.append((room < place.neighbour_room, cost, x, side * abs_y))
+    ys = grid(*place.region_abs_y, place.spot_step) * (1.0 if arm == "left" else -1.0)
+    ranked = [
+        (clearance < place.neighbour_room, cost, x, y)
+        for cost, clearance, x, y in clear_spots(grid(*place.region_x, place.spot_step), ys, target, others, place)
+    ]
     if not ranked:
         raise OpenArmError(
             Code.PLACE_FAILED,
@@ -206,6 +198,35 @@ def free_spots(arm: str, target: Detection, others: Sequence[Detection], config:
         if len(chosen) == place.spots:
             break
     return tuple(chosen)
+
+
+def clear_spots(
+    xs: Sequence[float] | Array,
+    ys: Sequence[float] | Array,
+    target: Detection,
+    others: Sequence[Detection],
+    config: PlaceConfig,
+) -> list[tuple[float, float, float, float]]:
+    """Spots of a grid that keep their distance from other objects and from where the object came from.
+
+    Args:
+        xs: Of the grid, base frame, m.
+        ys: Of the grid, base frame, m.
+        target: The object as it stood at the grasp.
+        others: Other objects in view.
+        config: The distances.
+
+    Returns:
+        Cost, clearance to the nearest object, x and y of each, m. The cost is the distance from where the object came
+        from, less the clearance up to twice the distance asked for.
+    """
+    found: list[tuple[float, float, float, float]] = []
+    for x, y in product(map(float, xs), map(float, ys)):
+        origin = hypot(x - target.p_base[0], y - target.p_base[1])
+        clearance = min((hypot(x - d.p_base[0], y - d.p_base[1]) for d in others), default=inf)
+        if origin >= config.origin_distance and clearance >= config.neighbour_distance:
+            found.append((origin - min(clearance, 2.0 * config.neighbour_distance), clearance, x, y))
+    return found
 
 
 def check_position(

@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One arm's link to the robot while the other arm works, too: they look in turn, and one waits where the other stands.
+"""Coordination of two arms that work at the same time: they observe in turn, and one waits for the other to leave.
 
-That two arms under way keep apart is proven by motion, which lets the later one rest first. What is left is an arm
-that stands in the way: the other waits until it has gone on. Two that wait for each other are parted: the one that
-comes second in the order of arms gives up, and goes home as after every failure. Base frame, m, rad.
+That two arms in motion keep their clearance is validated by motion, which delays the later one. What is left is an arm
+at rest in the way: the other waits until it has gone on. Of two that wait for each other, the one that comes second in
+the order of arms gives up, and goes home as after every failure. Base frame, m, rad.
 """
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import RobotDescription, Side
-from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.robot.description import Side
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.routing import ARMS
@@ -32,11 +31,11 @@ _GONE_ON = 0.1
 
 @dataclass
 class ArmCoordination:
-    """What both links share.
+    """What the robots of both arms share.
 
     Attributes:
         waiting: Arms that wait until the other goes on.
-        looking: The arm that looks; "" when none does.
+        looking: The arm that observes; "" when none does.
         done: Arms whose work has ended.
     """
 
@@ -46,12 +45,12 @@ class ArmCoordination:
 
 
 class CoordinatedRobot:
-    """Implements `Link` for one arm beside the other.
+    """Implements the robot's interface for one arm while the other works, too; use `coordinated`.
 
     Args:
-        arm: Whose link.
-        link: To the robot, for this arm alone.
-        coordination: Shared with the other arm's link.
+        arm: Which.
+        link: The robot, for this arm alone.
+        coordination: Shared with the other arm's.
         config: Parameters.
     """
 
@@ -62,34 +61,9 @@ class CoordinatedRobot:
         self._homes = {a: link.description.group_state(f"{a}_arm", config.home_state) for a in (arm, self._other)}
         self.deadline_ns = 0
 
-    # --- the robot
-    @property
-    def description(self) -> RobotDescription:
-        """The robot."""
-        return self._link.description
-
-    @property
-    def states(self) -> RobotStateBuffer:
-        """Its joint states."""
-        return self._link.states
-
-    @property
-    def base_frame(self) -> str:
-        """Name of the base frame."""
-        return self._link.base_frame
-
-    @property
-    def now_ns(self) -> int:
-        """Robot time."""
-        return self._link.now_ns
-
-    def effort(self, joint: str) -> float:
-        """Newest effort of a joint, N or N m."""
-        return self._link.effort(joint)
-
-    def pads(self, arm: str) -> tuple[float, ...]:
-        """Force on each finger pad of a hand, N."""
-        return self._link.pads(arm)
+    def __getattr__(self, name: str) -> Any:
+        """What is the same for an arm alone."""
+        return getattr(self._link, name)
 
     def check(self) -> None:
         """Raise when the work shall not go on."""
@@ -100,17 +74,7 @@ class CoordinatedRobot:
         """Say something that does not stop the work."""
         self._link.warn(f"{self.arm} arm: {text}")
 
-    # --- waiting and looking
-    async def until(
-        self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
-    ) -> None:
-        """Wait for a condition."""
-        await self._link.until(done, limit, what, guard)
-
-    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
-        """Carry out several things at once."""
-        await self._link.together(parts)
-
+    # --- observing
     async def observe(self, count: int, *, near: bool = False) -> Frames:
         """Frames that are taken from now on.
 
@@ -119,8 +83,8 @@ class CoordinatedRobot:
         """
         coordination, limit = self._coordination, self._config.limits.beside_timeout
         if not near and self._is_home(self.arm):
-            await self.until(self._other_is_away, limit, f"looking: the {self._other} arm is in the view")
-        await self.until(lambda: coordination.looking in ("", self.arm), limit, "looking: the other arm's look")
+            await self._link.until(self._other_is_away, limit, f"looking: the {self._other} arm is in the view")
+        await self._link.until(lambda: coordination.looking in ("", self.arm), limit, "looking: the other arm's look")
         coordination.looking = self.arm
         try:
             return await self._link.observe(count, near=near)
@@ -136,10 +100,6 @@ class CoordinatedRobot:
         """Plan; again when the other arm has gone on."""
         return await self._patiently(lambda: self._link.plan(effect), "planning")
 
-    async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
-        """How far the arm's TCP stays from a point."""
-        return await self._link.reach(arm, T_base_tcp)
-
     async def follow(
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
     ) -> None:
@@ -154,18 +114,18 @@ class CoordinatedRobot:
         """Move an arm on a free path to a posture."""
         await self._patiently(lambda: self._link.move_named(arm, named, effect, what), what)
 
-    async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
-        """Move the fingers."""
-        return await self._link.grip(arm, joint, position, what, effort)
-
     # --- the other arm
     async def _patiently(self, work: Callable[[], Awaitable[T]], what: str) -> T:
-        end_ns = self.now_ns + round(self._config.limits.beside_timeout * 1e9)
+        end_ns = self._link.now_ns + round(self._config.limits.beside_timeout * 1e9)
         while True:
             try:
                 return await work()
             except OpenArmError as error:
-                if error.code not in (Code.IN_COLLISION, Code.NO_PLAN) or self._other_is_away() or self.now_ns > end_ns:
+                if (
+                    error.code not in (Code.IN_COLLISION, Code.NO_PLAN)
+                    or self._other_is_away()
+                    or self._link.now_ns > end_ns
+                ):
                     raise
                 if not await self._gone_on(what):
                     raise
@@ -182,13 +142,13 @@ class CoordinatedRobot:
         coordination.waiting.add(self.arm)
         try:
             text = f"{what}: the {self._other} arm stands in the way"
-            await self.until(over, self._config.limits.beside_timeout, text)
+            await self._link.until(over, self._config.limits.beside_timeout, text)
         finally:
             coordination.waiting.discard(self.arm)
         return not (gives_way and self._other in coordination.waiting)
 
     def _pose(self, arm: Side) -> Array:
-        _, q = self.states.latest()
+        _, q = self._link.states.latest()
         return np.array([q[name] for name in self._homes[arm]])
 
     def _is_home(self, arm: Side) -> bool:
@@ -197,3 +157,8 @@ class CoordinatedRobot:
 
     def _other_is_away(self) -> bool:
         return self._other in self._coordination.done or self._is_home(self._other)
+
+
+def coordinated(arm: Side, robot: Link, coordination: ArmCoordination, config: GraspConfig) -> Link:
+    """The robot for one arm while the other works, too; arguments as of `CoordinatedRobot`."""
+    return cast("Link", CoordinatedRobot(arm, robot, coordination, config))

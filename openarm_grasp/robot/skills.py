@@ -126,9 +126,6 @@ class Skills:
             OpenArmError: GRASP_LOST; as the robot.
         """
         self.robot.check()
-        await self._follow(arm, trajectory, what, carrying=carrying)
-
-    async def _follow(self, arm: str, trajectory: Trajectory, what: str, *, carrying: bool = False) -> None:
         held, at_first = self._config.held, self.aperture(arm)
 
         def still_held() -> None:
@@ -146,8 +143,7 @@ class Skills:
 
     async def follow_and_grip(self, arm: str, trajectory: Trajectory, what: str, *, position: float, how: str) -> None:
         """Follow a trajectory and move the fingers at the same time; arguments as of `follow` and `grip`."""
-        self.robot.check()
-        await self.robot.together([lambda: self._grip(arm, position, how), lambda: self._follow(arm, trajectory, what)])
+        await self.robot.together([lambda: self.grip(arm, position, how), lambda: self.follow(arm, trajectory, what)])
 
     async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Move the TCP to a pose on a straight line."""
@@ -208,9 +204,6 @@ class Skills:
                 meets anything.
         """
         self.robot.check()
-        await self._grip(arm, position, what, effort)
-
-    async def _grip(self, arm: str, position: float, what: str, effort: float = 0.0) -> None:
         hand, robot, what = self._hands[arm], self.robot, f"{arm} hand: {what}"
         ended_well = await robot.grip(arm, hand.joint, position, what, effort)
         if position > 0.0:

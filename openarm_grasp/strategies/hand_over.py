@@ -21,7 +21,7 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.observation import Detection, Sighting
 from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.planning.place import PlaceTarget, grid
+from openarm_grasp.planning.place import PlaceTarget, clear_spots, grid
 from openarm_grasp.planning.routing import ARMS
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import Feasible, GraspOutcome
@@ -101,14 +101,8 @@ def middle_spots(target: Detection, others: Sequence[Detection], context: GraspC
         OpenArmError: PLACE_FAILED, when none is free.
     """
     config, place = context.config.hand_over, context.config.place
-    ranked: list[tuple[float, float, float]] = []
-    for x in grid(*config.x, config.step):
-        for y in grid(-config.abs_y, config.abs_y, config.step):
-            spot = np.array([x, y])
-            room = min((float(np.linalg.norm(spot - d.p_base[:2])) for d in others), default=np.inf)
-            origin = float(np.linalg.norm(spot - target.p_base[:2]))
-            if room >= place.neighbour_distance and origin >= place.origin_distance:
-                ranked.append((origin - min(room, 2.0 * place.neighbour_distance), x, y))
+    xs, ys = grid(*config.x, config.step), grid(-config.abs_y, config.abs_y, config.step)
+    ranked = [(cost, x, y) for cost, _, x, y in clear_spots(xs, ys, target, others, place)]
     if not ranked:
         raise OpenArmError(
             Code.PLACE_FAILED,

@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 
 from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.config import Interval
 
 Place: TypeAlias = tuple[float, float]
 
@@ -31,16 +32,8 @@ _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 class Bin(Config):
     """A rectangle on the table."""
 
-    x: tuple[float, float] = Field(description="near and far edge, m")
-    y: tuple[float, float] = Field(description="right and left edge, m")
-
-    @model_validator(mode="after")
-    def _ascend(self) -> Self:
-        for name in ("x", "y"):
-            low, high = getattr(self, name)
-            if not low < high:
-                raise ValueError(f"{name} {[low, high]} must ascend")
-        return self
+    x: Interval = Field(description="near and far edge, m")
+    y: Interval = Field(description="right and left edge, m")
 
     def slots(self, spacing: float) -> tuple[tuple[float, float], ...]:
         """Places for objects, row by row, `spacing` apart; a small bin has one, in its middle."""

@@ -18,7 +18,7 @@ from openarm_grasp.evidence.observation import SAME_PLACE, Sighting, find, on_ta
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.routing import ARMS
-from openarm_grasp.robot.coordination import ArmCoordination, CoordinatedRobot
+from openarm_grasp.robot.coordination import ArmCoordination, coordinated
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
@@ -161,7 +161,7 @@ async def simultaneous(pair: Pair) -> PairOutcome | None:
 
     async def work(i: int) -> None:
         arm = arms[i]
-        robot = Skills(CoordinatedRobot(arm, pair.robots[arm], coordination, config), config, arms=(arm,))
+        robot = Skills(coordinated(arm, pair.robots[arm], coordination, config), config, arms=(arm,))
         try:
             task = pair.task(i, robot, arm=arm, why=pair.reason)
             outcome = await pick_and_place(task, task.request)
