@@ -8,7 +8,6 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from openarm_common.config import Config
-from openarm_grasp.evidence.drift import DriftConfig
 
 
 def _ascending(ends: tuple[float, float]) -> tuple[float, float]:
@@ -226,6 +225,15 @@ class LimitsConfig(Config):
     )
     move_timeout: float = Field(default=60.0, gt=0.0, le=600.0, description="one motion, wall clock, s")
     gripper_timeout: float = Field(default=20.0, gt=0.0, le=120.0, description="one gripper motion, wall clock, s")
+
+
+class DriftConfig(Config):
+    """When residuals of grasps raise an alarm."""
+
+    window: int = Field(default=10, ge=3, le=100, description="grasps that are looked at")
+    least: int = Field(default=5, ge=3, le=100, description="grasps before an alarm may be raised")
+    bias: float = Field(default=0.004, gt=0.0, le=0.05, description="mean residual that is an alarm, m")
+    sigmas: float = Field(default=3.0, gt=0.0, le=10.0, description="and it must be so many times its own error")
 
 
 class GraspConfig(Config):

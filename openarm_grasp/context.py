@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from openarm_common.robot.description import RobotDescription, Side
 from openarm_common.scene.scene import Table
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.planning.arms import ARMS
 
 
 @dataclass(frozen=True)

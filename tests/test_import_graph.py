@@ -35,9 +35,9 @@ OUTER = ("openarm_bringup", "openarm_evaluation")
 #: Modules of the longest import chain that a package may have.
 LONGEST = 10
 #: Packages whose chain is longer today. These figures may only become smaller; the aim is that none is left.
-STILL_LONGER = {"openarm_grasp": 16, "openarm_motion": 15}
+STILL_LONGER = {"openarm_motion": 15}
 #: Packages that list no public names yet; the aim is that none is left.
-STILL_WITHOUT_NAMES = ("openarm_grasp", "openarm_motion")
+STILL_WITHOUT_NAMES = ("openarm_motion",)
 ROS = ("rclpy", "rosidl", "ament", "tf2_ros", "rpyutils")
 
 
@@ -80,7 +80,7 @@ def test_a_reversed_arrow_would_be_seen() -> None:
     assert is_ros("openarm_interfaces.msg.GraspStatus")
     assert not is_ros("openarm_common.ros.convert.image_to_array")
     assert is_shell(Path("openarm_grasp/ros/node.py"))
-    assert not is_shell(Path("openarm_grasp/strategy/direct.py"))
+    assert not is_shell(Path("openarm_grasp/strategies/direct.py"))
 
 
 @pytest.mark.parametrize("package", PACKAGES)

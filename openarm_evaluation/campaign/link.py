@@ -15,12 +15,11 @@ from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.types import Array
 from openarm_evaluation.campaign.robot import PLANNING_S, SimRobot
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence.evidence import Verdict
+from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import Box as GraspBox
 from openarm_grasp.planning.options import NoWayError
-from openarm_grasp.strategy import effects
-from openarm_grasp.strategy.effects import Frames, GoHome, Planned
-from openarm_grasp.strategy.link import check_deadline
+from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, check_deadline
+from openarm_grasp.robot.interface import Trajectory as AnyTrajectory
 from openarm_motion.collision.solids import Box
 from openarm_motion.planning.approach import ApproachRequest, Target
 from openarm_motion.service.requests import (
@@ -41,7 +40,7 @@ AnswerT = TypeVar("AnswerT", bound=MotionAnswer)
 
 
 class DirectLink:
-    """Implements `openarm_grasp.strategy.link.Link`.
+    """Implements `openarm_grasp.robot.interface.RobotInterface`.
 
     Args:
         robot: The robot.
@@ -167,12 +166,12 @@ class DirectLink:
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
         return Frames(tuple(fresh()[-count:]), self.base_frame)
 
-    def stop_looking(self) -> None:
+    def stop_observing(self) -> None:
         """Nothing is detected for now."""
         self.robot.look("")
 
     # --- planning
-    async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
+    async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Plan with the motion service.
 
         Raises:
@@ -181,16 +180,16 @@ class DirectLink:
         if self.plans_to_fail > 0:
             self.plans_to_fail -= 1
             await self.robot.wait(PLANNING_S)
-            raise OpenArmError(Code.NO_PLAN, f"{effect.arm} arm: no path, on purpose")
-        after = effect.after if isinstance(effect, effects.PlanPlace) else None
-        request = PlanApproachRequest(
-            effect.arm,
-            approach_of(effect),
+            raise OpenArmError(Code.NO_PLAN, f"{request.arm} arm: no path, on purpose")
+        after = request.after if isinstance(request, PlanPlace) else None
+        asked = PlanApproachRequest(
+            request.arm,
+            approach_of(request),
             after.q[-1] if isinstance(after, Trajectory) else np.zeros(0),
             self._config.velocity_scale,
-            boxes_of(effect.gone),
+            boxes_of(request.gone),
         )
-        answer = await self._asked(lambda stopped: self.robot.motion.plan_approach(request, stopped))
+        answer = await self._asked(lambda stopped: self.robot.motion.plan_approach(asked, stopped))
         refusals = {refused.id: Verdict(refused.code, refused.message) for refused in answer.refusals}
         if answer.error is not None:
             raise NoWayError(answer.code, answer.message, refusals) from answer.error
@@ -205,7 +204,7 @@ class DirectLink:
 
     # --- moving
     async def follow(
-        self, arm: str, trajectory: effects.Trajectory, what: str, guard: Callable[[], None] | None = None
+        self, arm: str, trajectory: AnyTrajectory, what: str, guard: Callable[[], None] | None = None
     ) -> None:
         """Follow a planned trajectory and see that the arm has arrived.
 
@@ -217,14 +216,13 @@ class DirectLink:
         request = ExecuteRequest(arm, Motion.of(trajectory), self.max_wait)
         await self._moved(lambda stopped: self.robot.motion.execute(request, stopped), what, guard)
 
-    async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
+    async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Move the TCP on a straight line."""
-        await self._move(MoveRequest(effect.arm, LineGoal(effect.T_base_tcp), **self._options()), what)
+        await self._move(MoveRequest(arm, LineGoal(T_base_tcp), **self._options()), what)
 
-    async def move_named(self, arm: str, named: str, effect: GoHome, what: str) -> None:
+    async def move_named(self, arm: str, named: str, obstacles: Sequence[GraspBox], what: str) -> None:
         """Move an arm on a free path to a posture."""
-        obstacles = boxes_of(effect.obstacles)
-        await self._move(MoveRequest(arm, NamedGoal(named), obstacles, **self._options()), what)
+        await self._move(MoveRequest(arm, NamedGoal(named), boxes_of(obstacles), **self._options()), what)
 
     def _options(self) -> dict[str, Any]:
         return {"hand_empty": True, "scale": self._config.velocity_scale, "max_start_delay": self.max_wait}
@@ -284,11 +282,11 @@ def boxes_of(boxes: Sequence[GraspBox]) -> tuple[Box, ...]:
     return tuple(Box(box.id, box.T_frame_box, box.size) for box in boxes)
 
 
-def approach_of(effect: effects.PlanGrasp | effects.PlanPlace) -> ApproachRequest:
+def approach_of(request: PlanGrasp | PlanPlace) -> ApproachRequest:
     """What the planner is asked for a grasp or a place."""
-    ways = effect.candidates if isinstance(effect, effects.PlanGrasp) else effect.targets
+    ways = request.candidates if isinstance(request, PlanGrasp) else request.targets
     targets = tuple(Target(w.id, w.T_base_tcp, w.approach_offset, w.retreat_offset, w.score) for w in ways)
-    if isinstance(effect, effects.PlanGrasp):
-        obstacles, touchable = boxes_of((*effect.obstacles, effect.target)), frozenset({effect.target.id})
+    if isinstance(request, PlanGrasp):
+        obstacles, touchable = boxes_of((*request.obstacles, request.target)), frozenset({request.target.id})
         return ApproachRequest(targets, obstacles, touchable=touchable, attached_after=True)
-    return ApproachRequest(targets, boxes_of(effect.obstacles), boxes_of((effect.held,)), detached_after=True)
+    return ApproachRequest(targets, boxes_of(request.obstacles), boxes_of((request.held,)), detached_after=True)

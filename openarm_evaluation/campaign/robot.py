@@ -32,7 +32,7 @@ from openarm_common.types import Array
 from openarm_evaluation.campaign.map_feed import SimulatedMap
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.judging.judge import Sample
-from openarm_grasp.evidence.observation import Detection, Frame
+from openarm_grasp.perception.detections import Detection, Frame
 from openarm_motion.planning.arm import Arm
 from openarm_motion.service.motion_service import MotionService, make_arms, table_box
 from openarm_motion.service.robot import Outcome

@@ -25,7 +25,8 @@ from openarm_evaluation.judging.provenance import scene_hash
 from openarm_evaluation.judging.trial import Step, Trial
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.planning.arms import ARMS
+from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.orders import Ask, Order
 from openarm_grasp.strategies.pair import Pair
@@ -33,7 +34,6 @@ from openarm_grasp.strategies.registry import carry_out, carry_out_pair
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
 from openarm_grasp.strategies.task import GraspSession, Status
 from openarm_grasp.strategies.task import Task as GraspTask
-from openarm_grasp.strategy.link import Link
 from openarm_sim_bridge.faults.faults import checked_fault
 
 _SETTLE_S = 0.5
@@ -140,7 +140,7 @@ class Trials:
             self._report(status)
             steps[status.request].append(self.steps[-1])
 
-        robots: dict[Side, Link] = {arm: self.link.beside(self._config.limits.beside_wait) for arm in ARMS}
+        robots: dict[Side, RobotInterface] = {arm: self.link.beside(self._config.limits.beside_wait) for arm in ARMS}
         requests = (GraspRequest(task.labels[0]), GraspRequest(task.labels[1]))
         pair = Pair(self.session, self.skills, robots, requests, report, carry_out)
         robot.pass_time(0.1)

@@ -19,10 +19,10 @@ from openarm_evaluation.campaign.link import approach_of
 from openarm_evaluation.campaign.robot import arms_behind
 from openarm_evaluation.campaign.tasks import Task
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import propose, target_box
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.strategy.effects import PlanGrasp
+from openarm_grasp.robot.interface import PlanGrasp
 from openarm_motion.planning.approach import plan_approach
 
 #: Least distance of an object of a hand-over, and of its place, from the middle, m: the other arm reaches over to 0.21.

@@ -13,19 +13,9 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 
-from openarm_common.config import Config
 from openarm_common.types import Array
-
-
-class DriftConfig(Config):
-    """When residuals of grasps raise an alarm."""
-
-    window: int = Field(default=10, ge=3, le=100, description="grasps that are looked at")
-    least: int = Field(default=5, ge=3, le=100, description="grasps before an alarm may be raised")
-    bias: float = Field(default=0.004, gt=0.0, le=0.05, description="mean residual that is an alarm, m")
-    sigmas: float = Field(default=3.0, gt=0.0, le=10.0, description="and it must be so many times its own error")
+from openarm_grasp.config import DriftConfig
 
 
 @dataclass(frozen=True)

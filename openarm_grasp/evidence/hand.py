@@ -12,7 +12,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.types import Array
-from openarm_grasp.evidence.evidence import Evidence
+from openarm_grasp.evidence.verdicts import Evidence
 
 #: Finger speed is the change of position over this time: drivers may report a velocity of 0.
 SPEED_WINDOW_NS = 100_000_000

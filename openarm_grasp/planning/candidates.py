@@ -21,7 +21,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import ApproachConfig, GraspConfig, HandConfig
-from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.perception.detections import Detection
 
 UP = np.array([0.0, 0.0, 1.0])
 #: Below every difference that a tilt makes: a candidate that has failed is tried after all that have not.
@@ -76,6 +76,29 @@ class GraspCandidate:
     tilt: float
     score: float
     parts: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class PlaceTarget:
+    """One way to put the object down.
+
+    Attributes:
+        id: Names the spot and the turn, for example "spot0/yaw+30".
+        T_base_tcp: (4, 4) pose of the TCP at release.
+        position: (3,) of the footprint centre on the table, base frame, m.
+        yaw_offset: Turn of the object against its yaw at the grasp, rad.
+        approach_offset: (3,) from the release to where the straight way down begins, base frame, m.
+        retreat_offset: (3,) from the release to the end of the straight way back, base frame, m.
+        score: Higher is tried first.
+    """
+
+    id: str
+    T_base_tcp: Array
+    position: Array
+    yaw_offset: float
+    approach_offset: Array
+    retreat_offset: Array
+    score: float
 
 
 def tcp_height(height: float, tilt: float, hand: HandConfig) -> float:

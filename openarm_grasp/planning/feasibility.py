@@ -16,12 +16,12 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.context import GraspContext
-from openarm_grasp.evidence.observation import Detection
-from openarm_grasp.planning.candidates import GraspCandidate, held_box, obstacle_boxes, propose, target_box
+from openarm_grasp.perception.detections import Detection
+from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, held_box, obstacle_boxes, propose, target_box
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.planning.place import PlaceTarget, other_grasps, place_targets
+from openarm_grasp.planning.place import other_grasps, place_targets
+from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 from openarm_grasp.robot.skills import Skills
-from openarm_grasp.strategy.effects import PlanGrasp, Planned, PlanPlace
 
 
 class FeasibilityCheck:

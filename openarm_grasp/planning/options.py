@@ -9,8 +9,8 @@ from math import nan
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import ApproachConfig
-from openarm_grasp.evidence.evidence import Verdict
-from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import GraspCandidate, wide_edges
 
 #: A plan that fails with one of these says that it cannot be done; with any other it was not found out.

@@ -9,7 +9,6 @@ way may stand another.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
 from math import hypot, inf
 
@@ -19,35 +18,12 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig, PlaceConfig
-from openarm_grasp.evidence.evidence import SQUARE_WITHIN
-from openarm_grasp.evidence.observation import Detection, Frame
-from openarm_grasp.planning.candidates import UP, GraspCandidate, hold_of
+from openarm_grasp.evidence.verdicts import SQUARE_WITHIN
+from openarm_grasp.perception.detections import Detection, Frame
+from openarm_grasp.planning.candidates import UP, GraspCandidate, PlaceTarget, hold_of
 
 #: Spots nearer to each other than this are one, m.
 _SAME_SPOT = 0.02
-
-
-@dataclass(frozen=True)
-class PlaceTarget:
-    """One way to put the object down.
-
-    Attributes:
-        id: Names the spot and the turn, for example "spot0/yaw+30".
-        T_base_tcp: (4, 4) pose of the TCP at release.
-        position: (3,) of the footprint centre on the table, base frame, m.
-        yaw_offset: Turn of the object against its yaw at the grasp, rad.
-        approach_offset: (3,) from the release to where the straight way down begins, base frame, m.
-        retreat_offset: (3,) from the release to the end of the straight way back, base frame, m.
-        score: Higher is tried first.
-    """
-
-    id: str
-    T_base_tcp: Array
-    position: Array
-    yaw_offset: float
-    approach_offset: Array
-    retreat_offset: Array
-    score: float
 
 
 def place_targets(

@@ -8,7 +8,7 @@ the order of arms gives up, and goes home as after every failure. Base frame, m,
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar, cast
 
@@ -18,10 +18,9 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.routing import ARMS
-from openarm_grasp.strategy import effects
-from openarm_grasp.strategy.effects import Frames, GoHome, Planned, Trajectory
-from openarm_grasp.strategy.link import Link
+from openarm_grasp.planning.arms import ARMS
+from openarm_grasp.planning.candidates import Box
+from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 
 T = TypeVar("T")
 
@@ -49,30 +48,30 @@ class CoordinatedRobot:
 
     Args:
         arm: Which.
-        link: The robot, for this arm alone.
+        robot: The robot, for this arm alone.
         coordination: Shared with the other arm's.
         config: Parameters.
     """
 
-    def __init__(self, arm: Side, link: Link, coordination: ArmCoordination, config: GraspConfig) -> None:
+    def __init__(self, arm: Side, robot: RobotInterface, coordination: ArmCoordination, config: GraspConfig) -> None:
         self.arm: Side = arm
-        self._link, self._coordination, self._config = link, coordination, config
+        self._robot, self._coordination, self._config = robot, coordination, config
         self._other: Side = "right" if arm == "left" else "left"
-        self._homes = {a: link.description.group_state(f"{a}_arm", config.home_state) for a in (arm, self._other)}
+        self._homes = {a: robot.description.group_state(f"{a}_arm", config.home_state) for a in (arm, self._other)}
         self.deadline_ns = 0
 
     def __getattr__(self, name: str) -> Any:
         """What is the same for an arm alone."""
-        return getattr(self._link, name)
+        return getattr(self._robot, name)
 
     def check(self) -> None:
-        """Raise when the work shall not go on."""
-        self._link.deadline_ns = self.deadline_ns
-        self._link.check()
+        """Raise when the work may not go on."""
+        self._robot.deadline_ns = self.deadline_ns
+        self._robot.check()
 
     def warn(self, text: str) -> None:
-        """Say something that does not stop the work."""
-        self._link.warn(f"{self.arm} arm: {text}")
+        """Report something that does not stop the work."""
+        self._robot.warn(f"{self.arm} arm: {text}")
 
     # --- observing
     async def observe(self, count: int, *, near: bool = False) -> Frames:
@@ -83,40 +82,40 @@ class CoordinatedRobot:
         """
         coordination, limit = self._coordination, self._config.limits.beside_timeout
         if not near and self._is_home(self.arm):
-            await self._link.until(self._other_is_away, limit, f"looking: the {self._other} arm is in the view")
-        await self._link.until(lambda: coordination.looking in ("", self.arm), limit, "looking: the other arm's look")
+            await self._robot.until(self._other_is_away, limit, f"looking: the {self._other} arm is in the view")
+        await self._robot.until(lambda: coordination.looking in ("", self.arm), limit, "looking: the other arm's look")
         coordination.looking = self.arm
         try:
-            return await self._link.observe(count, near=near)
+            return await self._robot.observe(count, near=near)
         finally:
             coordination.looking = ""
-            self._link.stop_looking()
+            self._robot.stop_observing()
 
-    def stop_looking(self) -> None:
-        """A look of this link ends by itself."""
+    def stop_observing(self) -> None:
+        """An observation ends by itself."""
 
     # --- planning and moving
-    async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
+    async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Plan; again when the other arm has gone on."""
-        return await self._patiently(lambda: self._link.plan(effect), "planning")
+        return await self._patiently(lambda: self._robot.plan(request), "planning")
 
     async def follow(
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
     ) -> None:
-        """Follow a planned trajectory, when there is room for it."""
-        await self._patiently(lambda: self._link.follow(arm, trajectory, what, guard), what)
+        """Follow a planned trajectory, when the other arm leaves clearance for it."""
+        await self._patiently(lambda: self._robot.follow(arm, trajectory, what, guard), what)
 
-    async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
+    async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Move the TCP on a straight line."""
-        await self._patiently(lambda: self._link.move_linear(effect, what), what)
+        await self._patiently(lambda: self._robot.move_linear(arm, T_base_tcp, what), what)
 
-    async def move_named(self, arm: str, named: str, effect: GoHome, what: str) -> None:
+    async def move_named(self, arm: str, named: str, obstacles: Sequence[Box], what: str) -> None:
         """Move an arm on a free path to a posture."""
-        await self._patiently(lambda: self._link.move_named(arm, named, effect, what), what)
+        await self._patiently(lambda: self._robot.move_named(arm, named, obstacles, what), what)
 
     # --- the other arm
     async def _patiently(self, work: Callable[[], Awaitable[T]], what: str) -> T:
-        end_ns = self._link.now_ns + round(self._config.limits.beside_timeout * 1e9)
+        end_ns = self._robot.now_ns + round(self._config.limits.beside_timeout * 1e9)
         while True:
             try:
                 return await work()
@@ -124,7 +123,7 @@ class CoordinatedRobot:
                 if (
                     error.code not in (Code.IN_COLLISION, Code.NO_PLAN)
                     or self._other_is_away()
-                    or self._link.now_ns > end_ns
+                    or self._robot.now_ns > end_ns
                 ):
                     raise
                 if not await self._gone_on(what):
@@ -142,13 +141,13 @@ class CoordinatedRobot:
         coordination.waiting.add(self.arm)
         try:
             text = f"{what}: the {self._other} arm stands in the way"
-            await self._link.until(over, self._config.limits.beside_timeout, text)
+            await self._robot.until(over, self._config.limits.beside_timeout, text)
         finally:
             coordination.waiting.discard(self.arm)
         return not (gives_way and self._other in coordination.waiting)
 
     def _pose(self, arm: Side) -> Array:
-        _, q = self._link.states.latest()
+        _, q = self._robot.states.latest()
         return np.array([q[name] for name in self._homes[arm]])
 
     def _is_home(self, arm: Side) -> bool:
@@ -159,6 +158,6 @@ class CoordinatedRobot:
         return self._other in self._coordination.done or self._is_home(self._other)
 
 
-def coordinated(arm: Side, robot: Link, coordination: ArmCoordination, config: GraspConfig) -> Link:
+def coordinated(arm: Side, robot: RobotInterface, coordination: ArmCoordination, config: GraspConfig) -> RobotInterface:
     """The robot for one arm while the other works, too; arguments as of `CoordinatedRobot`."""
-    return cast("Link", CoordinatedRobot(arm, robot, coordination, config))
+    return cast("RobotInterface", CoordinatedRobot(arm, robot, coordination, config))

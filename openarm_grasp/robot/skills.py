@@ -14,13 +14,12 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence.evidence import Evidence
 from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
-from openarm_grasp.evidence.observation import in_base
+from openarm_grasp.evidence.verdicts import Evidence
+from openarm_grasp.perception.detections import in_base
+from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import Box
-from openarm_grasp.planning.routing import ARMS
-from openarm_grasp.strategy.effects import Frames, GoHome, MoveLinear, PlanGrasp, Planned, PlanPlace, Trajectory
-from openarm_grasp.strategy.link import Link
+from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 
 #: Errors of a robot that end a request at once, with the arm where it is.
 STOPS = (Code.CANCELLED, Code.ROBOT_LOST, Code.INTERNAL)
@@ -41,7 +40,7 @@ class Skills:
         arms: Those that may be sent home.
     """
 
-    def __init__(self, robot: Link, config: GraspConfig, *, arms: Sequence[str] = ARMS) -> None:
+    def __init__(self, robot: RobotInterface, config: GraspConfig, *, arms: Sequence[str] = ARMS) -> None:
         self.robot = robot
         self._config = config
         self._arms = frozenset(arms)
@@ -82,7 +81,7 @@ class Skills:
 
     def stop_observing(self) -> None:
         """Let the detector rest."""
-        self.robot.stop_looking()
+        self.robot.stop_observing()
 
     def in_base(self, seen: Frames) -> Frames:
         """Frames of detections in the base frame, at the joints of their stamps."""
@@ -148,7 +147,7 @@ class Skills:
     async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Move the TCP to a pose on a straight line."""
         self.robot.check()
-        await self.robot.move_linear(MoveLinear(arm, T_base_tcp, what), f"{arm} arm: {what}")
+        await self.robot.move_linear(arm, T_base_tcp, f"{arm} arm: {what}")
 
     async def go_home(
         self, arms: Sequence[str], obstacles: Sequence[Box] = (), *, back_off_below: float = float("-inf")
@@ -174,12 +173,11 @@ class Skills:
             if T_base_tcp[2, 3] < back_off_below:
                 T_back = T_base_tcp @ se3.make(p=(0.0, 0.0, -config.approach.pregrasp_distance))
                 try:
-                    await robot.move_linear(MoveLinear(arm, T_back, "back off"), f"{arm} arm: back off")
+                    await robot.move_linear(arm, T_back, f"{arm} arm: back off")
                 except OpenArmError as error:
                     reraise_stop(error)
                     robot.warn(error.message)  # the free path home may still be there
-            request = GoHome((arm,), tuple(obstacles), back_off_below)
-            await robot.move_named(arm, config.home_state, request, f"{arm} arm: go {config.home_state}")
+            await robot.move_named(arm, config.home_state, obstacles, f"{arm} arm: go {config.home_state}")
 
     # --- the hand
     def aperture(self, arm: str) -> float:

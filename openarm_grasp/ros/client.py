@@ -14,7 +14,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
 from openarm_common.ros.convert import point, xyz
 from openarm_grasp.ros.answers import GraspResult, PairResult, Wanted
-from openarm_grasp.ros.convert import option_from_msg
+from openarm_grasp.ros.messages import option_from_msg
 
 OnFeedback = Callable[[GraspStatus], None]
 

@@ -1,147 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Between messages and the frozen data of the core. Poses are in the base frame unless a name says otherwise."""
+"""Between messages and what a robot is asked and answers. Poses are in the base frame unless a name says otherwise."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import numpy as np
 from control_msgs.action import GripperCommand, ParallelGripperCommand
-from geometry_msgs.msg import Point
-from openarm_interfaces.action import MoveArm, Pick, PickTwo, PlanApproach
-from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspOption, GraspStatus, PickAnswer, PickRequest
-from openarm_interfaces.srv import ComputeIK, Grasp
+from openarm_interfaces.action import MoveArm, PlanApproach
+from openarm_interfaces.msg import ApproachTarget, CollisionBox
+from openarm_interfaces.srv import ComputeIK
 from sensor_msgs.msg import JointState
-from std_msgs.msg import ColorRGBA
 from vision_msgs.msg import Detection3DArray
-from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, point, pose_to_matrix, stamp_to_ns, vector, xyz
+from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix, stamp_to_ns, vector, xyz
 from openarm_common.ros.node import BASE_FRAME
 from openarm_common.types import Array
-from openarm_grasp.evidence.evidence import Verdict
-from openarm_grasp.evidence.observation import Detection, Frame
-from openarm_grasp.planning.candidates import Box, GraspCandidate
-from openarm_grasp.planning.options import NoWayError, Option
-from openarm_grasp.planning.place import PlaceTarget
-from openarm_grasp.strategies.pair import PairOutcome
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
-from openarm_grasp.strategies.task import Status
-from openarm_grasp.strategy.effects import GoHome, MoveLinear, PlanGrasp, Planned, PlanPlace
+from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.perception.detections import Detection, Frame
+from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget
+from openarm_grasp.planning.options import NoWayError
+from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 
-_CHOSEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
-_REFUSED = ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.35)
-_OFFERED = ColorRGBA(r=0.4, g=0.5, b=0.9, a=0.35)
 #: Shapes that are round seen from above when they stand; one that lies is seldom as long as wide.
 _ROUND, _AS_LONG_AS_WIDE = frozenset({"cylinder", "can", "sphere"}), 0.001
-
-
-# --- requests and answers
-def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
-    """The user's wish; a service request and an action goal have the same fields."""
-    return replace(
-        _wish(message),
-        dry_run=message.dry_run,
-        phase=message.phase or "all",
-        timeout=message.timeout,
-        leave=tuple((p.x, p.y) for p in message.leave),
-    )
-
-
-def requests_from_msg(goal: PickTwo.Goal) -> tuple[GraspRequest, GraspRequest]:
-    """Two wishes at once."""
-    first, second = (replace(_wish(item), dry_run=goal.dry_run, timeout=goal.timeout) for item in goal.requests)
-    return first, second
-
-
-def _wish(message: Grasp.Request | Pick.Goal | PickRequest) -> GraspRequest:
-    """What all of them say of an object and its place."""
-    p, at = message.place_position, message.object_position
-    return GraspRequest(
-        label=message.label,
-        arm=message.arm or "auto",
-        place=(p.x, p.y, p.z) if message.has_place_position else None,
-        place_yaw=message.place_yaw if message.has_place_yaw else None,
-        object_at=(at.x, at.y) if message.has_object_position else None,
-    )
-
-
-def fill_answer(answer: Grasp.Response | Pick.Result | PickAnswer, outcome: GraspOutcome) -> None:
-    """Write an outcome into a service response, an action result, or one of its answers."""
-    answer.success = outcome.success
-    answer.outcome = outcome.kind
-    answer.code = outcome.code.value
-    answer.message = outcome.message
-    answer.label = outcome.label
-    answer.arm = outcome.arm
-    answer.attempts = outcome.attempts
-    answer.place_position = point(outcome.place_position)
-    answer.duration = outcome.duration
-    answer.route = outcome.route
-    if not isinstance(answer, PickAnswer):
-        answer.options = [option_to_msg(option) for option in outcome.options]
-
-
-def option_to_msg(option: Option) -> GraspOption:
-    """How one way to grasp fared."""
-    return GraspOption(
-        id=option.id,
-        arm=option.arm,
-        score=option.score,
-        parts=list(option.parts),
-        values=list(option.parts.values()),
-        limit_margin=option.limit_margin,
-        code=str(option.code),
-        message=option.message,
-    )
-
-
-def option_from_msg(message: GraspOption) -> Option:
-    """The same, of an answer."""
-    return Option(
-        message.id,
-        message.arm,
-        message.score,
-        dict(zip(message.parts, message.values, strict=True)),
-        message.limit_margin,
-        message.code,
-        message.message,
-    )
-
-
-def pair_result(outcome: PairOutcome) -> PickTwo.Result:
-    """The answer to two wishes."""
-    result = PickTwo.Result(
-        success=outcome.success,
-        outcome=outcome.kind,
-        code=outcome.code.value,
-        message=outcome.message,
-        at_once=outcome.at_once,
-        duration=outcome.duration,
-    )
-    for one in outcome.answers:
-        answer = PickAnswer()
-        fill_answer(answer, one)
-        result.answers.append(answer)
-    return result
-
-
-def status_msg(status: Status, t_ns: int) -> GraspStatus:
-    """A state that was entered."""
-    message = GraspStatus(
-        state=status.state.value,
-        previous_state=status.previous.value,
-        reason=status.reason,
-        attempt=status.attempt,
-        label=status.label,
-        arm=status.arm,
-    )
-    message.header.stamp = ns_to_stamp(t_ns)
-    message.header.frame_id = BASE_FRAME
-    return message
 
 
 # --- detections
@@ -169,40 +53,25 @@ def box_to_msg(box: Box) -> CollisionBox:
     return CollisionBox(id=box.id, pose=matrix_to_pose(box.T_frame_box), size=vector(box.size))
 
 
-def plan_goal(effect: PlanGrasp | PlanPlace, velocity_scale: float) -> PlanApproach.Goal:
+def plan_goal(request: PlanGrasp | PlanPlace, velocity_scale: float) -> PlanApproach.Goal:
     """The planning goal of a grasp (the target may be touched, and is carried on the retreat) or of a place."""
-    return _grasp_goal(effect, velocity_scale) if isinstance(effect, PlanGrasp) else _place_goal(effect, velocity_scale)
-
-
-def _grasp_goal(effect: PlanGrasp, velocity_scale: float) -> PlanApproach.Goal:
-    return PlanApproach.Goal(
-        arm=effect.arm,
-        targets=_targets(effect.candidates),
-        obstacles=[box_to_msg(box) for box in (*effect.obstacles, effect.target)],
-        gone=[box_to_msg(box) for box in effect.gone],
-        touchable=[effect.target.id],
-        attached_after_approach=True,
-        velocity_scale=velocity_scale,
+    goal = PlanApproach.Goal(
+        arm=request.arm, gone=[box_to_msg(box) for box in request.gone], velocity_scale=velocity_scale
     )
-
-
-def _place_goal(effect: PlanPlace, velocity_scale: float) -> PlanApproach.Goal:
-    start: list[float] = []
-    if effect.after is not None:
-        points = getattr(effect.after, "points", None)
+    if isinstance(request, PlanGrasp):
+        goal.targets = _targets(request.candidates)
+        goal.obstacles = [box_to_msg(box) for box in (*request.obstacles, request.target)]
+        goal.touchable, goal.attached_after_approach = [request.target.id], True
+        return goal
+    goal.targets = _targets(request.targets)
+    goal.obstacles = [box_to_msg(box) for box in request.obstacles]
+    goal.attached, goal.detached_after_approach = [box_to_msg(request.held)], True
+    if request.after is not None:
+        points = getattr(request.after, "points", None)
         if not points:
-            raise OpenArmError(Code.INTERNAL, f"{type(effect.after).__name__} is not a trajectory with points")
-        start = list(points[-1].positions)
-    return PlanApproach.Goal(
-        arm=effect.arm,
-        targets=_targets(effect.targets),
-        obstacles=[box_to_msg(box) for box in effect.obstacles],
-        attached=[box_to_msg(effect.held)],
-        gone=[box_to_msg(box) for box in effect.gone],
-        detached_after_approach=True,
-        start=start,
-        velocity_scale=velocity_scale,
-    )
+            raise OpenArmError(Code.INTERNAL, f"{type(request.after).__name__} is not a trajectory with points")
+        goal.start = list(points[-1].positions)
+    return goal
 
 
 def _targets(ways: Iterable[GraspCandidate | PlaceTarget]) -> list[ApproachTarget]:
@@ -272,60 +141,33 @@ def reach_from_msg(arm: str, answer: ComputeIK.Response, T_base_tcp: Array) -> d
     return {arm: float(np.linalg.norm(xyz(answer.nearest.position) - T_base_tcp[:3, 3]))}
 
 
-def home_goal(arm: str, named: str, effect: GoHome, velocity_scale: float, max_wait: float = 0.0) -> MoveArm.Goal:
-    """A free path to a named posture; it may rest first for the other arm, s."""
-    return MoveArm.Goal(
-        arm=arm,
-        kind=MoveArm.Goal.NAMED,
-        named=named,
-        obstacles=[box_to_msg(box) for box in effect.obstacles],
-        hand_empty=True,
-        velocity_scale=velocity_scale,
-        max_wait=max_wait,
-    )
+def move_goal(
+    arm: str, to: str | Array, obstacles: Sequence[Box], velocity_scale: float, max_wait: float
+) -> MoveArm.Goal:
+    """A free path to a named posture, or a straight line of the TCP to a pose.
 
-
-def linear_goal(effect: MoveLinear, velocity_scale: float, max_wait: float = 0.0) -> MoveArm.Goal:
-    """A straight line of the TCP; it may rest first for the other arm, s."""
+    Args:
+        arm: Which.
+        to: Name of the posture, or the pose (4, 4), base frame.
+        obstacles: Boxes to keep clear of, base frame.
+        velocity_scale: Of the motion limits; 0: the planner's default.
+        max_wait: Longest start delay until the other arm leaves clearance, s.
+    """
     goal = MoveArm.Goal(
-        arm=effect.arm,
-        kind=MoveArm.Goal.LINEAR,
-        velocity_scale=velocity_scale,
+        arm=arm,
+        obstacles=[box_to_msg(box) for box in obstacles],
         hand_empty=True,
+        velocity_scale=velocity_scale,
         max_wait=max_wait,
     )
-    goal.pose.header.frame_id = BASE_FRAME
-    goal.pose.pose = matrix_to_pose(effect.T_base_tcp)
+    if isinstance(to, str):
+        goal.kind, goal.named = MoveArm.Goal.NAMED, to
+        return goal
+    goal.kind, goal.pose.header.frame_id = MoveArm.Goal.LINEAR, BASE_FRAME
+    goal.pose.pose = matrix_to_pose(to)
     return goal
 
 
 def code_from_text(text: str, otherwise: Code) -> Code:
     """The code that a message names; `otherwise` for one that is not of the suite, or claims success in a failure."""
     return Code(text) if text in Code.__members__ and text != Code.OK else otherwise
-
-
-# --- pictures
-def candidate_markers(
-    candidates: Sequence[GraspCandidate], chosen: str, refused: Collection[str], t_ns: int
-) -> MarkerArray:
-    """An arrow along each approach and a bar along its opening axis: the chosen one green, what was refused red."""
-    markers = [Marker(action=Marker.DELETEALL)]
-    for i, c in enumerate(candidates):
-        tip = c.T_base_tcp[:3, 3]
-        half = 0.5 * c.width * c.T_base_tcp[:3, 1]
-        color = _CHOSEN if c.id == chosen else _REFUSED if c.id in refused else _OFFERED
-        shaft = _points(tip + c.approach_offset, tip)
-        arrow = Marker(ns="approach", id=i, type=Marker.ARROW, color=color, points=shaft)
-        arrow.scale = vector((0.004, 0.008, 0.012))
-        bar = Marker(ns="opening", id=i, type=Marker.LINE_STRIP, color=color, points=_points(tip - half, tip + half))
-        bar.scale.x = 0.003
-        markers += [arrow, bar]
-    for marker in markers:
-        marker.header.frame_id = BASE_FRAME
-        marker.header.stamp = ns_to_stamp(t_ns)
-        marker.pose.orientation.w = 1.0
-    return MarkerArray(markers=markers)
-
-
-def _points(*positions: np.ndarray) -> list[Point]:
-    return [point(p) for p in positions]

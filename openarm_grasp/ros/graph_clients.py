@@ -23,10 +23,10 @@ from openarm_common.ros.node import BASE_FRAME, BaseNode, reliable
 from openarm_common.ros.tf import RobotStateListener
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import Silence
-from openarm_grasp.evidence.observation import Frame
+from openarm_grasp.perception.detections import Frame
+from openarm_grasp.robot.interface import Frames
 from openarm_grasp.ros import convert
 from openarm_grasp.ros.pad_listener import Pads
-from openarm_grasp.strategy.effects import Frames
 
 #: What the detector of the camera over the table finds.
 DETECTIONS = "/detections_3d"
@@ -38,7 +38,7 @@ _STOP_LIMIT_S = 2.0
 _GONE = 60
 
 
-class OtherNodes:
+class GraphClients:
     """Hears the robot and the detector, and sends goals.
 
     Args:
@@ -87,7 +87,7 @@ class OtherNodes:
         if not self._active:
             return
         self._active = False
-        self.stop_looking()
+        self.stop_observing()
         self._timer.cancel()
         self.robot.enable(False)
         self.pads.enable(False)
@@ -220,7 +220,7 @@ class OtherNodes:
 
     def _look(self, topic: str) -> None:
         if self._detections is not None and self._topic != topic:
-            self.stop_looking()
+            self.stop_observing()
         if self._detections is None:
             self._topic = topic
             self._detections = self._node.create_subscription(Detection3DArray, topic, self._on_detections, reliable(5))
@@ -236,7 +236,7 @@ class OtherNodes:
             return
         self._frame_id = message.header.frame_id
 
-    def stop_looking(self) -> None:
+    def stop_observing(self) -> None:
         """Leave /detections_3d, so that the detector may rest."""
         if self._detections is not None:
             self._node.destroy_subscription(self._detections)

@@ -20,7 +20,7 @@ from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.ros import convert
+from openarm_grasp.ros import messages
 from openarm_grasp.ros.request_server import RequestServer
 from openarm_grasp.strategies.pair import PairOutcome
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
@@ -50,7 +50,7 @@ class GraspNode(BaseNode[GraspConfig]):
             self._serve(Pick, "/grasp/pick", self._on_pick),
             self._serve(PickTwo, "/grasp/pick_two", self._on_pick_two),
         ]
-        self._status_topic.publish(convert.status_msg(Status(State.IDLE, State.IDLE, "waiting for a request"), 0))
+        self._status_topic.publish(messages.status_msg(Status(State.IDLE, State.IDLE, "waiting for a request"), 0))
 
     def close(self) -> None:
         """Stop listening and take the actions down."""
@@ -61,23 +61,23 @@ class GraspNode(BaseNode[GraspConfig]):
 
     # --- callbacks
     async def _on_grasp(self, request: Grasp.Request, response: Grasp.Response) -> Grasp.Response:
-        convert.fill_answer(response, await self._one(convert.request_from_msg(request)))
+        messages.fill_answer(response, await self._one(messages.request_from_msg(request)))
         return response
 
     async def _on_pick(self, goal: ServerGoalHandle) -> Pick.Result:
         def feedback(_: int, status: GraspStatus) -> None:
             goal.publish_feedback(Pick.Feedback(status=status))
 
-        request, result = convert.request_from_msg(goal.request), Pick.Result()
-        convert.fill_answer(result, await self._as_goal(goal, lambda: self._one(request, feedback)))
+        request, result = messages.request_from_msg(goal.request), Pick.Result()
+        messages.fill_answer(result, await self._as_goal(goal, lambda: self._one(request, feedback)))
         return result
 
     async def _on_pick_two(self, goal: ServerGoalHandle) -> PickTwo.Result:
         def feedback(which: int, status: GraspStatus) -> None:
             goal.publish_feedback(PickTwo.Feedback(request=which, status=status))
 
-        requests = convert.requests_from_msg(goal.request)
-        return convert.pair_result(await self._as_goal(goal, lambda: self._two(requests, feedback)))
+        requests = messages.requests_from_msg(goal.request)
+        return messages.pair_result(await self._as_goal(goal, lambda: self._two(requests, feedback)))
 
     async def _as_goal(self, goal: ServerGoalHandle, work: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
         """Carry a goal out; a cancel reaches the one that is being carried out."""
@@ -146,7 +146,7 @@ class GraspNode(BaseNode[GraspConfig]):
         """Publish a state that was entered."""
         t_ns = self._requests.now_ns
         self._newest[status.request] = status
-        message = convert.status_msg(status, t_ns)
+        message = messages.status_msg(status, t_ns)
         self._status_topic.publish(message)
         if on_status is not None:
             on_status(status.request, message)
@@ -154,14 +154,14 @@ class GraspNode(BaseNode[GraspConfig]):
             # The newest status is not that of one which has ended while the other is at work.
             for other in self._newest.values():
                 if other.request != status.request and other.state is not State.IDLE:
-                    self._status_topic.publish(convert.status_msg(replace(other, previous=other.state), t_ns))
+                    self._status_topic.publish(messages.status_msg(replace(other, previous=other.state), t_ns))
         change = f"{message.previous_state} -> {message.state} at {t_ns * 1e-9:.2f} s, attempt {status.attempt}"
         about = f"{status.label} " if status.label else ""
         self.get_logger().info(f"{about}{change}: {status.reason}")
         text = f"{message.state}: {status.reason}"
         self.diagnose(True, text, state=message.state, label=status.label, arm=status.arm)
         if status.candidates:
-            markers = convert.candidate_markers(status.candidates, status.chosen, status.refused, t_ns)
+            markers = messages.candidate_markers(status.candidates, status.chosen, status.refused, t_ns)
             self._marker_topic.publish(markers)
 
 

@@ -12,7 +12,7 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.subscription import Subscription
 
 from openarm_common.ros.node import QOS_SENSOR, BaseNode
-from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.planning.arms import ARMS
 
 #: A force older than this says nothing, s of wall clock.
 _FRESH_S = 0.5

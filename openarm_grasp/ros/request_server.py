@@ -10,14 +10,14 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
 from openarm_common.ros.node import BaseNode
 from openarm_grasp.context import GraspContext
-from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.planning.arms import ARMS
+from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
-from openarm_grasp.ros.link_executor import GraphLink
+from openarm_grasp.ros.graph_robot import GraphRobot
 from openarm_grasp.strategies.pair import Pair, PairOutcome
 from openarm_grasp.strategies.registry import carry_out, carry_out_pair
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
 from openarm_grasp.strategies.task import GraspSession, Report, Task
-from openarm_grasp.strategy.link import Link
 
 T = TypeVar("T")
 
@@ -31,7 +31,7 @@ class RequestServer:
     """
 
     def __init__(self, node: BaseNode[Any], context: GraspContext) -> None:
-        self._robot = GraphLink(node, context.config)
+        self._robot = GraphRobot(node, context.config)
         self._skills = Skills(self._robot, context.config)
         self.session = GraspSession(context)
         self._running: tuple[GraspRequest, ...] = ()
@@ -68,7 +68,7 @@ class RequestServer:
         Raises:
             OpenArmError: As `one`, when they are not taken.
         """
-        robots: dict[Side, Link] = {arm: self._robot.beside() for arm in ARMS}
+        robots: dict[Side, RobotInterface] = {arm: self._robot.next_to_other() for arm in ARMS}
         return await self._take(
             requests,
             lambda: carry_out_pair(Pair(self.session, self._skills, robots, requests, report, carry_out)),

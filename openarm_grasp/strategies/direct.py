@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from openarm_common.errors import OpenArmError
+from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.planning.routing import ARMS
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import GraspOutcome
 from openarm_grasp.strategies.task import Task

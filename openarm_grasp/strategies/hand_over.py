@@ -18,11 +18,12 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import HandOverConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.evidence.observation import Detection, Sighting
+from openarm_grasp.perception.detections import Detection, Sighting
+from openarm_grasp.planning.arms import ARMS
+from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.planning.place import PlaceTarget, clear_spots, grid
-from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.planning.place import clear_spots, grid
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import Feasible, GraspOutcome
 from openarm_grasp.strategies.task import Task

@@ -14,17 +14,18 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
-from openarm_grasp.evidence.observation import SAME_PLACE, Sighting, find, on_table
+from openarm_grasp.perception.detections import SAME_PLACE, Sighting
+from openarm_grasp.perception.find import find, on_table
+from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.planning.routing import ARMS
 from openarm_grasp.robot.coordination import ArmCoordination, coordinated
+from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
 from openarm_grasp.strategies.states import State
 from openarm_grasp.strategies.task import GraspSession, Report, Status, Task
-from openarm_grasp.strategy.link import Link
 
 Requests = tuple[GraspRequest, GraspRequest]
 
@@ -84,7 +85,7 @@ class Pair:
         self,
         session: GraspSession,
         robot: Skills,
-        robots: Mapping[Side, Link],
+        robots: Mapping[Side, RobotInterface],
         requests: Requests,
         report: Report,
         alone: Callable[[Task], Awaitable[GraspOutcome]],

@@ -18,7 +18,7 @@ import numpy as np
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.evidence import (
+from openarm_grasp.evidence.verdicts import (
     GripVerdict,
     PlaceVerdict,
     SightVerdict,
@@ -29,11 +29,14 @@ from openarm_grasp.evidence.evidence import (
     judge_sight,
     judge_still,
 )
-from openarm_grasp.evidence.observation import Detection, Frame, Sighting, apart, find, labels_in_view, on_table
+from openarm_grasp.perception.detections import Detection, Frame, Sighting, apart, labels_in_view
+from openarm_grasp.perception.find import find, on_table
+from openarm_grasp.planning.arms import ARMS, arm_order, out_of_reach
 from openarm_grasp.planning.candidates import (
     UP,
     Box,
     GraspCandidate,
+    PlaceTarget,
     held_box,
     obstacle_boxes,
     propose,
@@ -41,20 +44,12 @@ from openarm_grasp.planning.candidates import (
     target_box,
 )
 from openarm_grasp.planning.options import NoWayError, Options, not_placeable, options_of, planned
-from openarm_grasp.planning.place import (
-    PlaceTarget,
-    check_position,
-    free_spots,
-    other_grasps,
-    place_targets,
-    placing_error,
-)
-from openarm_grasp.planning.routing import ARMS, arm_order, out_of_reach
+from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, placing_error
+from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace
 from openarm_grasp.robot.skills import reraise_stop
 from openarm_grasp.strategies.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.strategies.states import State, check_transition
 from openarm_grasp.strategies.task import Findings, Kept, Status, Task
-from openarm_grasp.strategy.effects import Frames, PlanGrasp, Planned, PlanPlace
 
 #: Frames that must not show the object in its old place after the lift: a detector may miss it in one.
 _LIFT_FRAMES = 2

@@ -22,16 +22,17 @@ from openarm_common.robot.description import RobotDescription, Side
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.evidence.observation import Detection, Sighting, find
+from openarm_grasp.perception.detections import Detection, Sighting
+from openarm_grasp.perception.find import find
+from openarm_grasp.planning.arms import ARMS, arm_order
 from openarm_grasp.planning.candidates import UP, GraspCandidate, obstacle_boxes, shifted, target_box
 from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.planning.routing import ARMS, arm_order
+from openarm_grasp.robot.interface import PlanGrasp, Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import Feasible, GraspOutcome
 from openarm_grasp.strategies.task import Task
-from openarm_grasp.strategy.effects import PlanGrasp, Planned
 
 #: Between two points of a hand's shape, m.
 _GRAIN = 0.005

@@ -6,9 +6,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.evidence import GripVerdict, PlaceVerdict, SightVerdict
+from openarm_grasp.evidence.verdicts import GripVerdict, PlaceVerdict, SightVerdict
+from openarm_grasp.planning.arms import arm_order
 from openarm_grasp.planning.options import Option
-from openarm_grasp.planning.routing import arm_order
 
 #: What a request may ask for.
 PHASES = ("all", "pick", "place")

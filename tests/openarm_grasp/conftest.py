@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.perception.detections import Detection
 from tests.openarm_grasp.scripted import World, standing
 
 

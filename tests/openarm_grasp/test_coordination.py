@@ -52,7 +52,7 @@ class Robot:
         self.looks += 1
         return "frames"
 
-    def stop_looking(self) -> None:
+    def stop_observing(self) -> None:
         pass
 
 

@@ -13,8 +13,8 @@ from openarm_common.camera.cameras import load_cameras
 from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.sets import make_task
 from openarm_evaluation.campaign.trial import Trials
-from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence.drift import DriftConfig, DriftWatch
+from openarm_grasp.config import DriftConfig, GraspConfig
+from openarm_grasp.evidence.drift import DriftWatch
 
 
 def watched(bias: tuple[float, float], noise: float, n: int = 10, seed: int = 0) -> DriftWatch:

@@ -11,7 +11,7 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import Code
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.evidence.evidence import (
+from openarm_grasp.evidence.verdicts import (
     Evidence,
     Grip,
     GripVerdict,
@@ -23,7 +23,7 @@ from openarm_grasp.evidence.evidence import (
     judge_sight,
     judge_still,
 )
-from openarm_grasp.evidence.observation import Detection, Frame
+from openarm_grasp.perception.detections import Detection, Frame
 
 HELD = HeldConfig()
 GOOD = Evidence(gap=0.0503, expected=0.05, effort=-30.0, speed=0.0)

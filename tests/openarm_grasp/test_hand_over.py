@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code
-from openarm_grasp.strategy.effects import PlanPlace
+from openarm_grasp.robot.interface import PlanPlace
 from tests.openarm_grasp.scripted import OVER, Follow, GoHome, Grip, World
 
 

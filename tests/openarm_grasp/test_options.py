@@ -17,11 +17,11 @@ from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence.evidence import Verdict
+from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.options import NoWayError, Option
+from openarm_grasp.robot.interface import Planned
 from openarm_grasp.strategies.registry import carry_out
 from openarm_grasp.strategies.request import GraspRequest
-from openarm_grasp.strategy.effects import Planned
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ from itertools import pairwise
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.observation import Frame
+from openarm_grasp.perception.detections import Frame
+from openarm_grasp.robot.interface import Frames, PlanGrasp, PlanPlace
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import GraspRequest
 from openarm_grasp.strategies.states import State
-from openarm_grasp.strategy.effects import Frames, PlanGrasp, PlanPlace
 from tests.openarm_grasp.scripted import GoHome, Grip, MoveLinear, Wait
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.planning.routing import arm_order, out_of_reach
+from openarm_grasp.planning.arms import arm_order, out_of_reach
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 
 import openarm_grasp
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.evidence import Grip, GripVerdict, PlaceVerdict, Sight, SightVerdict
+from openarm_grasp.evidence.verdicts import Grip, GripVerdict, PlaceVerdict, Sight, SightVerdict
 from openarm_grasp.strategies.request import Feasible, GraspOutcome, Proof
 
 HELD = GripVerdict(Grip.HELD, "held")

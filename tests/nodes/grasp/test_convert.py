@@ -8,10 +8,10 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.ros.convert import pose_to_matrix
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence.observation import Detection
+from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import Box, held_box, propose, target_box
+from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
 from openarm_grasp.ros import convert
-from openarm_grasp.strategy.effects import PlanGrasp, PlanPlace
 
 
 def test_a_plan_of_what_comes_later_names_where_the_object_will_not_stand_any_more() -> None:

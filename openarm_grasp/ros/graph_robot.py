@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot as the performer reaches it: joint states, detections, actions and services of the other nodes."""
+"""The robot behind the node graph: joint states, detections, actions and services of the other nodes."""
 
 from __future__ import annotations
 
@@ -19,16 +19,15 @@ from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.node import BASE_FRAME, BaseNode
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.routing import ARMS
+from openarm_grasp.planning.arms import ARMS
+from openarm_grasp.planning.candidates import Box
+from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, Trajectory, check_deadline
 from openarm_grasp.ros import convert
-from openarm_grasp.ros.graph_clients import DETECTIONS, OtherNodes
-from openarm_grasp.strategy import effects
-from openarm_grasp.strategy.effects import Frames, Planned, Trajectory
-from openarm_grasp.strategy.link import check_deadline
+from openarm_grasp.ros.graph_clients import DETECTIONS, GraphClients
 
 
-class GraphLink:
-    """Implements `Link` over the node graph.
+class GraphRobot:
+    """Implements `RobotInterface` over the node graph.
 
     Args:
         node: The node that owns the clients.
@@ -38,7 +37,7 @@ class GraphLink:
     def __init__(self, node: BaseNode[Any], config: GraspConfig) -> None:
         self._node = node
         self._config = config
-        self._nodes = OtherNodes(node, config)
+        self._nodes = GraphClients(node, config)
         self._plan = ActionClient(node, PlanApproach, "/motion/plan_approach")
         self._execute = ActionClient(node, ExecuteTrajectory, "/motion/execute")
         self._move = ActionClient(node, MoveArm, "/motion/move")
@@ -48,14 +47,14 @@ class GraphLink:
             arm: ActionClient(node, gripper_action, f"/{arm}_gripper_controller/gripper_cmd") for arm in ARMS
         }
         self.deadline_ns = 0
-        #: Longest rest before a motion until the other arm leaves room, s; 0: the arms never move at once.
+        #: Longest start delay of a motion until the other arm leaves clearance, s; 0: the arms never move at once.
         self.max_wait = 0.0
 
-    def beside(self) -> GraphLink:
-        """The same link for an arm that moves while the other does: its motions may rest first, its time is its own."""
-        link = copy(self)
-        link.max_wait = self._config.limits.beside_wait
-        return link
+    def next_to_other(self) -> GraphRobot:
+        """The same for an arm that moves while the other does: its motions may start later, its deadline is its own."""
+        robot = copy(self)
+        robot.max_wait = self._config.limits.beside_wait
+        return robot
 
     # --- begin, end, cancel
     async def begin(self, *, moves: bool) -> None:
@@ -77,7 +76,7 @@ class GraphLink:
             client.destroy()
 
     def cancel(self) -> None:
-        """Let the running recipe end with CANCELLED and the arm hold."""
+        """Let what runs end with CANCELLED and the arm hold."""
         self._nodes.cancel()
 
     def _missing(self, moves: bool) -> list[str]:
@@ -120,7 +119,7 @@ class GraphLink:
         return self._nodes.robot.efforts.get(joint, 0.0)
 
     def pads(self, arm: str) -> tuple[float, ...]:
-        """Force on each finger pad of a hand, N; empty when no sensor tells it."""
+        """Force on each finger pad of a hand, N; empty without a sensor."""
         return self._nodes.pads.of(arm)
 
     def check(self) -> None:
@@ -162,7 +161,7 @@ class GraphLink:
                 faults.append(error)
 
         tasks: list[Future] = [executor.create_task(carry_out, part) for part in parts]
-        # All end, also those beside one that failed: they watch the same cancel, robot and deadlines.
+        # All end, also those next to one that failed: they watch the same cancel, robot and deadlines.
         while not all(task.done() for task in tasks):
             await self._nodes.tick()
         if faults:
@@ -177,15 +176,15 @@ class GraphLink:
             raise OpenArmError(Code.NOT_READY, f"nobody publishes {config.topic}")
         return await self._nodes.observe(count, config.topic, config.timeout)
 
-    def stop_looking(self) -> None:
+    def stop_observing(self) -> None:
         """Leave /detections_3d."""
-        self._nodes.stop_looking()
+        self._nodes.stop_observing()
 
     # --- planning and moving
-    async def plan(self, effect: effects.PlanGrasp | effects.PlanPlace) -> Planned:
+    async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Ask /motion/plan_approach."""
-        goal = convert.plan_goal(effect, self._config.velocity_scale)
-        what = f"{effect.arm} arm: planning"
+        goal = convert.plan_goal(request, self._config.velocity_scale)
+        what = f"{request.arm} arm: planning"
         result = await self._nodes.goal(self._plan, goal, self._config.limits.plan_timeout, what, self._watched(None))
         return convert.planned_from_msg(result, len(goal.targets))
 
@@ -204,14 +203,14 @@ class GraphLink:
         goal = ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_wait=self.max_wait)
         await self._moved(self._execute, goal, what, guard)
 
-    async def move_linear(self, effect: effects.MoveLinear, what: str) -> None:
+    async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Ask /motion/move for a straight line."""
-        goal = convert.linear_goal(effect, self._config.velocity_scale, self.max_wait)
+        goal = convert.move_goal(arm, T_base_tcp, (), self._config.velocity_scale, self.max_wait)
         await self._moved(self._move, goal, what)
 
-    async def move_named(self, arm: str, named: str, effect: effects.GoHome, what: str) -> None:
+    async def move_named(self, arm: str, named: str, obstacles: Sequence[Box], what: str) -> None:
         """Ask /motion/move for a free path to a posture."""
-        goal = convert.home_goal(arm, named, effect, self._config.velocity_scale, self.max_wait)
+        goal = convert.move_goal(arm, named, obstacles, self._config.velocity_scale, self.max_wait)
         await self._moved(self._move, goal, what)
 
     async def _moved(
