@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vision-guided grasping: strategies that pick and place objects, the evidence they need, and a client of the node.
 
-Ask a running graph:
+Example:
+    Ask a running graph.
+
     >>> from openarm_grasp import GraspClient
     >>> with GraspClient() as grasp:  # doctest: +SKIP
     ...     print(grasp.pick("red", place=(0.30, -0.30)).message)
 
-Carry a request out on any robot that implements `RobotInterface`, without ROS:
+    Carry a request out on any robot that implements `RobotInterface`, without ROS.
+
     >>> from openarm_grasp import GraspConfig, GraspContext, GraspRequest, GraspSession, Skills, Task, carry_out
     >>> session = GraspSession(GraspContext.of(GraspConfig(), table, description))  # doctest: +SKIP
     >>> task = Task(session, Skills(robot, GraspConfig()), GraspRequest("red"), print)  # doctest: +SKIP
