@@ -25,24 +25,28 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("MUJOCO_GL", "egl")
 
 
-class Floor:
-    """Who may run beside whom where tests run in several processes: one that is marked `alone`, beside none.
+class MachineLock:
+    """Keeps a test that is marked `alone` from running at the same time as tests of other worker processes.
 
-    Who waits to be alone holds the door, so that those who come after it can't keep it out.
+    Tests share the lock; one that is marked takes it exclusively. Whoever waits for it holds the queue, so that a test
+    that comes later cannot overtake.
+
+    Args:
+        folder: Of the lock files, the same for all workers.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._door, self._floor = ((folder / name).open("a") for name in ("door", "floor"))
+        self._queue, self._lock = ((folder / name).open("a") for name in ("queue", "lock"))
         self._alone = False
 
-    def enter(self, *, alone: bool) -> None:
+    def acquire(self, *, alone: bool) -> None:
         if not self._alone:
-            with _locked(self._door):
-                fcntl.flock(self._floor, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+            with _locked(self._queue):
+                fcntl.flock(self._lock, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
             self._alone = alone
 
-    def leave(self) -> None:
-        fcntl.flock(self._floor, fcntl.LOCK_UN)
+    def release(self) -> None:
+        fcntl.flock(self._lock, fcntl.LOCK_UN)
         self._alone = False
 
 
@@ -55,7 +59,7 @@ def _locked(file: IO[str]) -> Iterator[None]:
         fcntl.flock(file, fcntl.LOCK_UN)
 
 
-_FLOOR = pytest.StashKey[Floor]()
+_LOCK = pytest.StashKey[MachineLock]()
 
 
 def _alone(item: pytest.Item) -> bool:
@@ -64,25 +68,25 @@ def _alone(item: pytest.Item) -> bool:
 
 def pytest_configure(config: pytest.Config) -> None:
     if hasattr(config, "workerinput"):
-        config.stash[_FLOOR] = Floor(config.cache.mkdir("floor"))
+        config.stash[_LOCK] = MachineLock(config.cache.mkdir("lock"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=_alone)  # last: until then nobody waits
+    items.sort(key=_alone)  # last: until then no worker waits
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, object, object]:
-    floor = item.config.stash.get(_FLOOR, None)
-    if floor is None:
+    lock = item.config.stash.get(_LOCK, None)
+    if lock is None:
         return (yield)
-    floor.enter(alone=_alone(item))
+    lock.acquire(alone=_alone(item))
     try:
         return (yield)
     finally:
-        # what a file has set up for all its tests is there between them, too
+        # fixtures of the module stay in place between its tests
         if nextitem is None or nextitem.path != item.path or not (_alone(item) and _alone(nextitem)):
-            floor.leave()
+            lock.release()
 
 
 class RosProbe:

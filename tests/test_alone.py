@@ -25,8 +25,8 @@ def test_of_some_time(k):
 """
 
 
-def test_who_is_alone_meets_nobody_and_the_others_do_not_wait(tmp_path: Path) -> None:
-    """Also between two of a file: what it has set up for all of them is there then, too."""
+def test_a_test_marked_alone_runs_alone_and_the_others_run_in_parallel(tmp_path: Path) -> None:
+    """Also between two tests of a file, whose module fixtures are in place then, too."""
     marks = {"a": "", "b": "", "c": "", "d": "@pytest.mark.alone", "e": "@pytest.mark.alone"}
     for name, mark in marks.items():
         (tmp_path / f"test_{name}.py").write_text(FILE.format(mark=mark))
@@ -42,10 +42,10 @@ def test_who_is_alone_meets_nobody_and_the_others_do_not_wait(tmp_path: Path) ->
     spans = {path.stem: json.loads(path.read_text()) for path in tmp_path.glob("test_*.json")}
     assert len(spans) == 3 * len(marks)
 
-    def beside(name: str, began: float, ended: float) -> set[str]:
+    def overlapping(name: str, began: float, ended: float) -> set[str]:
         return {other for other, (a, b) in spans.items() if not other.startswith(name) and a < ended and b > began}
 
     for name in ("test_d", "test_e"):
         times = [time for stem, span in spans.items() if stem.startswith(name) for time in span]
-        assert beside(name, min(times), max(times)) == set()
-    assert any(beside(stem[:6], *spans[stem]) for stem in spans)
+        assert overlapping(name, min(times), max(times)) == set()
+    assert any(overlapping(stem[:6], *spans[stem]) for stem in spans)
