@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 
-from openarm_grasp.ros.client import GraspClient
+from openarm_grasp import GraspClient
 
 
 def main() -> int:

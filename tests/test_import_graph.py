@@ -99,7 +99,7 @@ def test_a_package_lists_at_most_a_dozen_public_names_and_shows_a_use(package: s
     folder = ROOT / package
     assert 1 <= structure.exported(folder) <= 12
     docstring = ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8")))
-    assert "Example:" in (docstring or "")
+    assert f">>> from {package} import " in (docstring or "")
 
 
 @pytest.mark.parametrize("package", PACKAGES)
