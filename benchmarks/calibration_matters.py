@@ -29,10 +29,10 @@ from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.resources import config_dir
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.campaign.mounts import with_mounts
+from openarm_evaluation.campaign.options import parse_seeds
 from openarm_evaluation.campaign.robot import SimulatedSenses
-from openarm_evaluation.campaign.tasks import Task
+from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
-from openarm_evaluation.demo.demo import parse_seeds
 from openarm_grasp.config import GraspConfig
 
 #: The cameras that grasps look through; the first tells where objects are.

@@ -32,7 +32,7 @@ from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
-from openarm_evaluation.demo.demo import parse_seeds
+from openarm_evaluation.campaign.options import parse_seeds
 
 #: Predicted errors that are never reached, so that the whole budget of poses is used: m, rad.
 WHOLE_BUDGET = (1e-9, 1e-9)

@@ -32,7 +32,7 @@ from typing import Any
 
 from benchmarks.report import Row, write_report
 from openarm_evaluation.campaign.robot import SimulatedSenses
-from openarm_evaluation.campaign.sets import make_task
+from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
 

@@ -18,7 +18,7 @@ from typing import Any
 from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.campaign.one_task import run_one
 from openarm_evaluation.campaign.options import CampaignOptions, Row
-from openarm_evaluation.campaign.sets import make_task
+from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.judging import provenance
 
 Files = dict[str, bytes]

@@ -31,7 +31,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Array
 from openarm_evaluation.campaign.robot import shared_renderer
-from openarm_evaluation.campaign.tasks import Task
+from openarm_evaluation.campaign.tasks.task import Task
 from openarm_sim_bridge.world.model import build_spec
 from openarm_sim_bridge.world.world import Snapshot
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from openarm_evaluation.campaign.options import CampaignOptions, Row
-from openarm_evaluation.campaign.sets import make_task
+from openarm_evaluation.campaign.tasks.suites import make_task
 
 
 def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:

@@ -4,38 +4,66 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
+from cyclopts import Parameter, Token
+from cyclopts.validators import Number
+
+from openarm_common.errors import Code, OpenArmError
 from openarm_perception.detection.kinds import DetectorKind
 
 Row = dict[str, Any]
 
 
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of `A-B`, `A` or a list such as `1,4,7-9`.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT.
+    """
+    seeds: list[int] = []
+    for part in text.split(","):
+        low, dash, high = part.strip().partition("-")
+        if not low.isdecimal() or (dash and not high.isdecimal()) or (dash and int(high) < int(low)):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"seeds {text!r}: expected numbers such as 0-19, 3 or 1,4,7-9")
+        seeds += range(int(low), int(high if dash else low) + 1)
+    return tuple(seeds)
+
+
+def _from_command_line(_: object, tokens: Sequence[Token]) -> tuple[int, ...]:
+    return parse_seeds(tokens[0].value)
+
+
+Seeds = Annotated[tuple[int, ...], Parameter(converter=_from_command_line, n_tokens=1, show_default=False)]
+
+
+@Parameter(name="*")
 @dataclass(frozen=True)
 class CampaignOptions:
     """What a campaign runs.
 
-    Attributes:
-        set_name: One of `sets.SETS`.
-        seeds: One task each.
+    Args:
+        set_name: nominal, clutter, faults, endurance, handover, push, pairs or pairs_in_turn.
+        seeds: One task each, such as 0-99 or 1,4,7-9; 0-9 when not given.
         workers: Processes.
         noise: Depth as noisy as a D435's.
-        mount_seeds: True camera mounts to go through, each with its calibration; empty: nominal mounts.
-        use_effort: Whether the finger's effort counts as evidence.
-        detector: What finds objects: color, network, both.
-        parameters: `node.param=value` of nodes of the graph.
-        ray: Address of a Ray cluster whose machines run the workers; "": this machine.
+        mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.
+        use_effort: Whether the force of the fingers counts as evidence.
+        detector: What finds objects: their colour, the network, or both checking each other.
+        parameters: A parameter of a node of the graph `sim`, as node.param=value; may be given several times.
+        ray: Address of a Ray cluster, such as HOST:6379 or auto, whose machines run the workers.
     """
 
-    set_name: str = "nominal"
-    seeds: tuple[int, ...] = ()
-    workers: int = 1
+    set_name: Annotated[str, Parameter(name="--suite")] = "nominal"
+    seeds: Seeds = tuple(range(10))
+    workers: Annotated[int, Parameter(validator=Number(gte=1))] = 1
     noise: bool = False
-    mount_seeds: tuple[int, ...] = ()
-    use_effort: bool = True
+    mount_seeds: Seeds = ()
+    use_effort: Annotated[bool, Parameter(name="--effort", negative="--no-effort")] = True
     detector: DetectorKind = "color"
-    parameters: tuple[str, ...] = ()
+    parameters: Annotated[tuple[str, ...], Parameter(name="--set")] = ()
     ray: str = ""
 
     def settings(self) -> dict[str, Any]:

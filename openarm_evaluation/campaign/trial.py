@@ -16,10 +16,10 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
 from openarm_common.types import Array
 from openarm_evaluation.campaign import record
-from openarm_evaluation.campaign.gap import LEAST_GAP, watch_gap
+from openarm_evaluation.campaign.arm_clearance import LEAST_CLEARANCE, watch_clearance
 from openarm_evaluation.campaign.link import DirectLink
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
-from openarm_evaluation.campaign.tasks import MISSES, PLAN_FAILS, Task
+from openarm_evaluation.campaign.tasks.task import MISSES, PLAN_FAILS, Task
 from openarm_evaluation.judging.judge import JudgeConfig, Sample, Verdict, at_rest, judge
 from openarm_evaluation.judging.provenance import scene_hash
 from openarm_evaluation.judging.trial import Step, Trial
@@ -83,13 +83,13 @@ class Trials:
         began = time.monotonic()
         self.robot.pass_time(_SETTLE_S)
         self._begin_fault("")
-        gap = watch_gap(self.robot) if self._task.set_name.startswith("pairs") else None
+        clearance = watch_clearance(self.robot) if self._task.set_name.startswith("pairs") else None
         began_ns = self.robot.t_ns
         trials = self._both() if self._task.together else self._all_in_turn()
         row = row_of(self._task, trials, time.monotonic() - began)
         row["again"] = self._again
-        if gap is not None:
-            add_gap(row, gap.least, (self.robot.t_ns - began_ns) * 1e-9)
+        if clearance is not None:
+            add_clearance(row, clearance.least, (self.robot.t_ns - began_ns) * 1e-9)
         row["planning_ms_median"] = round(1e3 * float(np.median(self.link.planning_s or [math.nan])), 1)
         if self._keep is not None and not row["as_expected"]:
             self._keep.write(row, [step.__dict__ for step in self.steps])
@@ -284,10 +284,10 @@ def row_of(task: Task, trials: list[Trial], wall_s: float) -> dict[str, Any]:
     }
 
 
-def add_gap(row: dict[str, Any], least: float, sim_s: float) -> None:
+def add_clearance(row: dict[str, Any], least: float, sim_s: float) -> None:
     """Say how near the arms came to each other, m, and how long both objects took together, s."""
-    row["arm_gap_mm"] = round(1e3 * least, 1)
-    row["as_expected"] = bool(row["as_expected"] and least >= LEAST_GAP)
+    row["arm_clearance_mm"] = round(1e3 * least, 1)
+    row["as_expected"] = bool(row["as_expected"] and least >= LEAST_CLEARANCE)
     row["sim_s"] = round(sim_s, 2)
 
 

@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from openarm_bringup.commands.connect import Sets
 from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code
+from openarm_evaluation.campaign.options import Seeds
 
 if TYPE_CHECKING:
     from openarm_bringup.supervision.supervisor import Event
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 def demo(
     *,
-    seeds: str | None = None,
+    seeds: Seeds = (),
     label: str | None = None,
     arm: Literal["auto", "left", "right"] = "auto",
     place: tuple[float, float, float] | None = None,
@@ -41,7 +42,7 @@ def demo(
         seeds: Random scenes one after the other, such as 0-19; in each the first object is grasped.
         label: What to grasp; the first object of the scene when not given.
         arm: Which arm.
-        place: Where to place it: x y z of the footprint centre, base frame, m (z is not read); chosen when not given.
+        place: Where to place it: x y z of the footprint centre, base frame, m (z is not read); seeds when not given.
         scene: Name or path of a scene, or "random".
         graph: Name of a graph, or a file.
         video: Pictures and a video; by default for a single grasp only.
@@ -51,22 +52,21 @@ def demo(
         domain: ROS_DOMAIN_ID; a free one when not given.
         accept: With seeds: the share of objects placed that counts as success.
     """
-    from openarm_evaluation.demo.demo import DemoOptions, Listeners, parse_seeds, run_demo
+    from openarm_evaluation.demo.demo import DemoOptions, Listeners, run_demo
     from openarm_evaluation.judging.trial import Ask
 
-    chosen = parse_seeds(seeds) if seeds is not None else ()
     options = DemoOptions(
         graph=graph,
         scene=scene,
-        seeds=chosen,
+        seeds=seeds,
         ask=Ask(label, arm, place[:2] if place is not None else None),
-        film=not chosen if video is None else video,
+        film=not seeds if video is None else video,
         domain=domain,
         sets=tuple(set_),
         mount_seed=mount_seed,
         uncalibrated=uncalibrated,
     )
-    show = _Show(quiet_steps=bool(chosen))
+    show = _Show(quiet_steps=bool(seeds))
     listeners = Listeners(
         on_event=show.event, on_ready=show.ready, on_step=show.step, on_trial=show.trial, on_note=show.note
     )

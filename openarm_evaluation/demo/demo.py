@@ -13,7 +13,7 @@ from openarm_bringup.supervision import environment, runs
 from openarm_bringup.supervision.graph import Graph, load_graph
 from openarm_bringup.supervision.session import running_graph, work_until_stopped
 from openarm_common.domain import reserve_domain
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import OpenArmError
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.demo import mounts
 from openarm_evaluation.judging import provenance
@@ -248,18 +248,3 @@ def write_report(options: DemoOptions, graph: Graph, result: DemoResult) -> dict
     }
     runs.write_json(result.run_dir / "report.json", data)
     return data
-
-
-def parse_seeds(text: str) -> tuple[int, ...]:
-    """Return the seeds of `A-B`, `A` or a list such as `1,4,7-9`.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT.
-    """
-    seeds: list[int] = []
-    for part in text.split(","):
-        low, dash, high = part.strip().partition("-")
-        if not low.isdecimal() or (dash and not high.isdecimal()) or (dash and int(high) < int(low)):
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"--seeds {text}: expected numbers such as 0-19, 3 or 1,4,7-9")
-        seeds += range(int(low), int(high if dash else low) + 1)
-    return tuple(seeds)

@@ -21,7 +21,7 @@ from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.shm import ports_of, unused
 from openarm_common.errors import Code
 from openarm_common.scene.scene import load_scene
-from openarm_evaluation.campaign.gap import LEAST_GAP, least_gap
+from openarm_evaluation.campaign.arm_clearance import LEAST_CLEARANCE, least_clearance
 from openarm_evaluation.judging.judge import JudgeConfig, judge
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import run_pair, wait_scene
@@ -141,7 +141,7 @@ def test_two_objects_are_picked_at_once_and_the_arms_keep_20_mm_apart(observer: 
     for trial, arm in ((red, "right"), (blue, "left")):
         assert trial.outcome == "placed", trial.message
         assert trial.arm == arm
-    assert least_gap(observer.joints()) >= LEAST_GAP
+    assert least_clearance(observer.joints()) >= LEAST_CLEARANCE
     began = {step.label: step.t_ns for step in observer.steps() if step.state == "MOVE_TO_PREGRASP"}
     ended = {step.label: step.t_ns for step in observer.steps() if step.state == "RESET"}
     assert max(began.values()) < min(ended.values())

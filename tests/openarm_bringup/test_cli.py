@@ -19,7 +19,7 @@ from openarm_bringup.commands.checks import _in_order
 from openarm_bringup.outcome import Outcome
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
-from openarm_evaluation.demo.demo import parse_seeds
+from openarm_evaluation.campaign.options import parse_seeds
 
 ROOT = Path(__file__).parents[2]
 

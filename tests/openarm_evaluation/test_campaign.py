@@ -14,12 +14,12 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.codec import read_file
 from openarm_evaluation.campaign import campaign, link, report, trial
 from openarm_evaluation.campaign.campaign import run_campaign
-from openarm_evaluation.campaign.faults import KINDS
 from openarm_evaluation.campaign.options import CampaignOptions
 from openarm_evaluation.campaign.progress import Pace
 from openarm_evaluation.campaign.robot import SimulatedSenses
-from openarm_evaluation.campaign.sets import SETS, make_task
-from openarm_evaluation.campaign.tasks import FaultPlan
+from openarm_evaluation.campaign.tasks.faults import KINDS
+from openarm_evaluation.campaign.tasks.suites import SUITES, make_task
+from openarm_evaluation.campaign.tasks.task import FaultPlan
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.robot import skills
 from openarm_grasp.strategies import pick_and_place
@@ -114,7 +114,7 @@ def test_clutter_is_five_to_eight_objects_each_asked_for() -> None:
 
 
 def test_tasks_come_from_set_and_seed_alone() -> None:
-    for name in SETS:
+    for name in SUITES:
         assert make_task(name, 7) == make_task(name, 7)
     with pytest.raises(OpenArmError, match="nominal"):
         make_task("nothing", 0)

@@ -9,9 +9,9 @@ import pytest
 
 from openarm_common.errors import Code
 from openarm_common.scene.scene import Table, random_scene
-from openarm_evaluation.campaign.gap import LEAST_GAP, Gap, least_gap, watch_gap
+from openarm_evaluation.campaign.arm_clearance import LEAST_CLEARANCE, ArmClearance, least_clearance, watch_clearance
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses, arms_behind
-from openarm_evaluation.campaign.sets import make_task
+from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
 from openarm_motion.collision.seen import SeenMap
@@ -49,7 +49,7 @@ def test_an_object_that_no_arm_can_grasp_is_pushed_and_then_grasped() -> None:
 def test_two_objects_are_grasped_at_once_and_the_arms_keep_apart() -> None:
     trials, row = run("pairs", 5001)
     assert row["as_expected"], row["message"]
-    assert row["arm_gap_mm"] >= 1e3 * LEAST_GAP
+    assert row["arm_clearance_mm"] >= 1e3 * LEAST_CLEARANCE
     assert {g["arm"] for g in row["grasps"]} == {"left", "right"}
     closed = {step.arm: step.t_ns for step in trials.steps if step.state == "CLOSE_GRIPPER"}
     placed = {step.arm: step.t_ns for step in trials.steps if step.state == "PLACE"}
@@ -58,7 +58,7 @@ def test_two_objects_are_grasped_at_once_and_the_arms_keep_apart() -> None:
 
 def test_the_judge_of_the_gap_measures_what_mujoco_measures_pair_by_pair() -> None:
     robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
-    gap = watch_gap(robot)
+    gap = watch_clearance(robot)
     model, data = robot.world.model, robot.world.data
     left, right = gap.sides
     pairs = [mujoco.mj_geomDistance(model, data, int(i), int(j), 2.0, None) for i in left for j in right]
@@ -81,7 +81,7 @@ def test_the_gap_of_joint_states_is_that_of_the_simulation_which_they_come_from(
         found = arms[arm].inverse.position_solutions(target, 0.05, start)[0].q
         return dict(zip(arms[arm].names, found.tolist(), strict=True))
 
-    gap = Gap(robot.world.model)
+    gap = ArmClearance(robot.world.model)
     states: list[tuple[int, dict[str, float]]] = []
     distances: list[float] = []
     for k, y in enumerate((-0.20, -0.10, -0.15)):
@@ -90,7 +90,7 @@ def test_the_gap_of_joint_states_is_that_of_the_simulation_which_they_come_from(
         states.append((k * 10**9, home | moved))
         distances.append(gap.distance(robot.world.data))
     assert distances[1] < distances[2] < distances[0]
-    assert least_gap(states) == pytest.approx(distances[1], abs=1e-9)
+    assert least_clearance(states) == pytest.approx(distances[1], abs=1e-9)
 
 
 def sweep(robot: SimRobot, x: float = 0.27) -> dict[str, Motion]:
@@ -109,7 +109,7 @@ def sweep(robot: SimRobot, x: float = 0.27) -> dict[str, Motion]:
 
 def test_an_arm_next_to_one_under_way_starts_later_and_keeps_clear() -> None:
     robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
-    gap, motions = watch_gap(robot), sweep(robot)
+    gap, motions = watch_clearance(robot), sweep(robot)
     answers: dict[str, MotionAnswer] = {}
 
     def part(arm: str, delay: float):
@@ -122,12 +122,12 @@ def test_an_arm_next_to_one_under_way_starts_later_and_keeps_clear() -> None:
     assert [answer.code for answer in answers.values()] == [Code.OK, Code.OK]
     assert answers["left"].start_delay == 0.0
     assert 0.5 < answers["right"].start_delay < 4.0  # it comes when the left arm is about to be gone
-    assert gap.least >= LEAST_GAP
+    assert gap.least >= LEAST_CLEARANCE
 
 
 def test_an_arm_that_may_not_wait_long_enough_is_refused_and_one_whose_way_is_blocked_holds() -> None:
     robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
-    gap, motions = watch_gap(robot), sweep(robot)
+    gap, motions = watch_clearance(robot), sweep(robot)
     answers: dict[str, MotionAnswer] = {}
 
     async def left() -> None:
@@ -146,7 +146,7 @@ def test_an_arm_that_may_not_wait_long_enough_is_refused_and_one_whose_way_is_bl
     assert answers["left"].code is Code.CANCELLED
     assert answers["right"].code is Code.IN_COLLISION
     assert "the left arm stopped on its way" in answers["right"].message
-    assert gap.least >= LEAST_GAP
+    assert gap.least >= LEAST_CLEARANCE
 
 
 def test_plans_in_process_see_the_map_of_the_rendered_images() -> None:

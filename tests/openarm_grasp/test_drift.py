@@ -11,7 +11,7 @@ import pytest
 from openarm_common import se3
 from openarm_common.camera.cameras import load_cameras
 from openarm_evaluation.campaign.robot import SimulatedSenses
-from openarm_evaluation.campaign.sets import make_task
+from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import DriftConfig, GraspConfig
 from openarm_grasp.evidence.drift import DriftWatch

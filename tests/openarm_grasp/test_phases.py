@@ -11,7 +11,7 @@ import pytest
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, SceneObject
 from openarm_evaluation.campaign.robot import SimulatedSenses
-from openarm_evaluation.campaign.tasks import Task
+from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig, HandConfig, HeldConfig
 from openarm_grasp.strategies.pick_and_place import pick_and_place

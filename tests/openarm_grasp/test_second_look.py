@@ -13,7 +13,7 @@ from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, SceneObject
 from openarm_evaluation.campaign.robot import SimulatedSenses
-from openarm_evaluation.campaign.tasks import Task
+from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.robot.interface import Frames, PlanGrasp

@@ -16,11 +16,11 @@ from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import running_graph, work_until_stopped
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
-from openarm_evaluation.campaign.gap import least_gap
+from openarm_evaluation.campaign.arm_clearance import least_clearance
 from openarm_evaluation.campaign.options import CampaignOptions, Row
-from openarm_evaluation.campaign.sets import make_task
-from openarm_evaluation.campaign.tasks import Task
-from openarm_evaluation.campaign.trial import add_gap, crashed_row, row_of
+from openarm_evaluation.campaign.tasks.suites import make_task
+from openarm_evaluation.campaign.tasks.task import Task
+from openarm_evaluation.campaign.trial import add_clearance, crashed_row, row_of
 from openarm_evaluation.judging.trial import Ask, run_pair, run_trial
 
 if TYPE_CHECKING:
@@ -94,5 +94,5 @@ def _row(observer: Observer, client: GraspClient, task: Task, scenes: Path) -> R
     row = row_of(task, trials, time.monotonic() - began)
     if task.together:
         states, steps = observer.joints(), observer.steps()
-        add_gap(row, least_gap(states), (steps[-1].t_ns - steps[0].t_ns) * 1e-9)
+        add_clearance(row, least_clearance(states), (steps[-1].t_ns - steps[0].t_ns) * 1e-9)
     return row

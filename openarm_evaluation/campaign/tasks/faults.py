@@ -15,7 +15,7 @@ import numpy as np
 
 from openarm_common.errors import Code
 from openarm_common.scene.scene import Scene, SceneObject
-from openarm_evaluation.campaign.tasks import MISSES, PLAN_FAILS, FaultPlan, Task, nominal
+from openarm_evaluation.campaign.tasks.task import MISSES, PLAN_FAILS, FaultPlan, Task, nominal
 
 _NOTHING_HELD = (Code.GRASP_MISSED, Code.GRASP_LOST)
 #: The hand is off its plan: it meets the object, misses it, or is stopped.

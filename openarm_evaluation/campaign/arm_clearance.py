@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How near both arms came to each other, by the shapes of the simulation and its true joints; for the judge alone.
+"""Least distance of both arms, by the shapes of the simulation and its true joints; for the judge alone.
 
-Looks are as far apart in time as the arms, at the greatest speed that they approach each other with, need to come
-nearer than the least distance so far; so no smaller one is missed. m, s.
+Measurements are as far apart in time as the arms, at their greatest approach speed, need to come nearer than the least
+distance so far; so no smaller one is missed. m, s.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from openarm_sim_bridge.world.compiled import start_qpos
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
 
-#: Two arms that work at once are never nearer than this, m.
-LEAST_GAP = 0.020
+#: Two arms that move simultaneously are never nearer than this, m.
+LEAST_CLEARANCE = 0.020
 #: Two points of the arms approach each other no faster, m/s: joints run at half of their speed.
 _APPROACH = 4.0
 
 
-class Gap:
+class ArmClearance:
     """The least distance of the arms of a simulated robot so far.
 
     Args:
@@ -42,14 +42,14 @@ class Gap:
         self.least = float(np.inf)
 
     def due(self, t_ns: int) -> bool:
-        """Whether the arms may have come nearer by now than they ever were."""
+        """Return whether the arms may have come nearer by now than ever before."""
         return t_ns >= self._next_ns
 
-    def look(self, t_ns: int, data: mujoco.MjData) -> None:
+    def measure(self, t_ns: int, data: mujoco.MjData) -> None:
         """Measure."""
-        gap = self.distance(data)
-        self.least = min(self.least, gap)
-        self._next_ns = t_ns + round(1e9 * max(0.0, gap - self.least) / _APPROACH)
+        distance = self.distance(data)
+        self.least = min(self.least, distance)
+        self._next_ns = t_ns + round(1e9 * max(0.0, distance - self.least) / _APPROACH)
 
     def distance(self, data: mujoco.MjData) -> float:
         """Distance of the arms in a state whose kinematics are done, m."""
@@ -67,34 +67,34 @@ class Gap:
         return best
 
 
-def watch_gap(robot: SimRobot) -> Gap:
-    """Watch a robot in this process, from each control tick to the next."""
-    gap = Gap(robot.world.model)
+def watch_clearance(robot: SimRobot) -> ArmClearance:
+    """Measure on a robot in this process, from each control tick to the next."""
+    clearance = ArmClearance(robot.world.model)
     tick: Callable[[], None] = robot.tick
 
     def watched() -> None:
         tick()
-        if gap.due(robot.t_ns):
-            gap.look(robot.t_ns, robot.world.data)
+        if clearance.due(robot.t_ns):
+            clearance.measure(robot.t_ns, robot.world.data)
 
     robot.tick = watched  # type: ignore[method-assign]
-    return gap
+    return clearance
 
 
-def least_gap(states: Iterable[tuple[int, Mapping[str, float]]]) -> float:
+def least_clearance(states: Iterable[tuple[int, Mapping[str, float]]]) -> float:
     """Least distance of the arms in the joint states of a simulation, m.
 
     Args:
         states: Stamp in ns, and position by joint; oldest first, as often as a control tick.
     """
     world = Stage(RobotDescription.load(), load_cameras(), None, PhysicsConfig()).world(load_scene("empty"))
-    gap = Gap(world.model)
+    clearance = ArmClearance(world.model)
     for t_ns, joints in states:
-        if gap.due(t_ns):
+        if clearance.due(t_ns):
             world.data.qpos[:] = start_qpos(world.model, joints)
             mujoco.mj_kinematics(world.model, world.data)
-            gap.look(t_ns, world.data)
-    return gap.least
+            clearance.measure(t_ns, world.data)
+    return clearance.least
 
 
 def _arm_geoms(model: mujoco.MjModel, side: str) -> NDArray[np.intp]:

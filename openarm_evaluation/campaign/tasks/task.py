@@ -47,7 +47,7 @@ class Task:
     """One row of a campaign.
 
     Attributes:
-        set_name: Of `SETS`.
+        set_name: Of `SUITES`.
         seed: Of everything that is drawn.
         scene: What is on the table.
         labels: Requested objects, one after the other.
