@@ -13,10 +13,12 @@ import pytest
 
 from openarm_bringup.supervision.graph import load_graph
 from openarm_common.camera.cameras import load_cameras
-from openarm_common.errors import OpenArmError
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
+from openarm_grasp.strategies import registry
 from openarm_motion.planning.planner import PlanQuery
 from openarm_motion.planning.planners import make_planner
+from tests.openarm_grasp.scripted import Wait, World, standing
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
@@ -88,3 +90,21 @@ def test_the_planner_is_named_by_a_parameter(tmp_path: Path, monkeypatch: pytest
     np.testing.assert_array_equal(path.waypoints, [[0.0, 0.0], [0.0, 0.5]])
     with pytest.raises(OpenArmError, match="no straight line to 2 goals is free"):
         planner.plan(query(0, 1))
+
+
+def test_the_strategy_is_tried_after_the_others_and_its_key_is_the_route(monkeypatch: pytest.MonkeyPatch) -> None:
+    strategy = module(example("A grasp strategy", "python"))["patience"]
+    entries = re.findall(r'^    "(\w+)": (\w+),$', example("A grasp strategy", "python", 1), re.MULTILINE)
+    assert [key for key, _ in entries] == [*registry.STRATEGIES, "patience"]
+    world = World(standing("red", 0.46, 0.02))
+    world.far, world.hands_come_behind, world.two_sided = 0.44, False, True
+    assert world.ask().code == Code.UNREACHABLE
+
+    def comes_nearer(call: object) -> None:
+        if call == Wait(5.0):
+            world.objects["red"] = standing("red", 0.40, 0.02)
+
+    world.faults.append(comes_nearer)
+    monkeypatch.setitem(registry.STRATEGIES, "patience", strategy)
+    outcome = world.ask()
+    assert (outcome.code, outcome.route) == (Code.OK, "patience"), outcome.message

@@ -267,6 +267,7 @@ class Bench:
         self.service = probe.create_client(Grasp, "/grasp")
         self.action = ActionClient(probe, Pick, "/grasp/pick")
         self.two = ActionClient(probe, PickTwo, "/grasp/pick_two")
+        ros.spin_until(lambda: self.status, 20.0, "the first status")
 
     def ask(self, label: str = "red", timeout: float = 30.0, **request) -> Grasp.Response:
         return self.ros.call(self.service, Grasp.Request(label=label, **request), timeout)
