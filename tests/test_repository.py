@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from openarm_bringup.cli import build_app
 from openarm_common.errors import Code
 from openarm_sim_bridge.faults.faults import FAULTS
 
@@ -118,6 +119,19 @@ def test_the_table_of_codes_and_that_of_faults_are_complete() -> None:
 def test_links_between_pages_lead_somewhere(page: Path) -> None:
     links = re.findall(r"\]\((?!https?://)([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
     assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_files_and_commands_that_a_page_names_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    folders = "|".join((*PACKAGES, "interfaces", "config", "models", "tests", "benchmarks", "tools", "examples"))
+    named = re.findall(rf"`((?:{folders})/[\w./-]*)`( \(new\))?", text)
+    assert [path for path, new in named if not new and not (ROOT / path).exists()] == []
+    app = build_app()
+    for command, part in re.findall(r"\./openarm ([a-z]+)(?: ([a-z]+))?", text):
+        assert command in app, command
+        parts = [name for name in app[command] if not name.startswith("-")]
+        assert not parts or not part or part in parts, f"{command} {part}"
 
 
 def test_the_readme_is_short_and_links_every_guide() -> None:
