@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import importlib.metadata
 import os
 import re
 import subprocess
 import sys
+import textwrap
 import tomllib
 from pathlib import Path
 
@@ -132,6 +134,17 @@ def test_files_and_commands_that_a_page_names_exist(page: Path) -> None:
         assert command in app, command
         parts = [name for name in app[command] if not name.startswith("-")]
         assert not parts or not part or part in parts, f"{command} {part}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_what_examples_of_a_page_import_exists(page: Path) -> None:
+    for block in re.findall(r"^ *```python\n(.*?)^ *```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
+        for node in ast.walk(ast.parse(textwrap.dedent(block))):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("openarm_"):
+                module = importlib.import_module(node.module)
+                for alias in node.names:
+                    if not hasattr(module, alias.name):
+                        importlib.import_module(f"{node.module}.{alias.name}")
 
 
 def test_the_readme_is_short_and_links_every_guide() -> None:
