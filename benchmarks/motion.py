@@ -45,14 +45,15 @@ from openarm_common.camera.housings import with_housings
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
-from openarm_motion.collision.collision import box_from
 from openarm_motion.collision.fast import FastScene
-from openarm_motion.collision.seen import Known
+from openarm_motion.collision.occupancy import Environment
+from openarm_motion.collision.solids import box_from
 from openarm_motion.config import MotionConfig
-from openarm_motion.planning.arm import Arm, Situation
-from openarm_motion.planning.both import BothArms
-from openarm_motion.planning.fast_planner import FastPlanner
-from openarm_motion.planning.planner import OmplPlanner, Planner, PlanQuery
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.dual_arm import DualArm
+from openarm_motion.planning.ompl_planner import OmplPlanner
+from openarm_motion.planning.planner import Planner, PlanQuery
+from openarm_motion.planning.rrt import FastPlanner
 
 #: A problem counts as feasible when some planner finds a path within this time, s.
 _LONG = 20.0
@@ -122,7 +123,7 @@ def _by_callbacks(query: PlanQuery, fast: FastScene) -> PlanQuery:
     )
 
 
-def check_rows(both: BothArms, home: Mapping[str, float], count: int) -> list[Row]:
+def check_rows(both: DualArm, home: Mapping[str, float], count: int) -> list[Row]:
     """Time of one state of both arms and of an edge of one arm, among table and boxes."""
     rng = np.random.default_rng(3)
     boxes = table_boxes(rng)
@@ -191,15 +192,15 @@ def main() -> None:
     args = parser.parse_args()
     quick, seeds = args.quick, TUNING if args.tuning else REPORTED
     arms, home = arms_and_home()
-    both, sides = BothArms(arms["left"], arms["right"]), list(arms.values())
+    both, sides = DualArm(arms["left"], arms["right"]), list(arms.values())
 
     def single(name: str, problems: list[Problem], targets: tuple[float, float]) -> list[Row]:
         def query(problem: Problem) -> PlanQuery:
             arm = arms[problem.arm]
             seen = problem.known.map
-            known = Known(map=None if seen is None else replace(seen))  # nothing of it is worked out yet
+            known = Environment(map=None if seen is None else replace(seen))  # nothing of it is worked out yet
             scene = arm.scene(problem.state, problem.boxes, known=known)
-            return arm.query(scene, Situation(problem.state, problem.start), problem.goals, 5.0)
+            return arm.query(scene, StartState(problem.state, problem.start), problem.goals, 5.0)
 
         return plan_rows(name, problems, query, targets)
 

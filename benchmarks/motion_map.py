@@ -9,11 +9,11 @@ import numpy as np
 
 from benchmarks.map_scene import MapScene
 from openarm_common.scene.scene import PALETTE, Scene, SceneObject, Table
-from openarm_motion.collision.seen import Known, SeenMap
+from openarm_motion.collision.occupancy import Environment, OccupancyMap
 from openarm_motion.collision.solids import Box
 from openarm_motion.config import MapConfig
 from openarm_motion.planning.arm import Arm
-from openarm_motion.scene.map_eye import unexplained
+from openarm_motion.scene.map_view import unexplained
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.kernels import OCCUPIED
 from openarm_octomap.mapper import Mapper
@@ -22,7 +22,7 @@ from openarm_octomap.mapper import Mapper
 _FRAMES = 2
 
 
-def rendered(arm: Arm, home: Mapping[str, float], boxes: Sequence[Box], seed: int) -> Known:
+def rendered(arm: Arm, home: Mapping[str, float], boxes: Sequence[Box], seed: int) -> Environment:
     """The octree of both cameras' images of the table and the boxes, less what is known: the table and the robot.
 
     Args:
@@ -54,5 +54,5 @@ def rendered(arm: Arm, home: Mapping[str, float], boxes: Sequence[Box], seed: in
         place.close()
     if states is None:
         raise RuntimeError("the mapper gave no states")
-    seen = SeenMap(np.argwhere(states == OCCUPIED), mapper.lattice, 1)
-    return Known(map=unexplained(seen, MapConfig(), arm.description, home, arm.static, ()))
+    seen = OccupancyMap(np.argwhere(states == OCCUPIED), mapper.lattice, 1)
+    return Environment(map=unexplained(seen, MapConfig(), arm.description, home, arm.static, ()))

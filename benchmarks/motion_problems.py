@@ -12,10 +12,10 @@ import numpy as np
 from benchmarks.motion_map import rendered
 from openarm_common import se3
 from openarm_common.types import Array
-from openarm_motion.collision.seen import NOTHING, Known
+from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.planning.arm import Arm
-from openarm_motion.planning.both import BothArms
+from openarm_motion.planning.dual_arm import DualArm
 
 #: Whether configurations collide that are free of everything else is asked of this.
 Collides = Callable[[Array], bool]
@@ -38,7 +38,7 @@ class Problem:
     state: Mapping[str, float]
     start: Array
     goals: Array
-    known: Known = NOTHING
+    known: Environment = NOTHING
 
 
 def table_boxes(rng: np.random.Generator, count: int = 8) -> tuple[Box, ...]:
@@ -124,7 +124,7 @@ def shelf_problems(arms: Sequence[Arm], home: Mapping[str, float], count: int, s
     return out
 
 
-def dual_problems(both: BothArms, home: Mapping[str, float], count: int, seed: int) -> list[Problem]:
+def dual_problems(both: DualArm, home: Mapping[str, float], count: int, seed: int) -> list[Problem]:
     """Both arms from random configurations to boxes of their own."""
     rng = np.random.default_rng(seed)
     out: list[Problem] = []

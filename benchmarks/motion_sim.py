@@ -37,14 +37,13 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Array
-from openarm_motion.collision.collision import Box, box_from
-from openarm_motion.collision.seen import Known
+from openarm_motion.collision.occupancy import Environment
+from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning import moves
-from openarm_motion.planning.arm import Arm, Situation
-from openarm_motion.planning.beside import Course, least_wait
-from openarm_motion.planning.both import BothArms
-from openarm_motion.planning.together import BothGoals, plan_staggered, plan_together
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.coordination import ActiveMotion, least_delay
+from openarm_motion.planning.dual_arm import DualArm, DualArmGoals, plan_staggered, plan_together
 from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import Trajectory
 
@@ -76,8 +75,8 @@ def single(
     arm: Arm, state: dict[str, float], boxes: tuple[Box, ...], rng: np.random.Generator
 ) -> tuple[str, Trajectory]:
     """One random plan: to joints, to a pose beside a box, or along a line."""
-    now = arm.situation(state, scale=float(rng.choice([0.3, 0.5, 1.0])))
-    around, kind = moves.Around(boxes), str(rng.choice(["joints", "joints", "pose", "pose", "line"]))
+    now = arm.start_state(state, scale=float(rng.choice([0.3, 0.5, 1.0])))
+    around, kind = moves.RequestBoxes(boxes), str(rng.choice(["joints", "joints", "pose", "pose", "line"]))
     if kind == "joints":
         collides = arm.scene(state, boxes).collides
         return kind, moves.to_joints(arm, now, random_free(arm, rng, collides).tolist(), around)
@@ -131,17 +130,17 @@ def run_both(
     """Plans of both arms of one scene, together and staggered in turns."""
     rng = np.random.default_rng(seed)
     boxes = scene_boxes(arms, home, rng)
-    stand, both, out = Stand(description, boxes), BothArms(arms["left"], arms["right"]), list[Seen]()
+    stand, both, out = Stand(description, boxes), DualArm(arms["left"], arms["right"]), list[Seen]()
     for k in range(_A_SCENE):
         refused = 0
         while refused < _DRAWS:
             state = stand.state()
             begin = time.perf_counter()
             goals = tuple(middle_goals(arm, state, boxes, rng) for arm in both.arms)
-            now = Situation(state, np.array([state[name] for name in both.names]), float(rng.choice([0.3, 0.5, 1.0])))
+            now = StartState(state, np.array([state[name] for name in both.names]), float(rng.choice([0.3, 0.5, 1.0])))
             how = plan_staggered if k % 2 else plan_together
             try:
-                plan = how(both, now, BothGoals((goals[0], goals[1]), boxes), 2.0)
+                plan = how(both, now, DualArmGoals((goals[0], goals[1]), boxes), 2.0)
             except OpenArmError as error:
                 if error.code not in _REFUSED:
                     raise
@@ -171,18 +170,20 @@ def run_beside(
             stand.tick(seen, distances=True)
         under_way = {name: value for name, value in under_way.items() if name in stand.busy}
         for _ in range(_DRAWS):
-            begin, state, held = time.perf_counter(), stand.state(), Course.standing(other, stand.state())
+            begin, state, held = time.perf_counter(), stand.state(), ActiveMotion.standing(other, stand.state())
             later = state
             if other.name in under_way:
                 trajectory, since_ns = under_way[other.name]
-                held = Course(other, Motion.of(trajectory).later((since_ns - stand.world.t_ns) * 1e-9))
+                held = ActiveMotion(other, Motion.of(trajectory).later((since_ns - stand.world.t_ns) * 1e-9))
                 later = {**state, **held.motion.at(held.motion.duration)}
             goals = middle_goals(arm, later, boxes, rng)
-            now = replace(arm.situation(later, scale=float(rng.choice([0.3, 0.5, 1.0]))), known=Known(apart=_BESIDE))
+            now = replace(
+                arm.start_state(later, scale=float(rng.choice([0.3, 0.5, 1.0]))), known=Environment(apart=_BESIDE)
+            )
             try:
-                scene = moves.free_scene(arm, now, moves.Around(boxes))
-                plan = arm.plan_certified(scene, now, goals, 2.0).trajectory
-                wait = least_wait(Course(arm, Motion.of(plan)), [held], state)
+                scene = moves.free_scene(arm, now, moves.RequestBoxes(boxes))
+                plan = arm.plan_validated(scene, now, goals, 2.0).trajectory
+                wait = least_delay(ActiveMotion(arm, Motion.of(plan)), [held], state)
             except OpenArmError as error:
                 if error.code not in _REFUSED:
                     raise

@@ -12,7 +12,7 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
-from openarm_motion.collision.collision import Box
+from openarm_motion.collision.solids import Box
 from openarm_motion.timing.trajectory import Trajectory
 from openarm_sim_bridge.control.arm import TrajectoryConfig, TrajectoryOutcome
 from openarm_sim_bridge.control.controller import RobotController

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from openarm_common.config import Config
-from openarm_motion.collision.collision import Clearance
+from openarm_motion.collision.exact import Clearance
 
 _SEVEN_V = (2.0, 2.0, 2.5, 2.5, 3.0, 3.0, 3.0)
 _SEVEN_A = (6.0, 6.0, 8.0, 8.0, 12.0, 12.0, 12.0)

@@ -7,14 +7,14 @@ import numpy as np
 
 from openarm_common.octree.lattice import KEY_ZERO, Lattice
 from openarm_common.robot.description import SIDES, RobotDescription
-from openarm_motion.collision.collision import CollisionScene, Surroundings
-from openarm_motion.collision.collision_robot import CollisionRobot
+from openarm_motion.collision.exact import CollisionContext, CollisionScene
 from openarm_motion.collision.fast import FastScene
-from openarm_motion.collision.seen import SeenMap
-from openarm_motion.kinematics.cartesian import solve_line
+from openarm_motion.collision.occupancy import OccupancyMap
+from openarm_motion.collision.robot import CollisionRobot
+from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
-from openarm_motion.kinematics.kinematics import ArmKinematics
-from openarm_motion.planning.fast_planner import warm_search
+from openarm_motion.kinematics.line import solve_line
+from openarm_motion.planning.rrt import warm_search
 
 
 def warm() -> None:
@@ -31,9 +31,9 @@ def warm() -> None:
     inverse.solutions(pose, near=q)
     away = pose.copy()
     away[2, 3] += 0.01
-    scene = CollisionScene(CollisionRobot(description, kinematics), Surroundings(home))
+    scene = CollisionScene(CollisionRobot(description, kinematics), CollisionContext(home))
     warm_search(FastScene([scene]), q)
-    SeenMap(np.zeros((1, 3), np.int64), Lattice(0.02, (KEY_ZERO, KEY_ZERO, KEY_ZERO), (4, 4, 4)), 1).distances  # noqa: B018
+    OccupancyMap(np.zeros((1, 3), np.int64), Lattice(0.02, (KEY_ZERO, KEY_ZERO, KEY_ZERO), (4, 4, 4)), 1).distances  # noqa: B018
     solve_line(inverse, inverse.classify(q), pose, away, margin=0.0)
 
 

@@ -18,7 +18,7 @@ from openarm_octomap.mapper import Frame, Mapper
 
 
 class SimulatedMap:
-    """Does for one process what the octomap node does; implements `openarm_motion.scene.map_eye.FieldSource`.
+    """Does for one process what the octomap node does; implements `openarm_motion.scene.map_view.FieldSource`.
 
     Args:
         description: The robot.

@@ -19,12 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision import fast_kernels as kernels
-from openarm_motion.collision.collision import CollisionScene
-from openarm_motion.collision.fast_model import Model, workspace
-from openarm_motion.collision.seen import DistanceMap
+from openarm_motion.collision import clearance_kernels as kernels
+from openarm_motion.collision.clearance_kernels import Model, workspace
+from openarm_motion.collision.exact import CollisionScene
+from openarm_motion.collision.line_kernels import line_free
+from openarm_motion.collision.occupancy import DistanceMap
 from openarm_motion.collision.shape_kernels import BOX, CYLINDER, SPHERE
-from openarm_motion.planning.line_kernels import line_free
 
 #: Added to distances, so that rounding does not decide, m.
 _ROUNDING = 1e-6

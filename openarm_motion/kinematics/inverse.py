@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from openarm_common.errors import OpenArmError
 from openarm_common.types import Array
-from openarm_motion.kinematics.kinematics import ArmKinematics, IkResult
+from openarm_motion.kinematics.chain import ArmKinematics, IkResult
 from openarm_motion.kinematics.srs import SrsArm, SrsMiss
 
 #: Numeric solutions nearer to each other than this in every joint count as one.

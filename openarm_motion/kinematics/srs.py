@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.kinematics import srs_kernels
-from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.kinematics.chain import ArmKinematics
 
 #: How far the axes may miss each other: a rounded rpy in the URDF costs 4e-6 m.
 _MEET = 2e-5

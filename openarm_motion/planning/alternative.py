@@ -10,12 +10,12 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.collision import CollisionScene
+from openarm_motion.collision.exact import CollisionScene
 from openarm_motion.planning import moves
 from openarm_motion.planning.approach import ApproachFailedError, ApproachPlan, ApproachRequest
-from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.failure import Alternative, PlanFailedError
-from openarm_motion.planning.moves import Around
+from openarm_motion.planning.moves import RequestBoxes
 from openarm_motion.timing.trajectory import Trajectory
 
 #: Distances from the pose that was asked for that are tried, m.
@@ -47,7 +47,7 @@ def explained(plan: Callable[[], Trajectory], instead: Callable[[], Alternative 
 
 
 def explained_approach(
-    plan: Callable[[], ApproachPlan], arm: Arm, now: Situation, request: ApproachRequest
+    plan: Callable[[], ApproachPlan], arm: Arm, now: StartState, request: ApproachRequest
 ) -> ApproachPlan:
     """The same for an approach: what is near to the target that got furthest.
 
@@ -58,13 +58,13 @@ def explained_approach(
         return plan()
     except ApproachFailedError as error:
         target = next(target for target in request.targets if target.id == error.furthest.id)
-        around = Around(request.obstacles, request.attached)
+        around = RequestBoxes(request.obstacles, request.attached)
         error.alternative = near_pose(arm, now, around, target.pose, budget=_APPROACH)
         raise
 
 
 def near_pose(
-    arm: Arm, now: Situation, around: Around, pose: Array, *, free_orientation: bool = False, budget: float = 1.0
+    arm: Arm, now: StartState, around: RequestBoxes, pose: Array, *, free_orientation: bool = False, budget: float = 1.0
 ) -> Alternative | None:
     """The nearest tool pose that the arm can be planned to; None when none is found within `budget` s.
 
@@ -89,7 +89,9 @@ def near_pose(
     return None
 
 
-def near_joints(arm: Arm, now: Situation, around: Around, goal: Array, budget: float = 1.0) -> Alternative | None:
+def near_joints(
+    arm: Arm, now: StartState, around: RequestBoxes, goal: Array, budget: float = 1.0
+) -> Alternative | None:
     """The configuration nearest to `goal`, on the way back to the start, that the arm can be planned to."""
     end = time.monotonic() + budget
     scene = moves.free_scene(arm, now, around)
@@ -104,10 +106,10 @@ def near_joints(arm: Arm, now: Situation, around: Around, goal: Array, budget: f
     return None
 
 
-def _planned(arm: Arm, scene: CollisionScene, now: Situation, goals: Array) -> Array | None:
+def _planned(arm: Arm, scene: CollisionScene, now: StartState, goals: Array) -> Array | None:
     """The goal that a plan reaches in a short time, or None."""
     try:
-        return np.asarray(arm.plan_certified(scene, now, goals, _SEARCH).trajectory.q[-1])
+        return np.asarray(arm.plan_validated(scene, now, goals, _SEARCH).trajectory.q[-1])
     except OpenArmError:
         return None
 

@@ -9,7 +9,7 @@ and looked at densely before they are handed out. What is refused says why. Base
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,16 +17,107 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.collision import Box, CollisionScene
-from openarm_motion.kinematics.cartesian import Line, line_contact, solve_line
+from openarm_motion.collision.exact import CollisionScene, Contact
+from openarm_motion.collision.solids import Box
 from openarm_motion.kinematics.inverse import Solution
-from openarm_motion.planning.approach_request import ApproachRequest, Refused, Target
-from openarm_motion.planning.arm import Arm, Situation, first_contact, segment_time
-from openarm_motion.planning.failure import PlanFailedError
-from openarm_motion.timing.certificate import Certificate, certify
+from openarm_motion.kinematics.line import Line, line_contact, solve_line
+from openarm_motion.planning.arm import Arm, StartState, first_contact, segment_time
+from openarm_motion.planning.failure import PlanFailedError, Stage
 from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.validation import Validation, validate_trajectory
 
-__all__ = ["ApproachFailedError", "ApproachPlan", "ApproachRequest", "Refused", "Target", "plan_approach"]
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """One way to reach a place with the tool: lines from `pose` + `approach_offset` to `pose` to `retreat_offset`.
+
+    Attributes:
+        id: Returned in refusals.
+        pose: (4, 4) of the tool.
+        approach_offset: (3,) base frame.
+        retreat_offset: (3,) base frame.
+        score: A higher one is preferred.
+    """
+
+    id: str
+    pose: Array
+    approach_offset: Array
+    retreat_offset: Array
+    score: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class ApproachRequest:
+    """What `plan_approach` is asked.
+
+    Attributes:
+        targets: Any of them will do.
+        obstacles: Boxes beside the robot and the table, base frame.
+        attached: Boxes held by the arm, tool frame.
+        touchable: Ids of obstacles that the fingers may touch on the straight parts.
+        attached_after: The touchable obstacles are carried on the retreat (a grasp).
+        detached_after: The held boxes are left behind on the retreat (a place).
+    """
+
+    targets: tuple[Target, ...]
+    obstacles: tuple[Box, ...] = ()
+    attached: tuple[Box, ...] = ()
+    touchable: frozenset[str] = frozenset()
+    attached_after: bool = False
+    detached_after: bool = False
+
+    def check(self) -> None:
+        """Refuse a request that is none.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, without targets, for an unknown touchable id or numbers that are not finite.
+        """
+        if not self.targets:
+            raise OpenArmError(Code.INVALID_ARGUMENT, "no targets, expected at least one")
+        known = {box.id for box in self.obstacles}
+        unknown = sorted(self.touchable - known)
+        if unknown:
+            there = ", ".join(sorted(known)) or "none"
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"touchable {', '.join(unknown)} not among the obstacles: {there}"
+            )
+        if self.attached_after and self.detached_after:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, "attached_after_approach and detached_after_approach exclude each other"
+            )
+        for target in self.targets:
+            numbers = np.concatenate(
+                [target.pose.ravel(), target.approach_offset, target.retreat_offset, [target.score]]
+            )
+            if not np.all(np.isfinite(numbers)):
+                raise OpenArmError(Code.INVALID_ARGUMENT, f"target {target.id!r} has numbers that are not finite")
+
+    def by_score(self, step: float) -> Iterator[list[int]]:
+        """Indices of targets whose scores are within `step` of the best of their group, best group first."""
+        order = sorted(range(len(self.targets)), key=lambda i: -self.targets[i].score)
+        while order:
+            least = self.targets[order[0]].score - step
+            group = [i for i in order if self.targets[i].score >= least]
+            yield group
+            order = order[len(group) :]
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Why a target was not chosen: at which stage, and the pair in the way where there is one."""
+
+    id: str
+    code: Code
+    message: str
+    stage: Stage = "goal"
+    contact: Contact | None = None
+
+    @classmethod
+    def of(cls, id: str, error: OpenArmError, message: str, stage: Stage = "goal") -> Refused:
+        """For an error; `stage` is of one that does not know it."""
+        if isinstance(error, PlanFailedError):
+            return cls(id, error.code, message, error.stage, error.contact)
+        return cls(id, error.code, message, stage)
 
 
 #: A configuration nearer to a joint limit than this is thought less of, rad.
@@ -60,7 +151,7 @@ class ApproachPlan:
     retreat: Trajectory
     refusals: tuple[Refused, ...]
     held_after: tuple[Box, ...]
-    certificates: tuple[Certificate, Certificate, Certificate]
+    validations: tuple[Validation, Validation, Validation]
     limit_margins: tuple[float, ...]
 
 
@@ -83,7 +174,7 @@ class _Candidate:
 
 def plan_approach(
     arm: Arm,
-    now: Situation,
+    now: StartState,
     request: ApproachRequest,
     report: Callable[[str, int], None] = lambda stage, tried: None,
 ) -> ApproachPlan:
@@ -134,7 +225,7 @@ def plan_approach(
 class _Checks:
     """The three surroundings of one request, built once, and what fits into them."""
 
-    def __init__(self, arm: Arm, now: Situation, request: ApproachRequest) -> None:
+    def __init__(self, arm: Arm, now: StartState, request: ApproachRequest) -> None:
         self._arm, self._now, self._request = arm, now, request
         # hands grasp open; a hand that holds something keeps its opening until it lets go
         opened = arm.config.planning.gripper_open
@@ -184,7 +275,7 @@ class _Checks:
         while left:
             try:
                 goals = np.array([candidate.approach.q[0] for candidate in left])
-                free = arm.plan_certified(self.free, now, goals, max(end - time.monotonic(), 0.1))
+                free = arm.plan_validated(self.free, now, goals, max(end - time.monotonic(), 0.1))
             except OpenArmError as error:
                 if error.code not in (Code.NO_PLAN, Code.IN_COLLISION):
                     raise
@@ -197,15 +288,15 @@ class _Checks:
             approach, retreat = (arm.time_line(line, now.scale) for line in (best.approach, best.retreat))
             what = "approach"
             try:
-                to = certify(self._approach, approach)
+                to = validate_trajectory(self._approach, approach)
                 what = "retreat"
-                away = certify(self._retreat, retreat)
+                away = validate_trajectory(self._retreat, retreat)
             except PlanFailedError as error:
                 id = targets[best.target].id
                 refusals.append(Refused.of(id, error, f"{id}: on the {what}, {error.message}"))
                 continue
             held = self.held_after(pose)
-            proof = (free.certificate, to, away)
+            proof = (free.validation, to, away)
             self._margins[best.target] = best.margin
             margins = tuple(self._margins.tolist())
             return ApproachPlan(best.target, free.trajectory, approach, retreat, tuple(refusals), held, proof, margins)

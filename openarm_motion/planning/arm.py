@@ -16,20 +16,20 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
-from openarm_motion.collision.collision import Box, CollisionScene, Contact, Surroundings
-from openarm_motion.collision.collision_robot import CollisionRobot
+from openarm_motion.collision.exact import CollisionContext, CollisionScene, Contact
 from openarm_motion.collision.fast import FastScene
-from openarm_motion.collision.seen import NOTHING, Known
+from openarm_motion.collision.occupancy import NOTHING, Environment
+from openarm_motion.collision.robot import CollisionRobot
+from openarm_motion.collision.solids import Box
 from openarm_motion.config import MotionConfig
-from openarm_motion.kinematics.cartesian import Line
+from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
-from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.kinematics.line import Line
 from openarm_motion.planning.failure import PlanFailedError
-from openarm_motion.planning.planner import PlannedPath, Planner, PlanQuery, never
-from openarm_motion.planning.planners import make_planner
+from openarm_motion.planning.planner import PlannedPath, Planner, PlanQuery, make_planner, never
 from openarm_motion.timing.blending import timings
-from openarm_motion.timing.certificate import Certificate, certify
 from openarm_motion.timing.trajectory import JointLimits, Trajectory, profile, time_path
+from openarm_motion.timing.validation import Validation, validate_trajectory
 
 #: A joint this far outside its limits is a wrong reading, not sag; rad.
 _SAG = 0.05
@@ -40,16 +40,16 @@ _FINENESS = (1.0, 4.0)
 
 
 @dataclass(frozen=True, eq=False)
-class CertifiedPlan:
+class ValidatedPlan:
     """A path, the same timed, and what it was looked at with."""
 
     path: PlannedPath
     trajectory: Trajectory
-    certificate: Certificate
+    validation: Validation
 
 
 @dataclass(frozen=True, eq=False)
-class Situation:
+class StartState:
     """What a request starts from.
 
     Attributes:
@@ -64,7 +64,7 @@ class Situation:
     start: Array
     scale: float = 0.0
     stopped: Callable[[], bool] = never
-    known: Known = NOTHING
+    known: Environment = NOTHING
 
 
 class Arm:
@@ -115,14 +115,14 @@ class Arm:
         """The arm's joints."""
         return self.kinematics.names
 
-    def situation(
+    def start_state(
         self,
         state: Mapping[str, float],
         start: Sequence[float] | Array = (),
         scale: float = 0.0,
         stopped: Callable[[], bool] = never,
-        known: Known = NOTHING,
-    ) -> Situation:
+        known: Environment = NOTHING,
+    ) -> StartState:
         """Check and complete what a request starts from; an empty `start` is the present configuration.
 
         Raises:
@@ -134,7 +134,7 @@ class Arm:
             raise OpenArmError(Code.NOT_READY, f"/joint_states lacks {', '.join(missing)}")
         q = self.configuration(start if len(start) else [state[name] for name in self.names], "start", _SAG)
         self.scale(scale)
-        return Situation(dict(state), q, scale, stopped, known)
+        return StartState(dict(state), q, scale, stopped, known)
 
     def configuration(self, values: Sequence[float] | Array, what: str, tolerance: float = 1e-4) -> Array:
         """Check joint positions and move them into the limits where they are out by no more than `tolerance`.
@@ -183,7 +183,7 @@ class Arm:
         *,
         straight: bool = False,
         gripper: float | None = None,
-        known: Known = NOTHING,
+        known: Environment = NOTHING,
     ) -> CollisionScene:
         """Surroundings of the arm with the table in them.
 
@@ -203,7 +203,7 @@ class Arm:
         fixed = frozenset(body.id for body in certain)
         return CollisionScene(
             self.robot,
-            Surroundings(
+            CollisionContext(
                 state=state if gripper is None else self.with_gripper(state, gripper),
                 boxes=[*certain, *boxes],
                 held=held,
@@ -232,7 +232,7 @@ class Arm:
             raise PlanFailedError(Code.IN_COLLISION, text, "start", contact)
 
     def plan(
-        self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float, fineness: float = 1.0
+        self, scene: CollisionScene, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
     ) -> PlannedPath:
         """Free path to one of several configurations (k, n), an earlier one preferred.
 
@@ -251,7 +251,7 @@ class Arm:
             blocked = "" if contact is None else f"; on the direct way {contact}"
             raise PlanFailedError(Code.NO_PLAN, error.message + blocked, "search", contact) from error
 
-    def plan_certified(self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float) -> CertifiedPlan:
+    def plan_validated(self, scene: CollisionScene, now: StartState, goals: Array, time_limit: float) -> ValidatedPlan:
         """Free path to one of several configurations, timed, and looked at densely on the exact layer.
 
         Where the dense look finds what the search stepped over, the search is repeated with finer steps.
@@ -265,14 +265,14 @@ class Arm:
             path = self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
             for trajectory in self.timings(path, now.scale):
                 try:
-                    return CertifiedPlan(path, trajectory, certify(scene, trajectory))
+                    return ValidatedPlan(path, trajectory, validate_trajectory(scene, trajectory))
                 except PlanFailedError as error:
                     fault, contact = error.message, error.contact
         text = f"the {self.name} arm's plan did not pass the dense look: {fault}"
         raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
 
     def query(
-        self, scene: CollisionScene, now: Situation, goals: Array, time_limit: float, fineness: float = 1.0
+        self, scene: CollisionScene, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
     ) -> PlanQuery:
         """What a planner is asked for a path to one of several goals (k, n); steps are `fineness` times finer."""
         search = self.config.planning

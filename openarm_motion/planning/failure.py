@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.surroundings import Contact
+
+if TYPE_CHECKING:
+    from openarm_motion.collision.exact import Contact
 
 #: How far planning got: the request itself, the start, the goal, the straight line, the search, the dense look at the
 #: timed plan, the planning scene, beside another arm under way.

@@ -10,12 +10,13 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.collision import Box, CollisionScene
-from openarm_motion.kinematics.cartesian import line_contact, solve_line
-from openarm_motion.planning.arm import Arm, Situation, first_contact, segment_time
+from openarm_motion.collision.exact import CollisionScene
+from openarm_motion.collision.solids import Box
+from openarm_motion.kinematics.line import line_contact, solve_line
+from openarm_motion.planning.arm import Arm, StartState, first_contact, segment_time
 from openarm_motion.planning.failure import PlanFailedError
-from openarm_motion.timing.certificate import certify
 from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.validation import validate_trajectory
 
 #: A joint that is told to go no further than this from its limit is taken at its word, rad.
 _ROUNDING = 1e-3
@@ -26,7 +27,7 @@ _DRIFTS = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5, 0.8, -0.8)
 
 
 @dataclass(frozen=True, eq=False)
-class Around:
+class RequestBoxes:
     """Boxes of one request: obstacles (base frame) and what the arm holds (tool frame)."""
 
     obstacles: Sequence[Box] = ()
@@ -34,7 +35,7 @@ class Around:
 
 
 def to_joints(
-    arm: Arm, now: Situation, goal: Sequence[float] | Array, around: Around, what: str = "goal"
+    arm: Arm, now: StartState, goal: Sequence[float] | Array, around: RequestBoxes, what: str = "goal"
 ) -> Trajectory:
     """Free path to a configuration.
 
@@ -49,7 +50,7 @@ def to_joints(
     return _plan(arm, scene, now, q[None])
 
 
-def to_named(arm: Arm, now: Situation, posture: str, around: Around) -> Trajectory:
+def to_named(arm: Arm, now: StartState, posture: str, around: RequestBoxes) -> Trajectory:
     """Free path to a posture of the SRDF.
 
     Raises:
@@ -61,7 +62,9 @@ def to_named(arm: Arm, now: Situation, posture: str, around: Around) -> Trajecto
     return to_joints(arm, now, goal, around, f"posture {posture!r}")
 
 
-def to_pose(arm: Arm, now: Situation, pose: Array, around: Around, *, free_orientation: bool = False) -> Trajectory:
+def to_pose(
+    arm: Arm, now: StartState, pose: Array, around: RequestBoxes, *, free_orientation: bool = False
+) -> Trajectory:
     """Free path to the tool pose (4, 4), in whichever configuration is nearest.
 
     Raises:
@@ -85,7 +88,7 @@ def to_pose(arm: Arm, now: Situation, pose: Array, around: Around, *, free_orien
     return _plan(arm, scene, now, np.array(goals))
 
 
-def to_pose_on_line(arm: Arm, now: Situation, pose: Array, around: Around) -> Trajectory:
+def to_pose_on_line(arm: Arm, now: StartState, pose: Array, around: RequestBoxes) -> Trajectory:
     """Straight line of the tool to a pose (4, 4), without a change of branch, looked at densely when it is timed.
 
     Raises:
@@ -110,7 +113,7 @@ def to_pose_on_line(arm: Arm, now: Situation, pose: Array, around: Around) -> Tr
             continue
         trajectory = arm.time_line(line, now.scale)
         try:
-            certify(scene, trajectory)
+            validate_trajectory(scene, trajectory)
         except PlanFailedError as error:
             faults.append(error)
             continue
@@ -131,7 +134,7 @@ def unreachable(
     return PlanFailedError(Code.UNREACHABLE, text, "goal")
 
 
-def free_scene(arm: Arm, now: Situation, around: Around) -> CollisionScene:
+def free_scene(arm: Arm, now: StartState, around: RequestBoxes) -> CollisionScene:
     """What free paths of a request are planned in, the start freed of what it is in contact with.
 
     Raises:
@@ -142,5 +145,43 @@ def free_scene(arm: Arm, now: Situation, around: Around) -> CollisionScene:
     return scene
 
 
-def _plan(arm: Arm, scene: CollisionScene, now: Situation, goals: Array) -> Trajectory:
-    return arm.plan_certified(scene, now, goals, arm.config.planning.time_limit).trajectory
+def _plan(arm: Arm, scene: CollisionScene, now: StartState, goals: Array) -> Trajectory:
+    return arm.plan_validated(scene, now, goals, arm.config.planning.time_limit).trajectory
+
+
+#: Configurations of one arm that a search of both gets.
+_MOST = 24
+
+
+def posture(arm: Arm, name: str, start: Array) -> Array:
+    """A posture of the SRDF (n,); joints that it does not name stay.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, listing the postures there are; LIMITS.
+    """
+    state = arm.description.group_state(arm.config.group.format(arm=arm.name), name)
+    present: dict[str, float] = dict(zip(arm.names, start.tolist(), strict=True))
+    return arm.configuration([state.get(joint, present[joint]) for joint in arm.names], f"posture {name!r}", 1e-3)
+
+
+def yielding(arm: Arm, start: Array, name: str) -> Array:
+    """Stay, or else the posture of that name; (2, n)."""
+    return np.stack([start, posture(arm, name, start)])
+
+
+def goal_configurations(
+    arm: Arm, now: StartState, start: Array, pose: Array, *, free_orientation: bool = False
+) -> Array:
+    """Configurations with the tool at a pose, the nearest first; (k, n).
+
+    Raises:
+        PlanFailedError: UNREACHABLE, with the reason.
+    """
+    solve = arm.inverse.position_solutions if free_orientation else arm.inverse.solutions
+    solutions = solve(pose, arm.config.planning.joint_margin, start)
+    if not solutions:
+        raise unreachable(arm, pose, free_orientation=free_orientation)
+    limits = arm.limits(now.scale)
+    # of a whole turn of the elbow, some of every part: the nearest alone may all meet the other arm
+    ordered = sorted((s.q for s in solutions), key=lambda q: segment_time(start, q, limits))
+    return np.array(ordered[:: max(1, len(ordered) // _MOST)][:_MOST])

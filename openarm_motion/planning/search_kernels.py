@@ -9,9 +9,8 @@ import numpy as np
 from numba import njit
 
 from openarm_common.types import Array, Ints
-from openarm_motion.collision.fast_kernels import near
-from openarm_motion.collision.fast_model import Model, Work
-from openarm_motion.planning.line_kernels import between_free, line_free
+from openarm_motion.collision.clearance_kernels import Model, Work, near
+from openarm_motion.collision.line_kernels import between_free, line_free
 
 #: Two configurations nearer than this are one, rad.
 _SAME = 1e-6

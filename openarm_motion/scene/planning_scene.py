@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from openarm_common.errors import Code
-from openarm_motion.collision.seen import MAP
+from openarm_motion.collision.occupancy import MAP
 from openarm_motion.collision.solids import Box, Solid
 from openarm_motion.planning.failure import PlanFailedError
 

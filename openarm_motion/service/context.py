@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from openarm_common.types import Array
-from openarm_motion.collision.seen import Known, carried
+from openarm_motion.collision.occupancy import Environment, carried
 from openarm_motion.collision.solids import Box, Solid
 from openarm_motion.config import MotionConfig
-from openarm_motion.planning.arm import Arm, Situation
-from openarm_motion.scene.map_eye import Look, MapEye, unexplained
-from openarm_motion.scene.memory import HeldMemory
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.scene.held import HeldObjects
+from openarm_motion.scene.map_view import MapState, MapView, unexplained
 from openarm_motion.scene.planning_scene import PlanningScene
 from openarm_motion.service.robot import RobotInterface, Watch, stale
 
@@ -33,10 +33,10 @@ class Prepared:
     `complete` adds the map; it takes some ms and is for `RobotInterface.compute`.
     """
 
-    now: Situation
+    now: StartState
     version: int
     note: str
-    complete: Callable[[], Situation]
+    complete: Callable[[], StartState]
 
 
 class PlanningContext:
@@ -57,16 +57,16 @@ class PlanningContext:
         robot: RobotInterface,
         arms: Mapping[str, Arm],
         scene: PlanningScene,
-        held: HeldMemory,
+        held: HeldObjects,
         coordination: ArmCoordination,
-        map_view: MapEye,
+        map_view: MapView,
         config: MotionConfig,
     ) -> None:
         self._robot, self._arms, self._scene, self._held = robot, arms, scene, held
         self._coordination, self._map, self._config = coordination, map_view, config
 
-    def look(self) -> Look:
-        """Return the map as it is now; what is required and missing is an error, see `MapEye.look`."""
+    def look(self) -> MapState:
+        """Return the map as it is now; what is required and missing is an error, see `MapView.look`."""
         return self._map.look(round(self._robot.now() * 1e9))
 
     def prepare(
@@ -93,7 +93,7 @@ class PlanningContext:
             expected: Version that the scene must have; 0 is any.
 
         Raises:
-            OpenArmError: from `Arm.situation`, `PlanningScene.require` and `MapEye.look`; NOT_READY without joints.
+            OpenArmError: from `Arm.situation`, `PlanningScene.require` and `MapView.look`; NOT_READY without joints.
         """
         self._scene.require(expected)
         now = self.start(arm, start, scale, stopped)
@@ -121,7 +121,7 @@ class PlanningContext:
         now = replace(parts[0], start=np.concatenate([part.start for part in parts]))
         return self._prepared(now, self._scene.solids, known, now.state)
 
-    def start(self, arm: Arm, start: Sequence[float] | Array, scale: float, stopped: Callable[[], bool]) -> Situation:
+    def start(self, arm: Arm, start: Sequence[float] | Array, scale: float, stopped: Callable[[], bool]) -> StartState:
         """Take the joints alone, without scene and map; arguments as `prepare`."""
         state: dict[str, float] = {}
         age = self._robot.state_age()
@@ -129,7 +129,7 @@ class PlanningContext:
             state = self._robot.states.latest()[1]
         elif len(start) == 0:
             raise stale(age)
-        return arm.situation(state, start, scale, stopped)
+        return arm.start_state(state, start, scale, stopped)
 
     async def fresh(self) -> None:
         """Wait a moment for a fresh joint state; see `Watch.fresh`."""
@@ -138,7 +138,7 @@ class PlanningContext:
 
     def _prepared(
         self,
-        now: Situation,
+        now: StartState,
         solids: tuple[Solid, ...],
         estimates: Sequence[Box],
         later: Mapping[str, float],
@@ -148,11 +148,11 @@ class PlanningContext:
         certain = (*self._scene.fixed, *solids)
         robot = next(iter(self._arms.values())).description  # with what is mounted on it
 
-        def complete() -> Situation:
+        def complete() -> StartState:
             seen = look.seen
             if seen is not None:
                 seen = unexplained(seen, config, robot, now.state, certain, estimates)
-            return replace(now, state=later, known=Known(solids, seen, apart))
+            return replace(now, state=later, known=Environment(solids, seen, apart))
 
         # a graph without a map is as it should be; one with an old map is not
         note = f" without the map: {look.why}" if look.why and look.version else ""

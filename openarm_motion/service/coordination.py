@@ -12,8 +12,8 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.collision.solids import Box
 from openarm_motion.planning.arm import Arm
-from openarm_motion.planning.beside import Course, least_wait
-from openarm_motion.scene.memory import HeldMemory
+from openarm_motion.planning.coordination import ActiveMotion, least_delay
+from openarm_motion.scene.held import HeldObjects
 from openarm_motion.service.follower import TrajectoryFollower
 from openarm_motion.service.robot import RobotInterface
 from openarm_motion.timing.checks import Motion, check_against_others, check_trajectory
@@ -38,7 +38,7 @@ class ArmCoordination:
     """
 
     def __init__(
-        self, robot: RobotInterface, arms: Mapping[str, Arm], held: HeldMemory, on_held: Callable[[], None]
+        self, robot: RobotInterface, arms: Mapping[str, Arm], held: HeldObjects, on_held: Callable[[], None]
     ) -> None:
         self._robot, self._arms, self._held, self._on_held = robot, arms, held, on_held
         self.followers = {name: TrajectoryFollower(robot, arm) for name, arm in arms.items()}
@@ -144,8 +144,8 @@ class ArmCoordination:
             return 0.0
         now_ns, state = self._robot.states.latest()
         opened = self._hands_open(state)
-        others, mine = self._others(arm, now_ns, opened), Course(arm, motion, held)
-        return await self._robot.compute(lambda: least_wait(mine, others, opened, stopped=cancelled), _NOMINAL)
+        others, mine = self._others(arm, now_ns, opened), ActiveMotion(arm, motion, held)
+        return await self._robot.compute(lambda: least_delay(mine, others, opened, stopped=cancelled), _NOMINAL)
 
     def under_way(self, arm: Arm) -> bool:
         """Whether another arm is under way."""
@@ -174,7 +174,7 @@ class ArmCoordination:
     ) -> tuple[int, float]:
         """When to begin, robot time in ns (0: at once), and how much of that is waiting for another arm, s."""
         latest = self._robot.states.latest
-        mine = Course(arm, motion, self._held.held.get(arm.name, ()) if held is None else held)
+        mine = ActiveMotion(arm, motion, self._held.held.get(arm.name, ()) if held is None else held)
         for head in _HEAD_STARTS:
             now_ns, state = latest()
             begin_ns, stops = now_ns + round(head * 1e9), dict(self.stops)
@@ -183,7 +183,7 @@ class ArmCoordination:
                 return 0, 0.0
             opened = self._hands_open(state)
             others = self._others(arm, begin_ns, opened)
-            search = lambda o=others, s=opened: least_wait(mine, o, s, max_delay, cancelled)  # noqa: E731
+            search = lambda o=others, s=opened: least_delay(mine, o, s, max_delay, cancelled)  # noqa: E731
             delay = await self._robot.compute(search, _NOMINAL)
             begin_ns += round(delay * 1e9)
             if stops == self.stops and latest()[0] + round(_SEND * 1e9) <= begin_ns:
@@ -200,15 +200,15 @@ class ArmCoordination:
             state = arm.with_gripper(state, arm.config.planning.gripper_open)
         return state
 
-    def _others(self, arm: Arm, now_ns: int, state: Mapping[str, float]) -> list[Course]:
+    def _others(self, arm: Arm, now_ns: int, state: Mapping[str, float]) -> list[ActiveMotion]:
         """What the other arms have before them, from a moment on."""
-        found: list[Course] = []
+        found: list[ActiveMotion] = []
         for name, follower in self.followers.items():
             other, held = self._arms[name], self._held.held.get(name, ())
             if other is not arm and follower.active is not None:
-                found.append(Course(other, follower.active.rest(now_ns), held))
+                found.append(ActiveMotion(other, follower.active.rest(now_ns), held))
             elif other is not arm and all(joint in state for joint in other.names):
-                found.append(Course.standing(other, state, held))
+                found.append(ActiveMotion.standing(other, state, held))
         return found
 
 

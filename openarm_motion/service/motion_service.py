@@ -24,13 +24,12 @@ from openarm_motion.config import MotionConfig
 from openarm_motion.planning import moves
 from openarm_motion.planning.alternative import explained, explained_approach, near_joints, near_pose
 from openarm_motion.planning.approach import ApproachFailedError, ApproachPlan, plan_approach
-from openarm_motion.planning.arm import Arm, Situation
-from openarm_motion.planning.both import BothArms
-from openarm_motion.planning.goals import goal_configurations, posture, yielding
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.dual_arm import DualArm, DualArmGoals, DualArmPlan, plan_any, plan_staggered, plan_together
+from openarm_motion.planning.moves import goal_configurations, posture, yielding
 from openarm_motion.planning.planner import never
-from openarm_motion.planning.together import BothGoals, BothPlan, plan_any, plan_staggered, plan_together
-from openarm_motion.scene.map_eye import FieldSource, MapEye
-from openarm_motion.scene.memory import HeldMemory
+from openarm_motion.scene.held import HeldObjects
+from openarm_motion.scene.map_view import FieldSource, MapView
 from openarm_motion.scene.planning_scene import PlanningScene
 from openarm_motion.service.context import PlanningContext
 from openarm_motion.service.coordination import ArmCoordination
@@ -63,7 +62,7 @@ Report = Callable[[str, float], None]
 #: Points of a trajectory in a preview.
 _PREVIEW_POINTS = 50
 
-_STRATEGIES: dict[Strategy, Callable[[BothArms, Situation, BothGoals, float], BothPlan]] = {
+_STRATEGIES: dict[Strategy, Callable[[DualArm, StartState, DualArmGoals, float], DualArmPlan]] = {
     "any": plan_any,
     "together": plan_together,
     "staggered": plan_staggered,
@@ -119,9 +118,9 @@ class MotionService:
         #: Called when what a hand holds has changed.
         self.on_held: Callable[[], None] = lambda: None
         self.scene = PlanningScene(next(iter(arms.values())).static)
-        self.memory = HeldMemory()
+        self.memory = HeldObjects()
         self.coordination = ArmCoordination(robot, arms, self.memory, lambda: self.on_held())
-        view = MapEye(config.map, field, frames)
+        view = MapView(config.map, field, frames)
         self._context = PlanningContext(robot, arms, self.scene, self.memory, self.coordination, view, config)
         self._claimed: set[str] = set()
 
@@ -181,7 +180,7 @@ class MotionService:
             with self._claim(arm.name, wanted=not request.plan_only):
                 report("planning", 0.0)
                 held, holding = self.memory.on_request(arm.name, request.attached, request.hand_empty)
-                around = moves.Around(request.obstacles, held)
+                around = moves.RequestBoxes(request.obstacles, held)
                 await self._context.fresh()
                 prepared = self._context.prepare(
                     arm, (), request.scale, stopped, request.obstacles, held, request.scene_version
@@ -217,14 +216,14 @@ class MotionService:
                     arms, request.scale, stopped, request.obstacles, held, request.scene_version
                 )
                 answer = replace(answer, scene_version=prepared.version)
-                both = BothArms(*arms)
+                both = DualArm(*arms)
                 starts = both.parts(prepared.now.start)
                 find = [self._goals(a, q, t) for a, q, t in zip(arms, starts, request.targets, strict=True)]
                 limit = self.config.planning.time_limit
 
-                def work() -> BothPlan:
+                def work() -> DualArmPlan:
                     now = prepared.complete()
-                    wanted = BothGoals((find[0](now), find[1](now)), request.obstacles, (held[0], held[1]))
+                    wanted = DualArmGoals((find[0](now), find[1](now)), request.obstacles, (held[0], held[1]))
                     return _STRATEGIES[request.strategy](both, now, wanted, limit)
 
                 plan = await self.robot.compute(work)
@@ -359,7 +358,7 @@ class MotionService:
         progress = lambda share: report("executing", share)  # noqa: E731
         return await self.coordination.follow(arm, motion, cancelled, progress, max_delay)
 
-    def _planner(self, arm: Arm, goal: Goal, around: moves.Around) -> Callable[[Situation], Trajectory]:
+    def _planner(self, arm: Arm, goal: Goal, around: moves.RequestBoxes) -> Callable[[StartState], Trajectory]:
         """The plan that a goal asks for; poses are looked up now, the rest is for `RobotInterface.compute`."""
         if isinstance(goal, JointGoal):
             return lambda now: explained(
@@ -379,7 +378,7 @@ class MotionService:
             )
         return lambda now: moves.to_pose_on_line(arm, now, pose, around)
 
-    def _goals(self, arm: Arm, start: Array, target: ArmGoal) -> Callable[[Situation], Array]:
+    def _goals(self, arm: Arm, start: Array, target: ArmGoal) -> Callable[[StartState], Array]:
         """Configurations (k, n) that a goal of a dual-arm motion stands for; as `_planner`."""
         goal = target.goal
         if isinstance(goal, JointGoal):

@@ -11,7 +11,7 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid
-from openarm_motion.planning.approach_request import ApproachRequest, Refused
+from openarm_motion.planning.approach import ApproachRequest, Refused
 from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import Trajectory
 

@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.collision import Clearance, CollisionScene, Surroundings
-from openarm_motion.planning.arm import Arm
+from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
 from openarm_motion.timing.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from openarm_motion.planning.arm import Arm
 
 #: What rounding (or another interpolation between the points) may add to a limit.
 _SLACK = 1.02
@@ -142,7 +145,7 @@ def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float], o
         OpenArmError: IN_COLLISION, with the pair and the time.
     """
     keep = Clearance(arms=_PAIR_CLEARANCE)
-    scene = CollisionScene(arm.robot, Surroundings(state=state, clearance=keep, own=False))
+    scene = CollisionScene(arm.robot, CollisionContext(state=state, clearance=keep, own=False))
     if scene.relax(motion.q[0], arm.config.planning.start_overlap) is not None:
         return  # it is in contact already: any way out is better than none, and the plan has looked at it
     end = max([motion.duration, *(other.duration for other in others)])

@@ -14,7 +14,7 @@ from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses, arms_be
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
-from openarm_motion.collision.seen import SeenMap
+from openarm_motion.collision.occupancy import OccupancyMap
 from openarm_motion.service.requests import ExecuteRequest, MotionAnswer
 from openarm_motion.timing.checks import Motion
 
@@ -154,7 +154,7 @@ def test_plans_in_process_see_the_map_of_the_rendered_images() -> None:
     robot.pass_time(0.1)
     state = robot.motion.scene_state()
     assert state.map_used, state.map_message
-    cells = SeenMap.of(robot.map.latest()).centres
+    cells = OccupancyMap.of(robot.map.latest()).centres
     for item in robot.scene.objects:  # each object is in it, and hardly anything else above the table
         assert np.min(np.linalg.norm(cells - item.centre(robot.scene.table), axis=1)) < 0.06
     assert cells[:, 2].max() < robot.scene.table.top_z + 0.15

@@ -9,7 +9,7 @@ import pytest
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
 from openarm_common.robot.description import RobotDescription
-from openarm_motion.collision.collision import Box, box_from
+from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.arm import Arm
 

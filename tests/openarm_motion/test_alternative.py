@@ -8,12 +8,12 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code
-from openarm_motion.collision.collision import box_from
+from openarm_motion.collision.solids import box_from
 from openarm_motion.planning import moves
 from openarm_motion.planning.alternative import near_joints, near_pose
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.failure import PlanFailedError
-from openarm_motion.planning.moves import Around
+from openarm_motion.planning.moves import RequestBoxes
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
@@ -21,8 +21,8 @@ DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 def test_a_pose_in_a_box_is_refused_with_the_pair_and_the_nearest_pose_above(
     right: Arm, home: dict[str, float]
 ) -> None:
-    now, pose = right.situation(home, scale=1.0), se3.make(DOWN, (0.28, -0.24, 0.50))
-    around = Around([box_from("crate", (0.28, -0.24, 0.45), (0.12, 0.12, 0.10))])
+    now, pose = right.start_state(home, scale=1.0), se3.make(DOWN, (0.28, -0.24, 0.50))
+    around = RequestBoxes([box_from("crate", (0.28, -0.24, 0.45), (0.12, 0.12, 0.10))])
     with pytest.raises(PlanFailedError) as caught:
         moves.to_pose(right, now, pose, around)
     assert (caught.value.code, caught.value.stage) == (Code.IN_COLLISION, "goal")
@@ -37,22 +37,22 @@ def test_a_pose_in_a_box_is_refused_with_the_pair_and_the_nearest_pose_above(
 
 
 def test_a_pose_out_of_reach_has_the_nearest_in_reach(right: Arm, home: dict[str, float]) -> None:
-    now, pose = right.situation(home, scale=1.0), se3.make(DOWN, (0.62, -0.24, 0.62))
+    now, pose = right.start_state(home, scale=1.0), se3.make(DOWN, (0.62, -0.24, 0.62))
     with pytest.raises(PlanFailedError) as caught:
-        moves.to_pose(right, now, pose, Around())
+        moves.to_pose(right, now, pose, RequestBoxes())
     assert (caught.value.code, caught.value.stage) == (Code.UNREACHABLE, "goal")
-    found = near_pose(right, now, Around(), pose)
+    found = near_pose(right, now, RequestBoxes(), pose)
     assert found is not None
     assert 0.0 < found.distance < 0.35
 
 
 def test_joints_in_a_wall_end_before_it(right: Arm, home: dict[str, float]) -> None:
-    now = right.situation(home, scale=1.0)
+    now = right.start_state(home, scale=1.0)
     scene = right.scene(home)
     goal = next(
         s.q for s in right.inverse.solutions(se3.make(DOWN, (0.30, -0.10, 0.62)), 0.05) if not scene.collides(s.q)
     )
-    around = Around([box_from("wall", (0.30, -0.10, 0.62), (0.1, 0.1, 0.1))])
+    around = RequestBoxes([box_from("wall", (0.30, -0.10, 0.62), (0.1, 0.1, 0.1))])
     with pytest.raises(PlanFailedError) as caught:
         moves.to_joints(right, now, goal.tolist(), around)
     assert caught.value.stage == "goal"
@@ -63,9 +63,9 @@ def test_joints_in_a_wall_end_before_it(right: Arm, home: dict[str, float]) -> N
 
 
 def test_a_start_in_collision_names_the_pair(right: Arm, home: dict[str, float]) -> None:
-    now = right.situation(home, scale=1.0)
+    now = right.start_state(home, scale=1.0)
     hand = right.kinematics.fk(now.start)[:3, 3]
-    around = Around([box_from("brick", hand, (0.2, 0.2, 0.2))])
+    around = RequestBoxes([box_from("brick", hand, (0.2, 0.2, 0.2))])
     with pytest.raises(PlanFailedError) as caught:
         moves.to_joints(right, now, now.start.tolist(), around)
     assert (caught.value.stage, caught.value.code) == ("start", Code.IN_COLLISION)
@@ -74,10 +74,10 @@ def test_a_start_in_collision_names_the_pair(right: Arm, home: dict[str, float])
 
 
 def test_a_line_that_hits_something_names_it(right: Arm, home: dict[str, float]) -> None:
-    now = right.situation(home, scale=1.0)
+    now = right.start_state(home, scale=1.0)
     below = right.kinematics.fk(now.start)
     below[2, 3] -= 0.08
-    around = Around([box_from("bar", below[:3, 3] - [0, 0, 0.02], (0.03, 0.03, 0.03))])
+    around = RequestBoxes([box_from("bar", below[:3, 3] - [0, 0, 0.02], (0.03, 0.03, 0.03))])
     with pytest.raises(PlanFailedError) as caught:
         moves.to_pose_on_line(right, now, below, around)
     assert (caught.value.stage, caught.value.code) == ("line", Code.IN_COLLISION)

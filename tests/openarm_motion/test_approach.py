@@ -11,14 +11,15 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.collision import Box, box_from
-from openarm_motion.kinematics.cartesian import Line
+from openarm_motion.collision.solids import Box, box_from
+from openarm_motion.kinematics.line import Line
 from openarm_motion.planning.alternative import explained_approach
 from openarm_motion.planning.approach import ApproachFailedError, ApproachRequest, Target, plan_approach
 from openarm_motion.planning.arm import Arm
-from openarm_motion.planning.planner import OmplPlanner, PlannedPath, PlanQuery
-from openarm_motion.timing.certificate import dense_times
+from openarm_motion.planning.ompl_planner import OmplPlanner
+from openarm_motion.planning.planner import PlannedPath, PlanQuery
 from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.validation import dense_times
 
 TABLE_Z = 0.40
 UP = np.array([0.0, 0.0, 0.12])
@@ -71,7 +72,7 @@ def test_a_grasp_is_approached_and_lifted_on_straight_lines(
         touchable=frozenset({"cube"}),
         attached_after=True,
     )
-    plan = plan_approach(arm, arm.situation(home), request)
+    plan = plan_approach(arm, arm.start_state(home), request)
     target = request.targets[plan.chosen]
     assert target.score == 1.0
     before, after = target.pose.copy(), target.pose.copy()
@@ -94,7 +95,7 @@ def test_a_grasp_is_approached_and_lifted_on_straight_lines(
 def test_every_moment_of_a_plan_is_free_of_what_it_must_not_touch(right: Arm, home: dict[str, float]) -> None:
     obstacles = (cube(0.27, -0.2), box_from("can", (0.27, -0.34, TABLE_Z + 0.055), (0.066, 0.066, 0.11)))
     request = ApproachRequest(targets(0.27, -0.2, 0.05, 0.0), obstacles, (), frozenset({"cube"}), attached_after=True)
-    plan = plan_approach(right, right.situation(home), request)
+    plan = plan_approach(right, right.start_state(home), request)
     opened = right.with_gripper(home, 0.044)
     free = right.scene(opened, obstacles)
     for q in plan.transfer.at(np.linspace(0, plan.transfer.duration, 200))[0]:
@@ -117,8 +118,8 @@ def test_both_lines_carry_a_certificate_and_one_that_fails_it_is_not_handed_out(
         touchable=frozenset({"cube"}),
         attached_after=True,
     )
-    plan = plan_approach(right, right.situation(home), request)
-    for part, look in zip((plan.transfer, plan.approach, plan.retreat), plan.certificates, strict=True):
+    plan = plan_approach(right, right.start_state(home), request)
+    for part, look in zip((plan.transfer, plan.approach, plan.retreat), plan.validations, strict=True):
         held = plan.held_after if part is plan.retreat else ()
         assert look.states == len(dense_times(part, right.scene(home, held=held).levers, look.travel))
         assert look.travel <= 0.004
@@ -137,7 +138,7 @@ def test_both_lines_carry_a_certificate_and_one_that_fails_it_is_not_handed_out(
         return replace(way, q=(1.0 - u) * way.q + u * below)
 
     monkeypatch.setattr(right, "time_line", dipping)
-    again = plan_approach(right, right.situation(home), request)
+    again = plan_approach(right, right.start_state(home), request)
     refused = [one for one in again.refusals if one.stage == "certificate"]
     assert len(refused) == 2
     assert all(one.code == Code.IN_COLLISION and one.contact for one in refused)
@@ -157,7 +158,7 @@ def test_a_place_leaves_the_object_and_draws_back_with_open_fingers(right: Arm, 
         )
         for t in targets(0.24, -0.30, 0.05, 0.0)[:4]
     )
-    plan = plan_approach(right, right.situation(state), ApproachRequest(place, (), (held,), detached_after=True))
+    plan = plan_approach(right, right.start_state(state), ApproachRequest(place, (), (held,), detached_after=True))
     assert plan.held_after == ()
     standing = Box("cube", place[plan.chosen].pose, held.size)
     near = right.scene(right.with_gripper(home, 0.044), [standing], touchable=frozenset({"cube"}), straight=True)
@@ -173,12 +174,12 @@ def test_the_higher_score_is_chosen_where_it_can_be_reached(right: Arm, home: di
     steep = grasp("steep", 0.26, -0.22, 0.05, 0.0, np.radians(30.0), score=0.9)
     upright = grasp("upright", 0.26, -0.22, 0.05, 0.0, 0.0, score=0.2)
     for order in ((steep, upright), (upright, steep)):
-        plan = plan_approach(right, right.situation(home), ApproachRequest(order))
+        plan = plan_approach(right, right.start_state(home), ApproachRequest(order))
         assert order[plan.chosen].id == "steep"
     wall = box_from("wall", (0.26, -0.05, TABLE_Z + 0.1), (0.3, 0.02, 0.2))
     leaning = grasp("leaning", 0.26, -0.12, 0.05, 0.0, np.radians(-45.0), score=0.9)
     straight = grasp("straight", 0.26, -0.20, 0.05, np.pi / 2, 0.0, score=0.1)
-    plan = plan_approach(right, right.situation(home), ApproachRequest((leaning, straight), (wall,)))
+    plan = plan_approach(right, right.start_state(home), ApproachRequest((leaning, straight), (wall,)))
     if plan.chosen == 1:
         assert plan.refusals[0].id == "leaning"
 
@@ -186,7 +187,7 @@ def test_the_higher_score_is_chosen_where_it_can_be_reached(right: Arm, home: di
 def test_limit_margins_are_those_of_both_lines(right: Arm, home: dict[str, float]) -> None:
     ways = (grasp("far", 0.60, -0.22, 0.05, 0.0, score=0.9), grasp("near", 0.26, -0.22, 0.05, 0.0, score=0.5))
     worse = grasp("worse", 0.26, -0.22, 0.05, 1.0, score=0.1)
-    plan = plan_approach(right, right.situation(home), ApproachRequest((*ways, worse)))
+    plan = plan_approach(right, right.start_state(home), ApproachRequest((*ways, worse)))
     assert plan.chosen == 1
     refused, chosen, not_needed = plan.limit_margins
     assert np.isnan(refused)
@@ -200,7 +201,7 @@ def test_refusals_say_why(right: Arm, home: dict[str, float]) -> None:
     buried = grasp("buried", 0.26, -0.22, 0.05, 0.0)
     buried.pose[2, 3] = TABLE_Z - 0.03
     with pytest.raises(ApproachFailedError) as caught:
-        plan_approach(right, right.situation(home), ApproachRequest((far, buried)))
+        plan_approach(right, right.start_state(home), ApproachRequest((far, buried)))
     by_id = {refusal.id: refusal for refusal in caught.value.refusals}
     assert by_id["far"].code == Code.UNREACHABLE
     assert "mm short" in by_id["far"].message
@@ -218,7 +219,7 @@ def test_refusals_say_why(right: Arm, home: dict[str, float]) -> None:
 def test_a_failed_approach_names_stage_pair_and_the_nearest_place_that_can_be_reached(
     right: Arm, home: dict[str, float]
 ) -> None:
-    now = right.situation(home)
+    now = right.start_state(home)
     lid = box_from("lid", (0.26, -0.22, TABLE_Z + 0.07), (0.16, 0.16, 0.02))
     request = ApproachRequest((grasp("under", 0.26, -0.22, 0.05, 0.0),), (lid,))
     with pytest.raises(ApproachFailedError) as caught:
@@ -246,7 +247,7 @@ def test_an_object_in_the_way_refuses_only_the_targets_that_it_blocks(right: Arm
     along = grasp("along", 0.27, -0.22, 0.06, np.pi / 2)  # opens along y
     neighbour = box_from("neighbour", (0.355, -0.22, TABLE_Z + 0.04), (0.05, 0.05, 0.08))
     request = ApproachRequest((across, along), (cube(0.27, -0.22, 0.06), neighbour), (), frozenset({"cube"}))
-    plan = plan_approach(right, right.situation(home), request)
+    plan = plan_approach(right, right.start_state(home), request)
     assert request.targets[plan.chosen].id == "along"
     assert plan.refusals[0].id == "across"
     assert "neighbour" in plan.refusals[0].message
@@ -255,12 +256,12 @@ def test_an_object_in_the_way_refuses_only_the_targets_that_it_blocks(right: Arm
 def test_other_arm_in_the_way_is_an_obstacle_a68(arms: dict[str, Arm], home: dict[str, float]) -> None:
     left, right = arms["left"], arms["right"]
     # the left hand stands where the right one could grasp
-    taken = plan_approach(left, left.situation(home), ApproachRequest(targets(0.25, 0.0, 0.05, 0.0))).approach.q[-1]
+    taken = plan_approach(left, left.start_state(home), ApproachRequest(targets(0.25, 0.0, 0.05, 0.0))).approach.q[-1]
     there = {**home, **dict(zip(left.names, taken.tolist(), strict=True))}
     request = ApproachRequest(targets(0.25, -0.01, 0.05, 0.0))
-    plan_approach(right, right.situation(home), request)
+    plan_approach(right, right.start_state(home), request)
     with pytest.raises(ApproachFailedError) as caught:
-        plan_approach(right, right.situation(there), request)
+        plan_approach(right, right.start_state(there), request)
     assert caught.value.code == Code.IN_COLLISION
     assert "openarm_left_" in caught.value.message
 
@@ -275,7 +276,7 @@ def test_24_targets_are_planned_quickly(right: Arm, home: dict[str, float]) -> N
         )
         assert len(request.targets) == 24
         begin = time.thread_time()
-        plan_approach(right, right.situation(home), request)
+        plan_approach(right, right.start_state(home), request)
         took.append(time.thread_time() - begin)
     assert np.median(took) < 0.3
 
@@ -297,7 +298,7 @@ def test_where_the_best_targets_have_no_path_the_next_are_planned(right: Arm, ho
     arm = Arm("right", right.description, right.config, right.static, planner)
     best = grasp("best", 0.26, -0.22, 0.05, 0.0, score=1.0)
     next_best = grasp("next", 0.26, -0.22, 0.05, 0.0, np.radians(15.0), score=0.5)
-    plan = plan_approach(arm, arm.situation(home), ApproachRequest((next_best, best)))
+    plan = plan_approach(arm, arm.start_state(home), ApproachRequest((next_best, best)))
     assert plan.chosen == 0
     assert [(r.id, r.code) for r in plan.refusals] == [("best", Code.NO_PLAN)]
     assert planner.limits[0] < 0.6 * arm.config.planning.time_limit  # time is left for the others
@@ -306,16 +307,16 @@ def test_where_the_best_targets_have_no_path_the_next_are_planned(right: Arm, ho
 def test_progress_is_reported_and_a_plan_can_be_cancelled(right: Arm, home: dict[str, float]) -> None:
     reports: list[tuple[str, int]] = []
     request = ApproachRequest(targets(0.26, -0.22, 0.05, 0.0))
-    plan_approach(right, right.situation(home), request, lambda stage, tried: reports.append((stage, tried)))
+    plan_approach(right, right.start_state(home), request, lambda stage, tried: reports.append((stage, tried)))
     assert reports[0] == ("checking", 1)
     assert reports[-1][0] == "planning"
     with pytest.raises(OpenArmError) as caught:
-        plan_approach(right, right.situation(home, stopped=lambda: True), request)
+        plan_approach(right, right.start_state(home, stopped=lambda: True), request)
     assert caught.value.code == Code.CANCELLED
 
 
 def test_bad_requests_are_refused(right: Arm, home: dict[str, float]) -> None:
-    now = right.situation(home)
+    now = right.start_state(home)
     good = grasp("g", 0.26, -0.22, 0.05, 0.0)
     with pytest.raises(OpenArmError, match="no targets"):
         plan_approach(right, now, ApproachRequest(()))

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openarm_motion.collision.collision import box_from
-from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.collision.solids import box_from
+from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.planner import PlannedPath
 from openarm_motion.timing import blending
 from openarm_motion.timing.blending import time_blended, time_quintic
-from openarm_motion.timing.certificate import certify
 from openarm_motion.timing.trajectory import JointLimits, Trajectory, time_polyline
+from openarm_motion.timing.validation import validate_trajectory
 
 NAMES = tuple(f"j{i}" for i in range(3))
 LIMITS = JointLimits(np.array([2.0, 2.0, 3.0]), np.array([6.0, 8.0, 12.0]), np.array([60.0, 80.0, 120.0]))
@@ -91,14 +91,14 @@ def test_corners_of_plans_are_rounded_only_where_the_exact_layer_agrees(right: A
     states = [q for q in states if not scene.collides(q)][:24]
     corners = gained = 0
     for start, goal in itertools.pairwise(states):
-        plan = right.plan_certified(scene, Situation(home, start), goal[None], 5.0)
+        plan = right.plan_validated(scene, StartState(home, start), goal[None], 5.0)
         if len(plan.path.waypoints) == 2:
             continue
         corners += 1
         stops = time_polyline(right.names, plan.path.waypoints, right.limits(0.0))
         gained += plan.trajectory.duration < 0.97 * stops.duration
         assert plan.trajectory.duration <= stops.duration + 1e-6
-        certify(scene, plan.trajectory, travel=0.003)
+        validate_trajectory(scene, plan.trajectory, travel=0.003)
     assert corners >= 3
     assert gained >= 2
 
@@ -118,6 +118,6 @@ def test_a_rounded_corner_that_touches_is_done_with_a_stop(
     astray = time_polyline(right.names, np.stack([start, into]), right.limits(0.0))
     monkeypatch.setattr(blending, "time_blended", lambda *_: astray)
     monkeypatch.setattr(right, "plan", lambda *_: path)
-    plan = right.plan_certified(scene, Situation(home, start), start[None], 5.0)
+    plan = right.plan_validated(scene, StartState(home, start), start[None], 5.0)
     np.testing.assert_allclose(plan.trajectory.q[-1], start)
     assert not np.any(np.max(np.abs(plan.trajectory.q - start), axis=1) > 0.06)

@@ -11,10 +11,10 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_motion.collision.collision import box_from
-from openarm_motion.kinematics.cartesian import line_contact, line_poses, solve_line
+from openarm_motion.collision.solids import box_from
+from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
-from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.kinematics.line import line_contact, line_poses, solve_line
 from openarm_motion.planning.arm import Arm
 
 

@@ -8,11 +8,11 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.collision import Box
+from openarm_motion.collision.solids import Box
 from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm
-from openarm_motion.planning.moves import Around
-from openarm_motion.scene.memory import HeldMemory
+from openarm_motion.planning.moves import RequestBoxes
+from openarm_motion.scene.held import HeldObjects
 from openarm_motion.timing.checks import Motion, check_against_others, check_trajectory
 from openarm_motion.timing.trajectory import Trajectory
 
@@ -20,7 +20,7 @@ from openarm_motion.timing.trajectory import Trajectory
 @pytest.fixture
 def plan(right: Arm, home: dict[str, float]) -> Trajectory:
     goal = [home[name] + 0.1 for name in right.names]
-    return moves.to_joints(right, right.situation(home), goal, Around())
+    return moves.to_joints(right, right.start_state(home), goal, RequestBoxes())
 
 
 def fault(arm: Arm, state: dict[str, float], plan: Trajectory, code: Code, **change) -> str:
@@ -75,7 +75,7 @@ def test_joints_numbers_and_limits_are_refused_by_name(right: Arm, home: dict[st
 def test_a_motion_into_the_other_arm_is_refused(arms: dict[str, Arm], home: dict[str, float]) -> None:
     left, right = arms["left"], arms["right"]
     pose = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.26, 0.0, 0.60))
-    plans = {a.name: moves.to_pose(a, a.situation(home), pose, Around()) for a in (left, right)}
+    plans = {a.name: moves.to_pose(a, a.start_state(home), pose, RequestBoxes()) for a in (left, right)}
     motions = {n: Motion(p.names, p.t, p.q) for n, p in plans.items()}
     check_against_others(right, motions["right"], home, [])
     # the left arm stands at the place, or is on its way to it
@@ -92,7 +92,7 @@ def test_a_motion_into_the_other_arm_is_refused(arms: dict[str, Arm], home: dict
 
 
 def test_what_is_held_follows_the_plan(plan: Trajectory) -> None:
-    memory = HeldMemory()
+    memory = HeldObjects()
     box = Box("cube", np.eye(4), np.array([0.05, 0.05, 0.05]))
     memory.expect("right", [plan], [box])
     motion = Motion(plan.names, plan.t, plan.q)

@@ -11,10 +11,10 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription, mirror
-from openarm_motion.collision.collision import Box, Clearance, CollisionScene, Surroundings, box_from
-from openarm_motion.collision.collision_robot import CollisionRobot
-from openarm_motion.kinematics.arm_links import ArmLinks
-from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
+from openarm_motion.collision.robot import CollisionRobot
+from openarm_motion.collision.solids import Box, box_from
+from openarm_motion.kinematics.chain import ArmKinematics, ArmLinks
 from openarm_motion.planning.arm import Arm
 
 BARE = Clearance(own=0.0, world=0.0, arms=0.0, hand=0.0, touch=0.0, rest=0.0)
@@ -107,7 +107,7 @@ def test_shapes_in_a_block_collide_by_an_independent_count(right: Arm, home: dic
     # corners of the collision shapes, moved by the description's own kinematics, inside a block
     low, high = np.array([0.11, -0.6, 0.10]), np.array([0.81, 0.6, 0.60])
     block = box_from("block", 0.5 * (low + high), high - low)
-    scene = CollisionScene(right.robot, Surroundings(home, [block], clearance=BARE, own=False))
+    scene = CollisionScene(right.robot, CollisionContext(home, [block], clearance=BARE, own=False))
     corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
     arm, description = right.kinematics, right.description
     rng = np.random.default_rng(12)
@@ -272,11 +272,11 @@ def test_bad_boxes_are_refused(right: Arm, home: dict[str, float]) -> None:
 @pytest.mark.requirement("B-07")
 def test_another_robot_without_srdf_is_checked(six: RobotDescription) -> None:
     robot = CollisionRobot(six, ArmKinematics(six, "tool"))
-    scene = CollisionScene(robot, Surroundings({}))
+    scene = CollisionScene(robot, CollisionContext({}))
     assert scene.contacts(np.zeros(6)) == []
     folded = np.array([0, 1.8, 2.3, 0, 0, 0.0])
     assert scene.contacts(folded)
-    wall = CollisionScene(robot, Surroundings({}, [box_from("wall", (0, 0, 1.15), (0.3, 0.3, 0.1))]))
+    wall = CollisionScene(robot, CollisionContext({}, [box_from("wall", (0, 0, 1.15), (0.3, 0.3, 0.1))]))
     assert wall.contacts(np.zeros(6))[0].second == "wall"
 
 

@@ -13,12 +13,13 @@ from openarm_common import se3
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision import shape_kernels as kernels
-from openarm_motion.collision.collision import Box, CollisionScene, Surroundings, box_from
-from openarm_motion.collision.collision_robot import CollisionRobot
+from openarm_motion.collision.exact import CollisionContext, CollisionScene
 from openarm_motion.collision.fast import DistanceMap, FastScene, cover
-from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.collision.robot import CollisionRobot
+from openarm_motion.collision.solids import Box, box_from
+from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.planning.arm import Arm
-from openarm_motion.planning.both import BothArms
+from openarm_motion.planning.dual_arm import DualArm
 
 
 def turned_boxes(rng: np.random.Generator, count: int) -> list[Box]:
@@ -68,7 +69,7 @@ def test_never_free_where_the_exact_layer_says_collision_1e5(arms: dict[str, Arm
 
 @pytest.mark.requirement("A-74")
 def test_both_arms_never_free_where_they_meet(arms: dict[str, Arm], home: dict[str, float]) -> None:
-    both = BothArms(arms["left"], arms["right"])
+    both = DualArm(arms["left"], arms["right"])
     rng = np.random.default_rng(74)
     exact = both.scene(home, turned_boxes(rng, 3))
     fast = FastScene([exact.first, exact.second])
@@ -166,7 +167,7 @@ def test_spheres_cover_their_shape(kind: int) -> None:
 def test_another_robot_goes_through_the_same_code(six: RobotDescription) -> None:
     robot = CollisionRobot(six, ArmKinematics(six, "tool"))
     rng = np.random.default_rng(13)
-    exact = CollisionScene(robot, Surroundings({}, turned_boxes(rng, 4)))
+    exact = CollisionScene(robot, CollisionContext({}, turned_boxes(rng, 4)))
     states = rng.uniform(robot.kinematics.lower, robot.kinematics.upper, (2000, 6))
     free = FastScene([exact]).free_many(states)
     truth = np.array([not exact.collides(q) for q in states])
@@ -176,7 +177,7 @@ def test_another_robot_goes_through_the_same_code(six: RobotDescription) -> None
 
 def test_what_a_line_leaves_out_is_free_in_all_its_states(arms: dict[str, Arm], home: dict[str, float]) -> None:
     """Both arms among turned boxes: the look at a line agrees with one look after the other, by the exact layer."""
-    both = BothArms(arms["left"], arms["right"])
+    both = DualArm(arms["left"], arms["right"])
     rng = np.random.default_rng(21)
     exact = both.scene(home, turned_boxes(rng, 2))
     fast = FastScene([exact.first, exact.second])

@@ -12,16 +12,17 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.collision import Box, box_from
+from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.planning import search_kernels as kernels
-from openarm_motion.planning.arm import Arm, Situation, segment_time
-from openarm_motion.planning.both import BothArms
-from openarm_motion.planning.fast_planner import FastPlanner
-from openarm_motion.planning.planner import OmplPlanner, PlanQuery
+from openarm_motion.planning.arm import Arm, StartState, segment_time
+from openarm_motion.planning.dual_arm import DualArm
+from openarm_motion.planning.ompl_planner import OmplPlanner
+from openarm_motion.planning.planner import PlanQuery
+from openarm_motion.planning.rrt import FastPlanner
 
 
 def ask(arm: Arm, home: dict[str, float], start: np.ndarray, goals: np.ndarray, boxes: Sequence[Box] = ()) -> PlanQuery:
-    return arm.query(arm.scene(home, boxes), Situation(home, start), np.atleast_2d(goals), 5.0)
+    return arm.query(arm.scene(home, boxes), StartState(home, start), np.atleast_2d(goals), 5.0)
 
 
 #: Posts and boards in the way of both arms.
@@ -100,7 +101,7 @@ def test_a_goal_in_a_closed_box_is_no_plan_and_a_stop_is_heard(right: Arm, home:
 
 @pytest.mark.requirement("N-12")
 def test_both_arms_keep_apart_on_the_whole_path(arms: dict[str, Arm], home: dict[str, float]) -> None:
-    both = BothArms(arms["left"], arms["right"])
+    both = DualArm(arms["left"], arms["right"])
     rng = np.random.default_rng(12)
     scene, judge = both.scene(home), both.scene(home, separation=0.020)
     states = [q for q in rng.uniform(both.lower, both.upper, (600, 14)) if not scene.collides(q)][:10]

@@ -9,7 +9,7 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.kinematics.chain import ArmKinematics
 
 SIDES = ("left", "right")
 

@@ -9,14 +9,14 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_motion.collision.collision import Box
+from openarm_motion.collision.solids import Box
 from openarm_motion.config import LimitsConfig, MotionConfig
 from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm
-from openarm_motion.planning.moves import Around
+from openarm_motion.planning.moves import RequestBoxes
 from openarm_motion.timing.trajectory import Trajectory
 
-NOTHING = Around()
+NOTHING = RequestBoxes()
 T_base_table = se3.make(None, (0.0, 0.0, 0.40))
 
 
@@ -39,7 +39,7 @@ def test_the_sample_target_is_solved_with_free_orientation_and_refused_with_a_ve
     arms: dict[str, Arm], home: dict[str, float]
 ) -> None:
     arm = arms["left"]
-    now = arm.situation(home)
+    now = arm.start_state(home)
     pose = T_base_table @ se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.4, 0.2, 0.3))
     trajectory = moves.to_pose(arm, now, pose, NOTHING, free_orientation=True)
     np.testing.assert_allclose(arm.kinematics.fk(trajectory.q[-1])[:3, 3], pose[:3, 3], atol=1e-4)
@@ -54,16 +54,16 @@ def test_the_sample_target_is_solved_with_free_orientation_and_refused_with_a_ve
 def test_from_hanging_zero_to_home_by_name(arms: dict[str, Arm], home: dict[str, float], side: str) -> None:
     arm = arms[side]
     state = dict.fromkeys(home, 0.0)
-    trajectory = moves.to_named(arm, arm.situation(state), "home", NOTHING)
+    trajectory = moves.to_named(arm, arm.start_state(state), "home", NOTHING)
     np.testing.assert_allclose(trajectory.q[-1], [home[name] for name in arm.names], atol=1e-9)
     assert trajectory.names == arm.names
     assert_free(arm, state, trajectory)
-    assert "states:" in refused(Code.INVALID_ARGUMENT, moves.to_named, arm, arm.situation(state), "yoga", NOTHING)
+    assert "states:" in refused(Code.INVALID_ARGUMENT, moves.to_named, arm, arm.start_state(state), "yoga", NOTHING)
 
 
 def test_to_a_pose_in_the_nearest_configuration(right: Arm, home: dict[str, float]) -> None:
     pose = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.28, -0.22, 0.55))
-    now = right.situation(home, scale=1.0)
+    now = right.start_state(home, scale=1.0)
     trajectory = moves.to_pose(right, now, pose, NOTHING)
     np.testing.assert_allclose(right.kinematics.fk(trajectory.q[-1]), pose, atol=1e-9)
     assert_free(right, home, trajectory)
@@ -72,7 +72,7 @@ def test_to_a_pose_in_the_nearest_configuration(right: Arm, home: dict[str, floa
 
 
 def test_straight_down_from_home_and_back(right: Arm, home: dict[str, float]) -> None:
-    now = right.situation(home)
+    now = right.start_state(home)
     T = right.kinematics.fk(now.start)
     goal = T.copy()
     goal[2, 3] -= 0.12
@@ -85,23 +85,23 @@ def test_straight_down_from_home_and_back(right: Arm, home: dict[str, float]) ->
     assert message.startswith("right arm: the straight line of 600 mm ends after")
     post = Box("post", T @ se3.make(None, (0.0, 0.0, 0.06)), np.array([0.03, 0.03, 0.03]))
     forward = T @ se3.make(None, (0.0, 0.0, 0.08))
-    message = refused(Code.IN_COLLISION, moves.to_pose_on_line, right, now, forward, Around([post]))
+    message = refused(Code.IN_COLLISION, moves.to_pose_on_line, right, now, forward, RequestBoxes([post]))
     assert "post" in message
 
 
 @pytest.mark.requirement("B-47")
 def test_a_line_may_pass_by_an_object_nearer_than_a_free_path(right: Arm, home: dict[str, float]) -> None:
     state = right.with_gripper(home, 0.044)
-    now = right.situation(state)
+    now = right.start_state(state)
     T = right.kinematics.fk(now.start)
     # a post between the open fingers, 6 mm from the left one
     post = Box("post", T @ se3.make(None, (0.0, 0.033, 0.02)), np.array([0.01, 0.01, 0.06]))
     back = T @ se3.make(None, (0.0, 0.0, -0.05))
-    assert moves.to_pose_on_line(right, now, back, Around([post])).duration > 0.0
+    assert moves.to_pose_on_line(right, now, back, RequestBoxes([post])).duration > 0.0
 
 
 def test_goals_that_collide_or_break_limits_are_refused_by_name(right: Arm, home: dict[str, float]) -> None:
-    now = right.situation(home)
+    now = right.start_state(home)
     low = next(s.q for s in right.inverse.solutions(se3.make(np.diag([1.0, -1.0, -1.0]), (0.25, -0.25, 0.39)), 0.0))
     message = refused(Code.IN_COLLISION, moves.to_joints, right, now, low.tolist(), NOTHING)
     assert message.startswith("goal of the right arm: openarm_right_")
@@ -119,27 +119,27 @@ def test_goals_that_collide_or_break_limits_are_refused_by_name(right: Arm, home
 
 
 def test_a_start_that_is_stuck_is_refused(right: Arm, home: dict[str, float]) -> None:
-    now = right.situation(home)
+    now = right.start_state(home)
     block = Box("block", right.kinematics.fk(now.start), np.array([0.1, 0.1, 0.1]))
-    message = refused(Code.IN_COLLISION, moves.to_named, right, now, "home", Around([block]))
+    message = refused(Code.IN_COLLISION, moves.to_named, right, now, "home", RequestBoxes([block]))
     assert "starts in collision" in message
     assert "block" in message
 
 
-def test_situations_are_checked(right: Arm, home: dict[str, float]) -> None:
-    message = refused(Code.NOT_READY, right.situation, {})
+def test_start_states_are_checked(right: Arm, home: dict[str, float]) -> None:
+    message = refused(Code.NOT_READY, right.start_state, {})
     assert "lacks openarm_right_joint1" in message
-    assert right.situation({}, [0.0] * 7).start.tolist() == [0.0] * 7
-    message = refused(Code.INVALID_ARGUMENT, right.situation, home, (), 2.0)
+    assert right.start_state({}, [0.0] * 7).start.tolist() == [0.0] * 7
+    message = refused(Code.INVALID_ARGUMENT, right.start_state, home, (), 2.0)
     assert "velocity_scale is 2.0" in message
-    refused(Code.LIMITS, right.situation, home, [0, 0, 0, -0.2, 0, 0, 0])
+    refused(Code.LIMITS, right.start_state, home, [0, 0, 0, -0.2, 0, 0, 0])
     # a joint that sags a little below its limit is a reading, not a fault
-    assert right.situation(home, [0, 0, 0, -0.01, 0, 0, 0]).start[3] == 0.0
+    assert right.start_state(home, [0, 0, 0, -0.01, 0, 0, 0]).start[3] == 0.0
 
 
 def test_velocity_scale_stretches_time(right: Arm, home: dict[str, float]) -> None:
     goal = [home[name] + 0.2 for name in right.names]
-    fast, slow = (moves.to_joints(right, right.situation(home, scale=s), goal, NOTHING).duration for s in (1.0, 0.25))
+    fast, slow = (moves.to_joints(right, right.start_state(home, scale=s), goal, NOTHING).duration for s in (1.0, 0.25))
     assert slow > 1.5 * fast
 
 
@@ -148,7 +148,7 @@ def test_another_arm_is_a_matter_of_configuration(six: RobotDescription) -> None
     limits = LimitsConfig(velocity=(1.0,) * 6, acceleration=(3.0,) * 6, jerk=(30.0,) * 6)
     config = MotionConfig(arms=("main",), tool_link="tool", group="{arm}", limits=limits, scene="")
     arm = Arm("main", six, config)
-    now = arm.situation(dict.fromkeys(arm.names, 0.1))
+    now = arm.start_state(dict.fromkeys(arm.names, 0.1))
     pose = arm.kinematics.fk(np.array([0.5, 0.6, 1.0, 0.2, 0.5, 0.1]))
     trajectory = moves.to_pose(arm, now, pose, NOTHING)
     np.testing.assert_allclose(arm.kinematics.fk(trajectory.q[-1]), pose, atol=1e-3)

@@ -11,13 +11,13 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.collision import box_from
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.mesh_boxes import boxes_about, load_robot
+from openarm_motion.collision.solids import box_from
 from openarm_motion.config import LimitsConfig, MotionConfig
-from openarm_motion.planning.arm import Arm, Situation
-from openarm_motion.planning.moves import Around, to_pose, to_pose_on_line
-from openarm_motion.timing.certificate import certify
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.moves import RequestBoxes, to_pose, to_pose_on_line
+from openarm_motion.timing.validation import validate_trajectory
 
 DATA = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix" / "share" / "example-robot-data"
 
@@ -87,10 +87,10 @@ def test_a_pose_is_planned_around_a_post_within_the_limits(robot: tuple[Arm, np.
     turned = se3.make(se3.rot_z(1.2), (0.0, 0.0, 0.0)) @ here
     p = 0.5 * (here[:3, 3] + turned[:3, 3])
     post = box_from("post", (p[0], p[1], 0.5 * p[2] + 0.05), (0.06, 0.06, p[2] + 0.1))
-    now = Situation(names, start, 0.8)
-    trajectory = to_pose(arm, now, turned, Around([post]))
+    now = StartState(names, start, 0.8)
+    trajectory = to_pose(arm, now, turned, RequestBoxes([post]))
     np.testing.assert_allclose(arm.kinematics.fk(trajectory.q[-1]), turned, atol=1e-3)
-    certify(arm.scene(names, [post]), trajectory)
+    validate_trajectory(arm.scene(names, [post]), trajectory)
     limits = arm.limits(0.8)
     _, v, a = trajectory.at(np.linspace(0.0, trajectory.duration, 2000))
     assert np.all(np.abs(v) <= limits.velocity * 1.001)
@@ -100,11 +100,11 @@ def test_a_pose_is_planned_around_a_post_within_the_limits(robot: tuple[Arm, np.
 @pytest.mark.requirement("B-07")
 def test_a_straight_line_stays_on_it(robot: tuple[Arm, np.ndarray]) -> None:
     arm, start = robot
-    now = Situation(dict(zip(arm.names, start.tolist(), strict=True)), start)
+    now = StartState(dict(zip(arm.names, start.tolist(), strict=True)), start)
     here = arm.kinematics.fk(start)
     there = here.copy()
     there[:3, 3] += (0.02, 0.03, 0.08)
-    trajectory = to_pose_on_line(arm, now, there, Around())
+    trajectory = to_pose_on_line(arm, now, there, RequestBoxes())
     p = arm.kinematics.fk_many(trajectory.at(np.linspace(0.0, trajectory.duration, 300))[0])[:, :3, 3]
     along = (there - here)[:3, 3] / np.linalg.norm((there - here)[:3, 3])
     off = (p - here[:3, 3]) - np.outer((p - here[:3, 3]) @ along, along)

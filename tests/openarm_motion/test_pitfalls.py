@@ -12,11 +12,12 @@ import pytest
 import openarm_motion
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.collision import CollisionScene as Scene
-from openarm_motion.collision.collision import Surroundings, box_from
+from openarm_motion.collision.exact import CollisionContext
+from openarm_motion.collision.exact import CollisionScene as Scene
+from openarm_motion.collision.solids import box_from
 from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm
-from openarm_motion.planning.moves import Around
+from openarm_motion.planning.moves import RequestBoxes
 from openarm_motion.timing.trajectory import Trajectory
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
@@ -24,7 +25,7 @@ DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
 def overlaps(arm: Arm, state: dict[str, float], plan: Trajectory, boxes=()) -> list[str]:
     """What the arm really touches on the way: looks 2 ms apart, no clearance."""
-    scene = Scene(arm.robot, Surroundings(state, [*arm.static, *boxes]))
+    scene = Scene(arm.robot, CollisionContext(state, [*arm.static, *boxes]))
     with scene.lenient(0.0):
         states = plan.at(np.arange(0.0, plan.duration + 0.002, 0.002))[0]
         return [str(scene.contacts(q)[0]) for q in states if scene.collides(q)]
@@ -46,7 +47,7 @@ def test_no_path_leads_through_the_chest(arms: dict[str, Arm], home: dict[str, f
             if hit is None or scene.contacts(hit)[0].second in own | {"table"}:
                 continue
             found += 1
-            plan = moves.to_joints(arm, arm.situation(home, a.tolist(), 1.0), b.tolist(), Around())
+            plan = moves.to_joints(arm, arm.start_state(home, a.tolist(), 1.0), b.tolist(), RequestBoxes())
             assert overlaps(arm, home, plan) == []
 
 
@@ -57,8 +58,8 @@ def test_a_plan_does_not_tunnel_through_a_thin_wall(thickness: float, right: Arm
     poses = [se3.make(DOWN, (0.32, y, 0.62)) for y in (-0.34, -0.08)]
     a, b = (next(s.q for s in right.inverse.solutions(p, 0.05) if not walled.collides(s.q)) for p in poses)
     assert walled.first_hit(a, b) is not None
-    now = right.situation(home, a.tolist(), 1.0)
-    plan = moves.to_joints(right, now, b.tolist(), Around([wall]))
+    now = right.start_state(home, a.tolist(), 1.0)
+    plan = moves.to_joints(right, now, b.tolist(), RequestBoxes([wall]))
     assert overlaps(right, home, plan, [wall]) == []
 
 
@@ -71,7 +72,7 @@ def test_a_start_outside_a_limit_by_rounding_is_no_error(beyond: float, right: A
         if right.scene(home).collides(q):
             q = start.copy()
             q[i] = right.kinematics.upper[i] + beyond
-        plan = moves.to_joints(right, right.situation(home, q.tolist(), 1.0), start.tolist(), Around())
+        plan = moves.to_joints(right, right.start_state(home, q.tolist(), 1.0), start.tolist(), RequestBoxes())
         np.testing.assert_allclose(plan.q[-1], start, atol=1e-9)
         assert np.all(plan.q >= right.kinematics.lower - 1e-9)
         assert np.all(plan.q <= right.kinematics.upper + 1e-9)
@@ -81,7 +82,7 @@ def test_a_start_far_outside_a_limit_is_named(right: Arm, home: dict[str, float]
     q = [home[name] for name in right.names]
     q[3] = float(right.kinematics.upper[3]) + 0.2
     with pytest.raises(OpenArmError, match="start: openarm_right_joint4") as caught:
-        right.situation(home, q)
+        right.start_state(home, q)
     assert caught.value.code == Code.LIMITS
 
 

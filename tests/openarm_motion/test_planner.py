@@ -11,9 +11,11 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.collision import Box, Clearance, CollisionScene, Surroundings
+from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
+from openarm_motion.collision.solids import Box
 from openarm_motion.planning.arm import Arm, segment_time
-from openarm_motion.planning.planner import OmplPlanner, PlannedPath, PlanQuery, shorten
+from openarm_motion.planning.ompl_planner import OmplPlanner, shorten
+from openarm_motion.planning.planner import PlannedPath, PlanQuery
 
 
 def query(arm: Arm, scene: CollisionScene, start: np.ndarray, goals: np.ndarray, **kwargs: object) -> PlanQuery:
@@ -33,7 +35,7 @@ def query(arm: Arm, scene: CollisionScene, start: np.ndarray, goals: np.ndarray,
 def assert_free(arm: Arm, state: dict[str, float], path: PlannedPath) -> None:
     """Nothing touches anywhere on the path, looked at more finely than the planner did; the table counts."""
     touch = Clearance(own=0.0, world=0.0, arms=0.0, hand=0.0, touch=0.0, rest=0.0)
-    scene = CollisionScene(arm.robot, Surroundings(state, arm.static, clearance=touch))
+    scene = CollisionScene(arm.robot, CollisionContext(state, arm.static, clearance=touch))
     for a, b in itertools.pairwise(path.waypoints):
         assert scene.edge_free(a, b, 0.01, 0.004)
 
@@ -210,7 +212,7 @@ def test_the_reason_for_no_plan_names_what_blocks_the_direct_way(right: Arm, hom
 
     arm = Arm("right", right.description, right.config, right.static, NeverPlanner())
     with pytest.raises(OpenArmError, match=r"on the direct way .* post"):
-        arm.plan(arm.scene(home, [post]), arm.situation(home), goal[None], 0.1)
+        arm.plan(arm.scene(home, [post]), arm.start_state(home), goal[None], 0.1)
 
 
 def test_shortening_makes_a_detour_direct() -> None:

@@ -11,13 +11,13 @@ import pytest
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
-from openarm_motion.collision.collision import Box, box_from
+from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.config import MotionConfig, PlanningConfig
-from openarm_motion.planning.arm import Arm, Situation
-from openarm_motion.planning.fast_planner import FastPlanner
-from openarm_motion.planning.moves import Around, to_joints
-from openarm_motion.planning.planner import OmplPlanner, PlannedPath, PlanQuery
-from openarm_motion.planning.planners import make_planner
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.moves import RequestBoxes, to_joints
+from openarm_motion.planning.ompl_planner import OmplPlanner
+from openarm_motion.planning.planner import PlannedPath, PlanQuery, make_planner
+from openarm_motion.planning.rrt import FastPlanner
 
 
 class Foreign:
@@ -60,7 +60,7 @@ def test_another_planner_gets_the_same_calls_and_its_path_is_timed(
     arm = arm_with(f"{elsewhere}:Foreign", description, table)
     start = np.array([home[name] for name in arm.names])
     goal = start + np.array([0.0, 0.0, 0.3, 0.0, 0.2, 0.0, 0.1])
-    trajectory = to_joints(arm, Situation(home, start), goal.tolist(), Around())
+    trajectory = to_joints(arm, StartState(home, start), goal.tolist(), RequestBoxes())
     np.testing.assert_allclose(trajectory.q[-1], goal, atol=1e-9)
     (query,) = Foreign.asked
     assert query.time_limit == pytest.approx(5.0, abs=0.5)
@@ -78,7 +78,7 @@ def test_a_path_of_another_planner_that_is_not_free_is_refused(
     middle = arm.kinematics.fk(0.5 * (start + goal))[:3, 3]
     wall = box_from("wall", middle, (0.04, 0.04, 0.04))
     with pytest.raises(OpenArmError, match="wall") as caught:
-        to_joints(arm, Situation(home, start), goal.tolist(), Around([wall]))
+        to_joints(arm, StartState(home, start), goal.tolist(), RequestBoxes([wall]))
     assert caught.value.code == Code.IN_COLLISION
 
 

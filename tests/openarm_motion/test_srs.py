@@ -9,8 +9,8 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription, mirror
+from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
-from openarm_motion.kinematics.kinematics import ArmKinematics
 from openarm_motion.kinematics.srs import SrsArm
 
 SWIVELS = np.linspace(-np.pi, np.pi, 24, endpoint=False)

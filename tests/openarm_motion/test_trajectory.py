@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.errors import OpenArmError
-from openarm_motion.kinematics.cartesian import solve_line
+from openarm_motion.kinematics.line import solve_line
 from openarm_motion.planning.arm import Arm
 from openarm_motion.timing.trajectory import JointLimits, Trajectory, profile, time_path, time_polyline
 

@@ -101,7 +101,7 @@ def _graspable(scene: Scene, arm: str) -> bool:
     solver = arms_behind((), table)[arm]
     request = approach_of(PlanGrasp(arm, propose(target, config), (), target_box(target, config)))
     try:
-        plan_approach(solver, solver.situation(_home()), request)
+        plan_approach(solver, solver.start_state(_home()), request)
     except OpenArmError as error:
         if error.code not in NO_WAY:
             raise

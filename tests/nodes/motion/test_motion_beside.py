@@ -10,7 +10,7 @@ from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox
 
 from openarm_common import se3
 from openarm_common.ros.convert import matrix_to_pose
-from openarm_motion.planning.both import BothArms
+from openarm_motion.planning.dual_arm import DualArm
 
 MIDDLE = (0.28, 0.0, 0.60)
 
@@ -27,7 +27,7 @@ def execute(arm: str, trajectory, max_wait: float = 30.0) -> ExecuteTrajectory.G
 def nearest(bench, futures, limit: float = 30.0) -> float:
     """Wait for results; the least distance of the arms in the states meanwhile."""
     arms = bench.node.service.arms
-    both = BothArms(arms["left"], arms["right"])
+    both = DualArm(arms["left"], arms["right"])
     seen: list[dict[str, float]] = []
     done = lambda: seen.append(dict(bench.robot.state)) or all(f.done() for f in futures)  # noqa: E731
     bench.ros.spin_until(done, limit, "both arms")
@@ -171,7 +171,7 @@ def test_two_grasps_are_carried_out_at_once(bench) -> None:
     bench.ros.spin_until(step, 40.0, "both grasps")
     assert ends == dict.fromkeys(sides, ["OK"] * 3)
     assert max(together) == 2
-    both = BothArms(bench.node.service.arms["left"], bench.node.service.arms["right"])
+    both = DualArm(bench.node.service.arms["left"], bench.node.service.arms["right"])
     scene = both.scene(seen[0])
     assert min(scene.separation(np.array([state[n] for n in both.names])) for state in seen[::3]) >= 0.020
 

@@ -10,7 +10,7 @@ from openarm_interfaces.msg import ArmTarget, CollisionBox
 
 from openarm_common import se3
 from openarm_common.ros.convert import matrix_to_pose, stamp_to_ns
-from openarm_motion.planning.both import BothArms
+from openarm_motion.planning.dual_arm import DualArm
 
 
 def over_the_middle(bench, arm: str, **kwargs) -> ArmTarget:
@@ -29,7 +29,7 @@ def both_goal(*targets: ArmTarget, **kwargs) -> MoveArms.Goal:
 def watched(bench, goal: MoveArms.Goal) -> tuple[MoveArms.Result, float]:
     """Run a goal; its result, and the least distance of the arms in the joint states meanwhile."""
     arms = bench.node.service.arms
-    both = BothArms(arms["left"], arms["right"])
+    both = DualArm(arms["left"], arms["right"])
     _, future = bench.start(bench.both_client, goal)
     seen: list[dict[str, float]] = []
     bench.ros.spin_until(lambda: seen.append(dict(bench.robot.state)) or future.done(), 20.0, "both arms")

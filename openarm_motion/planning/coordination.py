@@ -9,18 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.collision import Clearance, CollisionScene, Contact, Surroundings
+from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene, Contact
 from openarm_motion.collision.solids import Box
-from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.planner import never
-from openarm_motion.timing.certificate import ends_first, subdivided
 from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.validation import ends_first, subdivided
+
+if TYPE_CHECKING:
+    from openarm_motion.planning.arm import Arm
 
 #: Distance of two arms under way that is proven, m.
 APART = 0.020
@@ -35,7 +38,7 @@ _STEP = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class ActiveMotion:
     """What an arm has before it: a motion whose time 0 is now, and the boxes that it holds on it, tool frame."""
 
     arm: Arm
@@ -43,15 +46,15 @@ class Course:
     held: Sequence[Box] = ()
 
     @classmethod
-    def standing(cls, arm: Arm, state: Mapping[str, float], held: Sequence[Box] = ()) -> Course:
+    def standing(cls, arm: Arm, state: Mapping[str, float], held: Sequence[Box] = ()) -> ActiveMotion:
         """An arm that stays where it is."""
         q = np.array([[state[name] for name in arm.names]])
         return cls(arm, Motion(arm.names, np.zeros(1), q), held)
 
 
-def least_wait(
-    mine: Course,
-    others: Sequence[Course],
+def least_delay(
+    mine: ActiveMotion,
+    others: Sequence[ActiveMotion],
     state: Mapping[str, float],
     longest: float = np.inf,
     stopped: Callable[[], bool] = never,
@@ -90,37 +93,10 @@ def least_wait(
     raise PlanFailedError(Code.IN_COLLISION, text, "execution", contact)
 
 
-def first_to_arrive(
-    candidates: Sequence[Course],
-    others: Sequence[Course],
-    state: Mapping[str, float],
-    longest: float = np.inf,
-    stopped: Callable[[], bool] = never,
-) -> tuple[int, float]:
-    """Which of several motions of an arm ends first when each rests as long as it must; its index and rest, s.
-
-    Raises:
-        OpenArmError: as `least_wait`, of the first candidate, when none can be.
-    """
-    found: list[tuple[float, int, float]] = []
-    faults: list[OpenArmError] = []
-    for k, candidate in enumerate(candidates):
-        try:
-            wait = least_wait(candidate, others, state, longest, stopped)
-        except PlanFailedError as error:
-            faults.append(error)
-            continue
-        found.append((wait + candidate.motion.duration, k, wait))
-    if not found:
-        raise faults[0] if faults else OpenArmError(Code.INVALID_ARGUMENT, "no candidates, expected at least one")
-    _, k, wait = min(found)
-    return k, wait
-
-
 class _Pair:
     """One arm and others under way, and nothing else."""
 
-    def __init__(self, mine: Course, others: Sequence[Course], state: Mapping[str, float]) -> None:
+    def __init__(self, mine: ActiveMotion, others: Sequence[ActiveMotion], state: Mapping[str, float]) -> None:
         self._mine, self._others = mine, others
         carried = [box for other in others for box in other.arm.robot.on_tool(other.held)]
         self._scene = self._made(mine, state, _SEEN, carried)
@@ -135,10 +111,10 @@ class _Pair:
 
     @staticmethod
     def _made(
-        course: Course, state: Mapping[str, float], apart: float, carried: Sequence[tuple[int, Box]] = ()
+        course: ActiveMotion, state: Mapping[str, float], apart: float, carried: Sequence[tuple[int, Box]] = ()
     ) -> CollisionScene:
         keep = Clearance(arms=apart)
-        around = Surroundings(state, held=course.held, carried=carried, clearance=keep, own=False)
+        around = CollisionContext(state, held=course.held, carried=carried, clearance=keep, own=False)
         return CollisionScene(course.arm.robot, around)
 
     def first_hit(self, wait: float) -> tuple[float, Array] | None:

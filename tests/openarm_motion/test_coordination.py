@@ -10,12 +10,12 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.collision import box_from
+from openarm_motion.collision.solids import box_from
 from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm
-from openarm_motion.planning.beside import Course, first_to_arrive, least_wait
-from openarm_motion.planning.both import BothArms
-from openarm_motion.planning.moves import Around
+from openarm_motion.planning.coordination import ActiveMotion, least_delay
+from openarm_motion.planning.dual_arm import DualArm
+from openarm_motion.planning.moves import RequestBoxes
 from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import Trajectory
 
@@ -23,7 +23,7 @@ DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
 
 def to_the_middle(arm: Arm, state: dict[str, float], y: float = 0.0) -> Trajectory:
-    return moves.to_pose(arm, arm.situation(state), se3.make(DOWN, (0.28, y, 0.60)), Around())
+    return moves.to_pose(arm, arm.start_state(state), se3.make(DOWN, (0.28, y, 0.60)), RequestBoxes())
 
 
 def back(plan: Trajectory, slow: float = 3.0) -> Motion:
@@ -37,7 +37,7 @@ def standing(state: dict[str, float], arm: Arm, q: np.ndarray) -> dict[str, floa
 
 def nearest(arms: dict[str, Arm], state: dict[str, float], left: Motion, right: Motion, held=((), ())) -> float:
     """Least distance of the arms at looks 5 ms apart, from nothing but the motions."""
-    both = BothArms(arms["left"], arms["right"])
+    both = DualArm(arms["left"], arms["right"])
     scene = both.pair_scene(state, 0.1, held)
     times = np.arange(0.0, max(left.t[-1], right.t[-1]) + 0.005, 0.005)
     return min(scene.separation(q) for q in np.hstack([left.states(times), right.states(times)]))
@@ -54,7 +54,7 @@ def meeting(arms: dict[str, Arm], home: dict[str, float]) -> tuple[dict[str, flo
 @pytest.mark.requirement("N-12")
 def test_an_arm_rests_until_the_other_one_leaves_room(arms, meeting) -> None:
     state, left, right = meeting
-    wait = least_wait(Course(arms["right"], right), [Course(arms["left"], left)], state)
+    wait = least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], state)
     assert 0.2 < wait < left.t[-1]
     assert nearest(arms, state, left, right.later(wait)) >= 0.020
     assert nearest(arms, state, left, right.later(wait - 0.1)) < 0.024  # not longer than it must
@@ -64,18 +64,18 @@ def test_an_arm_rests_until_the_other_one_leaves_room(arms, meeting) -> None:
 @pytest.mark.requirement("N-12")
 def test_what_has_passed_of_a_motion_under_way_counts(arms, meeting) -> None:
     state, left, right = meeting
-    mine = Course(arms["right"], right)
-    whole = least_wait(mine, [Course(arms["left"], left)], state)
+    mine = ActiveMotion(arms["right"], right)
+    whole = least_delay(mine, [ActiveMotion(arms["left"], left)], state)
     begun = left.later(-0.6)
     now = standing(state, arms["left"], begun.states(np.zeros(1))[0])
-    assert least_wait(mine, [Course(arms["left"], begun)], now) == pytest.approx(whole - 0.6, abs=0.11)
+    assert least_delay(mine, [ActiveMotion(arms["left"], begun)], now) == pytest.approx(whole - 0.6, abs=0.11)
 
 
 @pytest.mark.requirement("N-12")
 def test_arms_that_do_not_meet_set_out_at_once(arms, home) -> None:
     left = Motion.of(to_the_middle(arms["left"], home, 0.25))
     right = Motion.of(to_the_middle(arms["right"], home, -0.25))
-    assert least_wait(Course(arms["right"], right), [Course(arms["left"], left)], home) == 0.0
+    assert least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], home) == 0.0
     assert nearest(arms, home, left, right) >= 0.020
 
 
@@ -83,7 +83,7 @@ def test_arms_that_do_not_meet_set_out_at_once(arms, home) -> None:
 def test_an_arm_that_ends_in_the_way_is_no_matter_of_time(arms, home) -> None:
     left, right = (Motion.of(to_the_middle(arms[side], home)) for side in ("left", "right"))
     with pytest.raises(OpenArmError, match=r"right arm after .*openarm_left_\w+.* no rest before it helps") as caught:
-        least_wait(Course(arms["right"], right), [Course(arms["left"], left)], home)
+        least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], home)
     assert caught.value.code == Code.IN_COLLISION
     assert "longer" not in caught.value.message
 
@@ -91,22 +91,10 @@ def test_an_arm_that_ends_in_the_way_is_no_matter_of_time(arms, home) -> None:
 def test_a_rest_that_is_too_long_is_refused(arms, meeting) -> None:
     state, left, right = meeting
     with pytest.raises(OpenArmError, match=r"within 0\.2 s; it would have to wait longer"):
-        least_wait(Course(arms["right"], right), [Course(arms["left"], left)], state, longest=0.2)
+        least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], state, longest=0.2)
     with pytest.raises(OpenArmError) as caught:
-        least_wait(Course(arms["right"], right), [Course(arms["left"], left)], state, stopped=lambda: True)
+        least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], state, stopped=lambda: True)
     assert caught.value.code == Code.CANCELLED
-
-
-def test_of_several_motions_the_one_that_arrives_first_is_taken(arms, home, meeting) -> None:
-    state, left, middle = meeting
-    aside = Motion.of(to_the_middle(arms["right"], home, -0.25))
-    mine = [Course(arms["right"], motion) for motion in (middle, aside)]
-    assert first_to_arrive(mine, [Course(arms["left"], left)], state) == (1, 0.0)
-    k, wait = first_to_arrive(mine[:1], [Course(arms["left"], left)], state)
-    assert k == 0
-    assert wait > 0.0
-    with pytest.raises(OpenArmError, match="no candidates"):
-        first_to_arrive([], [], state)
 
 
 @pytest.mark.requirement("N-12")
@@ -115,21 +103,21 @@ def test_two_held_objects_keep_apart_too(arms, home) -> None:
     plate = box_from("plate", (0.0, 0.0, 0.10), (0.05, 0.26, 0.02))
     left = Motion.of(to_the_middle(arms["left"], home, 0.20))
     right = Motion.of(to_the_middle(arms["right"], home, -0.20))
-    both = BothArms(arms["left"], arms["right"])
+    both = DualArm(arms["left"], arms["right"])
     ends = np.concatenate([left.q[-1], right.q[-1]])
     assert not both.pair_scene(home, 0.02).collides(ends)
-    least_wait(Course(arms["right"], right), [Course(arms["left"], left)], home)
+    least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], home)
     wide = box_from("plate", (0.0, 0.0, 0.20), (0.05, 0.44, 0.02))
     hits = both.pair_scene(home, 0.02, ([wide], [wide])).contacts(ends)
     assert {c.first.split()[-1] for c in hits} >= {"plate"}
     for held in (plate, wide):
         meet = both.pair_scene(home, 0.02, ([held], [held])).collides(ends)
-        mine, other = Course(arms["right"], right, [held]), Course(arms["left"], left, [held])
+        mine, other = ActiveMotion(arms["right"], right, [held]), ActiveMotion(arms["left"], left, [held])
         if meet:
             with pytest.raises(OpenArmError, match="plate"):
-                least_wait(mine, [other], home)
+                least_delay(mine, [other], home)
         else:
-            least_wait(mine, [other], home)
+            least_delay(mine, [other], home)
 
 
 def test_motions_are_interpolated_as_controllers_do(arms, home) -> None:

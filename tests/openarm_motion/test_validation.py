@@ -8,10 +8,10 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.collision import box_from
-from openarm_motion.planning.arm import Arm, Situation
+from openarm_motion.collision.solids import box_from
+from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.planner import PlannedPath, PlanQuery
-from openarm_motion.timing.certificate import certify
+from openarm_motion.timing.validation import validate_trajectory
 
 
 def across(right: Arm, home: dict[str, float]) -> PlannedPath:
@@ -28,8 +28,8 @@ def test_a_planned_trajectory_is_certified_with_no_point_moving_far_between_two_
 ) -> None:
     scene = right.scene(home)
     path = across(right, home)
-    planned = right.plan(scene, Situation(home, path.waypoints[0]), path.waypoints[1:], 5.0)
-    certificate = certify(scene, [*right.timings(planned, 0.5)][-1])
+    planned = right.plan(scene, StartState(home, path.waypoints[0]), path.waypoints[1:], 5.0)
+    certificate = validate_trajectory(scene, [*right.timings(planned, 0.5)][-1])
     way = float(np.sum(np.abs(np.diff(planned.waypoints, axis=0)) @ scene.levers))
     assert certificate.states >= way / certificate.travel
     assert certificate.share == 0.5
@@ -41,7 +41,7 @@ def test_a_trajectory_through_a_thin_sheet_is_refused_with_the_time_and_the_pair
     trajectory = [*right.timings(across(right, home), 0.5)][-1]
     sheet = box_from("sheet", (0.32, -0.21, 0.6), (0.5, 0.001, 0.4))
     with pytest.raises(OpenArmError, match=r"after \d\.\d\d s of the trajectory openarm_right_.* sheet") as caught:
-        certify(right.scene(home, [sheet]), trajectory)
+        validate_trajectory(right.scene(home, [sheet]), trajectory)
     assert caught.value.code == Code.IN_COLLISION
 
 
@@ -75,8 +75,8 @@ def test_what_a_search_stepped_over_is_searched_again_more_closely_and_never_han
     arm = Arm("right", right.description, right.config, right.static, planner)
     path = across(right, home)
     sheet = box_from("sheet", (0.32, -0.21, 0.6), (0.5, 0.001, 0.4))
-    now = Situation(home, path.waypoints[0])
+    now = StartState(home, path.waypoints[0])
     with pytest.raises(OpenArmError, match="did not pass the dense look") as caught:
-        arm.plan_certified(arm.scene(home, [sheet]), now, path.waypoints[1:], 1.0)
+        arm.plan_validated(arm.scene(home, [sheet]), now, path.waypoints[1:], 1.0)
     assert caught.value.code == Code.IN_COLLISION
     assert planner.resolutions == [(0.05, 0.02), (0.0125, 0.005)]

@@ -14,7 +14,7 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.collision import CollisionScene, Contact
+from openarm_motion.collision.exact import CollisionScene, Contact
 from openarm_motion.kinematics.chain_kernels import ROTATION_LENGTH
 from openarm_motion.kinematics.inverse import InverseKinematics, Solution
 

@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
+from openarm_motion.collision.clearance_kernels import workspace
 from openarm_motion.collision.fast import FastScene
-from openarm_motion.collision.fast_model import workspace
 from openarm_motion.planning import search_kernels as kernels
-from openarm_motion.planning.planner import OmplPlanner, PlannedPath, Planner, PlanQuery
+from openarm_motion.planning.ompl_planner import OmplPlanner
+from openarm_motion.planning.planner import PlannedPath, Planner, PlanQuery, cancelled
 
 #: Two configurations nearer than this in every joint are one, rad.
 _SAME = 1e-6
@@ -55,7 +55,7 @@ class FastPlanner:
         scene = query.fast()
         step, travel = query.resolution
         if query.stopped():
-            raise _cancelled()
+            raise cancelled()
         for i, goal in enumerate(query.goals):
             if float(np.max(np.abs(goal - query.start))) < _SAME or scene.edge_free(query.start, goal, step, travel):
                 return PlannedPath(np.stack([query.start, goal]), i, i + 1)
@@ -100,7 +100,7 @@ class FastPlanner:
             if a >= 0:
                 break
             if query.stopped():
-                raise _cancelled()
+                raise cancelled()
             spent = chunk * _CHUNK >= query.iterations if query.iterations else time.monotonic() > end
             if spent or int(counts.max()) >= _ROOM:
                 return None
@@ -141,7 +141,3 @@ def _branch(parents: NDArray[np.int64], k: int) -> list[int]:
     while parents[out[-1]] >= 0:
         out.append(int(parents[out[-1]]))
     return out
-
-
-def _cancelled() -> OpenArmError:
-    return OpenArmError(Code.CANCELLED, "planning was stopped")

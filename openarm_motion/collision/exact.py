@@ -10,22 +10,111 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
+from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.collision_robot import CollisionRobot
-from openarm_motion.collision.looks import spread
-from openarm_motion.collision.seen import MAP, DistanceMap
-from openarm_motion.collision.solids import Box, Solid, box_from
-from openarm_motion.collision.surroundings import Clearance, Contact, Surroundings
+from openarm_motion.collision.occupancy import MAP, DistanceMap, OccupancyMap
+from openarm_motion.collision.robot import CollisionRobot
+from openarm_motion.collision.solids import Box, Solid
 
-__all__ = ["Box", "Clearance", "CollisionScene", "Contact", "Solid", "Surroundings", "box_from", "spread"]
+
+class Clearance(Config):
+    """Distances that pairs keep, m; nearer is a collision."""
+
+    own: float = Field(
+        default=0.003, ge=0.0, le=0.05, description="between links of the arm, and to the robot's body, m"
+    )
+    world: float = Field(default=0.010, ge=0.0, le=0.1, description="arm to boxes, m")
+    arms: float = Field(default=0.030, ge=0.0, le=0.1, description="arm to the other arm, m")
+    hand: float = Field(default=0.010, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
+    touch: float = Field(
+        default=0.002, ge=0.0, le=0.05, description="arm and palm to a box that the fingers may touch, m"
+    )
+    rest: float = Field(
+        default=0.0, ge=-0.02, le=0.05, description="held box to what it stands on; < 0 allows overlap, m"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionContext:
+    """What is around an arm in one query.
+
+    Attributes:
+        state: Positions of (at least) the robot's other movable joints; missing ones are taken as 0.
+        boxes: Obstacles, base frame; boxes or other bodies.
+        held: Boxes held by this arm, pose in the tool frame.
+        carried: Boxes that go with the other arm: the joint that each hangs on, pose in that joint's frame.
+        touchable: Ids of boxes that the fingers may touch.
+        supports: Ids of boxes that a held box may stand on.
+        fixed: Ids of boxes that are where they are said to be; the others are estimates.
+        clearance: Distances to keep.
+        map: What the cameras see beside all that; None is nothing.
+        own: Whether the arm is checked against itself and the robot's body; False leaves the other arm and the boxes.
+    """
+
+    state: Mapping[str, float]
+    boxes: Sequence[Solid] = ()
+    held: Sequence[Box] = ()
+    carried: Sequence[tuple[int, Box]] = ()
+    touchable: frozenset[str] = frozenset()
+    supports: frozenset[str] = frozenset()
+    fixed: frozenset[str] = frozenset()
+    clearance: Clearance = field(default_factory=Clearance)
+    map: OccupancyMap | None = None
+    own: bool = True
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Two things nearer to each other than allowed.
+
+    Attributes:
+        first: Link or held box.
+        second: Link or obstacle.
+        distance: < 0 is how deep they overlap, m.
+        required: What it should be, m.
+        where: Added to the name of the second in a sentence.
+    """
+
+    first: str
+    second: str
+    distance: float
+    required: float
+    where: str = ""
+
+    def __str__(self) -> str:
+        """Sentence for a refusal."""
+        second = self.second + self.where
+        if self.distance <= 0.0:
+            return f"{self.first} would hit {second} ({-self.distance * 1e3:.0f} mm deep)"
+        return (
+            f"{self.first} would come within {self.distance * 1e3:.1f} mm of {second},"
+            f" expected {self.required * 1e3:.0f} mm"
+        )
+
+
+@lru_cache(maxsize=512)
+def spread(n: int) -> tuple[float, ...]:
+    """0, 1/n, ..., 1 with the ends and far-apart points first, so that a collision is found early."""
+    order: list[int] = [n, 0]
+    gap = n
+    seen = {0, n}
+    while len(seen) <= n:
+        gap = max(gap // 2, 1)
+        for k in range(gap, n, gap):
+            if k not in seen:
+                seen.add(k)
+                order.append(k)
+    return tuple(k / n for k in order)
 
 
 #: A pair that may stay as near as it is may come nearer by this, m.
@@ -45,12 +134,12 @@ class CollisionScene:
         OpenArmError: INVALID_ARGUMENT, when two boxes have one id.
     """
 
-    def __init__(self, robot: CollisionRobot, around: Surroundings) -> None:
+    def __init__(self, robot: CollisionRobot, around: CollisionContext) -> None:
         self._robot = robot
         self._q = robot.configuration(around.state)
         self._build(around)
 
-    def _build(self, around: Surroundings) -> None:
+    def _build(self, around: CollisionContext) -> None:
         robot = self._robot
         self._around = around
         self._geometry = robot.geometry.copy()
@@ -77,7 +166,7 @@ class CollisionScene:
         return self._robot
 
     @property
-    def around(self) -> Surroundings:
+    def around(self) -> CollisionContext:
         """What is around the arm."""
         return self._around
 

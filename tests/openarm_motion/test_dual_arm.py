@@ -11,27 +11,27 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.collision import box_from
-from openarm_motion.planning import together
-from openarm_motion.planning.arm import Arm, Situation
-from openarm_motion.planning.both import BothArms
-from openarm_motion.planning.together import (
-    BothGoals,
-    BothPlan,
+from openarm_motion.collision.solids import box_from
+from openarm_motion.planning import dual_arm as together
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.dual_arm import (
+    DualArm,
+    DualArmGoals,
+    DualArmPlan,
     delayed,
     joined,
     plan_staggered,
     plan_together,
     separation,
 )
-from openarm_motion.timing.certificate import dense_times
+from openarm_motion.timing.validation import dense_times
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
 
 @pytest.fixture(scope="module")
-def both(arms: dict[str, Arm]) -> BothArms:
-    return BothArms(arms["left"], arms["right"])
+def both(arms: dict[str, Arm]) -> DualArm:
+    return DualArm(arms["left"], arms["right"])
 
 
 def hand_at(arm: Arm, home: dict[str, float], y: float, x: float = 0.30, z: float = 0.62) -> np.ndarray:
@@ -41,11 +41,11 @@ def hand_at(arm: Arm, home: dict[str, float], y: float, x: float = 0.30, z: floa
     return np.array(found[:6])
 
 
-def starting(both: BothArms, state: dict[str, float]) -> Situation:
-    return Situation(state, np.array([state[name] for name in both.names]), 0.5)
+def starting(both: DualArm, state: dict[str, float]) -> StartState:
+    return StartState(state, np.array([state[name] for name in both.names]), 0.5)
 
 
-def apart_all_the_way(both: BothArms, state: dict[str, float], plan: BothPlan) -> float:
+def apart_all_the_way(both: DualArm, state: dict[str, float], plan: DualArmPlan) -> float:
     """Least distance of the arms at looks 5 ms apart, from nothing but the trajectories."""
     whole = joined(both, plan.trajectories)
     scene = both.scene(state)
@@ -53,20 +53,20 @@ def apart_all_the_way(both: BothArms, state: dict[str, float], plan: BothPlan) -
     return min(scene.separation(q) for q in states[::3])
 
 
-def swapping(both: BothArms, home: dict[str, float]) -> tuple[dict[str, float], BothGoals]:
+def swapping(both: DualArm, home: dict[str, float]) -> tuple[dict[str, float], DualArmGoals]:
     """The left hand is over the middle, where the right one wants to go while the left one goes home."""
     left, right = both.arms
     inside = hand_at(left, home, 0.0)[0]
     state = {**home, **dict(zip(left.names, inside.tolist(), strict=True))}
     back = np.array([[home[name] for name in left.names]])
-    return state, BothGoals((back, hand_at(right, home, 0.0)))
+    return state, DualArmGoals((back, hand_at(right, home, 0.0)))
 
 
 @pytest.mark.parametrize("how", [plan_together, plan_staggered])
 @pytest.mark.requirement("N-12")
 def test_arms_that_take_each_others_place_keep_20_mm_all_the_way(both, home, how) -> None:
     state, goals = swapping(both, home)
-    plan: BothPlan = how(both, starting(both, state), goals, 10.0)
+    plan: DualArmPlan = how(both, starting(both, state), goals, 10.0)
     seen = apart_all_the_way(both, state, plan)
     assert seen >= 0.020
     assert plan.separation == pytest.approx(seen, abs=0.002)
@@ -105,7 +105,7 @@ def test_a_goal_of_both_that_can_not_be_names_the_pair(both, home) -> None:
     left, right = (hand_at(arm, home, 0.0)[:1] for arm in both.arms)
     for how in (plan_together, plan_staggered):
         with pytest.raises(OpenArmError, match=r"openarm_(left|right)_\w+ would (hit|come within)") as caught:
-            how(both, starting(both, home), BothGoals((left, right)), 2.0)
+            how(both, starting(both, home), DualArmGoals((left, right)), 2.0)
         assert caught.value.code == Code.IN_COLLISION
 
 
@@ -152,7 +152,7 @@ def test_corners_of_both_arms_are_rounded_and_keep_apart(both, home) -> None:
     for a, b in itertools.pairwise(states):
         state = {**home, **dict(zip(both.names, a.tolist(), strict=True))}
         first, second = both.parts(b)
-        plan = plan_together(both, Situation(state, a, 0.5), BothGoals((first[None], second[None]), posts), 5.0)
+        plan = plan_together(both, StartState(state, a, 0.5), DualArmGoals((first[None], second[None]), posts), 5.0)
         whole = joined(both, plan.trajectories)
         assert np.all(np.abs(whole.v) <= both.limits(0.5).velocity * (1 + 1e-6))
         moving = np.abs(whole.v).max(axis=1)[1:-1] > 1e-6

@@ -13,8 +13,7 @@ import math
 from numba import njit
 
 from openarm_common.types import Array
-from openarm_motion.collision.fast_kernels import look, near, place, sift
-from openarm_motion.collision.fast_model import Model, Work
+from openarm_motion.collision.clearance_kernels import Model, Work, look, near, place, sift
 
 
 @njit(cache=True, nogil=True)

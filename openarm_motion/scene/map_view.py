@@ -10,7 +10,7 @@ from typing import Protocol
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.distance_field import DistanceField
 from openarm_common.robot.description import RobotDescription
-from openarm_motion.collision.seen import SeenMap, robot_bodies
+from openarm_motion.collision.occupancy import OccupancyMap, robot_bodies
 from openarm_motion.collision.solids import Solid
 from openarm_motion.config import MapConfig
 from openarm_motion.planning.failure import PlanFailedError
@@ -20,10 +20,10 @@ _TRIES = 3
 
 
 @dataclass(frozen=True)
-class Look:
+class MapState:
     """What there is of the map: `seen` is None where plans go without it, and `why` says so."""
 
-    seen: SeenMap | None
+    seen: OccupancyMap | None
     version: int = 0
     age_s: float = -1.0
     why: str = ""
@@ -41,7 +41,7 @@ class FieldSource(Protocol):
         ...
 
 
-class MapEye:
+class MapView:
     """Looks at the map.
 
     Args:
@@ -53,9 +53,9 @@ class MapEye:
     def __init__(self, config: MapConfig, source: FieldSource, frames: Sequence[str]) -> None:
         self._config, self._frames = config, tuple(frames)
         self._reader = source
-        self._cells: SeenMap | None = None
+        self._cells: OccupancyMap | None = None
 
-    def look(self, now_ns: int) -> Look:
+    def look(self, now_ns: int) -> MapState:
         """The present map.
 
         Args:
@@ -65,7 +65,7 @@ class MapEye:
             PlanFailedError: NOT_READY or STALE_DATA, with what is missing or how old, when the map is required.
         """
         if self._config.use == "off":
-            return Look(None, why="switched off")
+            return MapState(None, why="switched off")
         version, age = 0, -1.0
         try:
             field = self._reader.latest()
@@ -74,18 +74,18 @@ class MapEye:
             if field.frame not in self._frames:
                 text = f"the map is in {field.frame!r}, expected {' or '.join(self._frames)}"
                 raise OpenArmError(Code.NO_TRANSFORM, text)
-            return Look(self._read(field), version, age)
+            return MapState(self._read(field), version, age)
         except OpenArmError as error:
             if self._config.use == "required":
                 text = f"{error.message} (parameter map.use is required)"
                 raise PlanFailedError(error.code, text, "scene") from error
-            return Look(None, version, age, error.message)
+            return MapState(None, version, age, error.message)
 
-    def _read(self, field: DistanceField) -> SeenMap:
+    def _read(self, field: DistanceField) -> OccupancyMap:
         for _ in range(_TRIES):
             if self._cells is not None and self._cells.version == field.version:
                 return self._cells
-            cells = SeenMap.of(field)
+            cells = OccupancyMap.of(field)
             if self._reader.intact(field):
                 self._cells = cells
                 return cells
@@ -94,13 +94,13 @@ class MapEye:
 
 
 def unexplained(
-    seen: SeenMap,
+    seen: OccupancyMap,
     config: MapConfig,
     robot: RobotDescription,
     state: Mapping[str, float],
     certain: Sequence[Solid],
     estimates: Sequence[Solid],
-) -> SeenMap:
+) -> OccupancyMap:
     """The map without the robot, the bodies of the scene, and those of the request and the hands (base frame)."""
     left = seen.without(certain, config.certain_padding)
     left = left.without(estimates, config.estimate_padding)

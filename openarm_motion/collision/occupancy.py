@@ -48,7 +48,7 @@ class DistanceMap:
 
 
 @dataclass(frozen=True, eq=False)
-class SeenMap:
+class OccupancyMap:
     """Occupied cells.
 
     Attributes:
@@ -62,7 +62,7 @@ class SeenMap:
     version: int
 
     @classmethod
-    def of(cls, field: DistanceField) -> SeenMap:
+    def of(cls, field: DistanceField) -> OccupancyMap:
         """The cells of a distance field that are at no distance from an obstacle."""
         return cls(np.argwhere(field.distances == 0.0), field.lattice, field.version)
 
@@ -71,7 +71,7 @@ class SeenMap:
         """(n, 3) middles of the cells, m."""
         return self.lattice.centres(self.indices)
 
-    def without(self, bodies: Iterable[Solid], padding: float) -> SeenMap:
+    def without(self, bodies: Iterable[Solid], padding: float) -> OccupancyMap:
         """The map without the cells whose middles lie within `padding` of one of the bodies (base frame), m."""
         centres = self.centres
         left = np.ones(len(centres), np.bool_)
@@ -79,7 +79,7 @@ class SeenMap:
             left &= ~body.inside(centres, padding)
         return self if left.all() else replace(self, indices=self.indices[left])
 
-    def minus(self, rows: NDArray[np.int64]) -> SeenMap:
+    def minus(self, rows: NDArray[np.int64]) -> OccupancyMap:
         """The map without some of its cells."""
         return replace(self, indices=np.delete(self.indices, rows, axis=0))
 
@@ -120,7 +120,7 @@ class SeenMap:
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class Environment:
     """What is around the robot, whatever a request says.
 
     Attributes:
@@ -130,12 +130,12 @@ class Known:
     """
 
     solids: tuple[Solid, ...] = ()
-    map: SeenMap | None = None
+    map: OccupancyMap | None = None
     apart: float = 0.0
 
 
 #: An empty scene, and no map.
-NOTHING = Known()
+NOTHING = Environment()
 
 
 def robot_bodies(description: RobotDescription, state: Mapping[str, float]) -> list[Box]:

@@ -18,8 +18,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Primitive, RobotDescription
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box
-from openarm_motion.kinematics.arm_links import ArmLinks
-from openarm_motion.kinematics.kinematics import ArmKinematics
+from openarm_motion.kinematics.chain import ArmKinematics, ArmLinks
 
 
 class CollisionRobot:
@@ -68,7 +67,7 @@ class CollisionRobot:
             self._set(full, name, float(value))
 
     def on_tool(self, boxes: Sequence[Box]) -> list[tuple[int, Box]]:
-        """Boxes in the tool frame as `Surroundings.carried` of the other arm."""
+        """Boxes in the tool frame as `CollisionContext.carried` of the other arm."""
         name = self.kinematics.tool_link
         return [(self.joints[-1], replace(b, id=f"{b.id} at {name}", T=self.kinematics.tip @ b.T)) for b in boxes]
 

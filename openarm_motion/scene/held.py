@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.collision.collision import Box
+from openarm_motion.collision.solids import Box
 from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import Trajectory
 
@@ -19,7 +19,7 @@ from openarm_motion.timing.trajectory import Trajectory
 _PLANS = 32
 
 
-class HeldMemory:
+class HeldObjects:
     """The one thing that the motion node remembers between requests."""
 
     def __init__(self) -> None:

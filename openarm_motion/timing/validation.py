@@ -10,15 +10,17 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from openarm_common.errors import Code
 from openarm_common.types import Array
-from openarm_motion.collision.collision import Contact
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.timing.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from openarm_motion.collision.exact import Contact
 
 #: Share of the clearance that must be left between the looks of the search.
 _SHARE = 0.5
@@ -29,7 +31,7 @@ _TRAVEL = 0.004
 
 
 @dataclass(frozen=True)
-class Certificate:
+class Validation:
     """What was looked at.
 
     Attributes:
@@ -61,7 +63,9 @@ class Checked(Protocol):
         ...
 
 
-def certify(scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL, share: float = _SHARE) -> Certificate:
+def validate_trajectory(
+    scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL, share: float = _SHARE
+) -> Validation:
     """Look at a trajectory densely.
 
     Args:
@@ -81,7 +85,7 @@ def certify(scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL, sha
                 contact = scene.contacts(states[k])[0]
                 text = f"after {times[k]:.2f} s of the trajectory {contact}"
                 raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
-    return Certificate(len(states), travel, share)
+    return Validation(len(states), travel, share)
 
 
 def dense_times(trajectory: Trajectory, levers: Array, travel: float = _TRAVEL) -> Array:

@@ -1,0 +1,366 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numba kernels of the fast collision layer: where bodies are, and which of their shapes are near to others or the map.
+
+The answer "apart" is a proof while the answer "near" may be wrong. Shapes are boxes, cylinders and spheres on bodies;
+body 0 is the base, bodies 1..n follow the joints. Shapes of one body are a cluster with a ball about it; two clusters
+whose shapes are to be checked are a group. m, rad, base frame. The kernels release the GIL.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from openarm_common.types import Array, Ints
+from openarm_motion.collision.shape_kernels import BOX, separation
+
+#: Numbers that a list of groups or intervals of a line has room for.
+_ROOM = 1 << 15
+
+
+class Model(NamedTuple):
+    """A scene as the kernels take it.
+
+    Attributes:
+        parents: (n,) body that joint i hangs on; joint i moves body i + 1.
+        placements: (n, 4, 4) of each joint in its parent body at zero.
+        axes: (n, 3) unit, in the joint's frame.
+        prismatic: (n,) bool.
+        kinds: (s,) BOX, CYLINDER or SPHERE.
+        sizes: (s, 3) half edges; radius, half length; radius.
+        radii: (s,) of the ball about the shape's centre that holds it.
+        bodies: (s,) body of each shape.
+        poses: (s, 3, 4) of each shape in its body.
+        clusters: (c,) body of each cluster; those that move come first.
+        centres: (c, 3) of the ball about a cluster, in its body.
+        bounds: (c,) radius of that ball.
+        runs: (moving clusters + 1,) where the groups of each moving cluster with clusters that stand still begin.
+        groups: (g, 5) clusters a (moving) and b, the first and last + 1 of their pairs, and b's shape if it is one
+            that stands still, else -1; groups of two moving clusters come last.
+        points: (3, g) centre of cluster b where it stands still.
+        reaches: (g,) greatest distance that a pair of the group must keep.
+        spans: (g,) the same with the radii of both balls.
+        swings: (g + m, n) how far, at most, a point of cluster a (of a body's spheres) moves as seen by cluster b (the
+            map) when a joint turns by 1 rad, m.
+        pairs: (p, 2) shapes.
+        keep: (p,) distance that each pair must keep.
+        spheres: (k, 4) centre in its body and radius with clearance, of spheres that cover the moving shapes.
+        sphere_groups: (m, 3) body, first and last + 1 of its spheres.
+        sphere_bounds: (m, 4) ball about them.
+        sphere_shapes: (k,) the shape that each sphere covers a part of; with a map, the last shape is a cell of it.
+        sphere_keep: (k,) distance that the shape must keep from the map.
+        field: (x, y, z) float32 distances to occupied cells, of one cell when there is no map.
+        corner: (3,) lower corner of the field.
+        edge: (2,) edge of a cell, and what rounding to cells takes off a distance.
+    """
+
+    parents: Ints
+    placements: Array
+    axes: Array
+    prismatic: NDArray[np.bool_]
+    kinds: Ints
+    sizes: Array
+    radii: Array
+    bodies: Ints
+    poses: Array
+    clusters: Ints
+    centres: Array
+    bounds: Array
+    runs: Ints
+    groups: Ints
+    points: Array
+    reaches: Array
+    spans: Array
+    swings: Array
+    pairs: Ints
+    keep: Array
+    spheres: Array
+    sphere_groups: Ints
+    sphere_bounds: Array
+    sphere_shapes: Ints
+    sphere_keep: Array
+    field: NDArray[np.float32]
+    corner: Array
+    edge: Array
+
+
+class Work(NamedTuple):
+    """Room for one thread.
+
+    Attributes:
+        frames: (n + 1, 3, 4) poses of bodies.
+        world: (s, 3, 4) poses of shapes.
+        done: (s + 1,) the number of the state that each shape was last placed for; the last one is that number.
+        middles: (c, 3) centres of clusters.
+        near: (g,) flags.
+        sways: (g + m,) how far things come nearer over a line, m.
+        lists: Numbers of groups.
+        spans: (k, 4) intervals of a line: first and last point, where the list of its groups begins, its length.
+        q: (n,) a state.
+    """
+
+    frames: Array
+    world: Array
+    done: Ints
+    middles: Array
+    near: NDArray[np.uint8]
+    sways: Array
+    lists: Ints
+    spans: Ints
+    q: Array
+
+
+@njit(cache=True, nogil=True)
+def workspace(model: Model) -> Work:
+    """Room for one thread."""
+    n, s, c, g = model.parents.shape[0], model.kinds.shape[0], model.clusters.shape[0], model.groups.shape[0]
+    frames = np.zeros((n + 1, 3, 4))
+    for i in range(3):
+        frames[0, i, i] = 1.0
+    world, middles = np.zeros((s, 3, 4)), np.zeros((c, 3))
+    work = Work(
+        frames,
+        world,
+        np.zeros(s + 1, np.int64),
+        middles,
+        np.empty(g, np.uint8),
+        np.zeros(model.swings.shape[0]),
+        np.empty(_ROOM, np.int64),
+        np.empty((_ROOM, 4), np.int64),
+        np.empty(n),
+    )
+    for k in range(s):  # what does not move is where it is
+        if model.bodies[k] == 0:
+            world[k] = model.poses[k]
+    for k in range(c):
+        middles[k] = model.centres[k]
+    return work
+
+
+@njit(cache=True, nogil=True, inline="always")
+def put_shape(k: int, bodies: Ints, poses: Array, frames: Array, done: Ints, world: Array) -> None:
+    """Bring a shape to where its body is, once a state."""
+    b, now = bodies[k], done[done.shape[0] - 1]
+    if b > 0 and done[k] != now:
+        done[k] = now
+        for r in range(3):
+            f0, f1, f2 = frames[b, r, 0], frames[b, r, 1], frames[b, r, 2]
+            for c in range(4):
+                world[k, r, c] = f0 * poses[k, 0, c] + f1 * poses[k, 1, c] + f2 * poses[k, 2, c]
+            world[k, r, 3] += frames[b, r, 3]
+
+
+@njit(cache=True, nogil=True)
+def map_room(m: int, enough: float, model: Model, work: Work) -> float:
+    """By how much a body is further from the map than it must be; looked for until it is `enough`."""
+    groups, spheres, shapes, keeps = model.sphere_groups, model.spheres, model.sphere_shapes, model.sphere_keep
+    field, corner, edge = model.field, model.corner, model.edge
+    kinds, sizes, bodies, poses = model.kinds, model.sizes, model.bodies, model.poses
+    frames, done, world = work.frames, work.done, work.world
+    frame = frames[groups[m, 0]]
+    least, cell, width = enough, kinds.shape[0] - 1, edge[0]
+    for k in range(groups[m, 1], groups[m, 2]):
+        room = map_distance(frame, spheres[k], field, corner, edge)
+        if room >= 0.0:
+            least = min(least, room)
+            continue
+        # the ball is too near: look at the shape itself and each cell that the ball may be near to
+        i, keep, least = shapes[k], keeps[k], 0.0
+        put_shape(i, bodies, poses, frames, done, world)
+        reach = spheres[k, 3] + width
+        low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+        for r in range(3):
+            x = frame[r, 3] - corner[r]
+            for c in range(3):
+                x += frame[r, c] * spheres[k, c]
+            low[r] = max(math.floor((x - reach) / width), 0)
+            high[r] = min(math.floor((x + reach) / width) + 1, field.shape[r])
+        for x in range(low[0], high[0]):
+            for y in range(low[1], high[1]):
+                for z in range(low[2], high[2]):
+                    if field[x, y, z] > 0.0:
+                        continue
+                    world[cell, 0, 3] = corner[0] + (x + 0.5) * width
+                    world[cell, 1, 3] = corner[1] + (y + 0.5) * width
+                    world[cell, 2, 3] = corner[2] + (z + 0.5) * width
+                    if separation(i, cell, keep, kinds, sizes, world) < keep:
+                        return -1.0
+    return least
+
+
+@njit(cache=True, nogil=True)
+def map_distance(frame: Array, ball: Array, field: NDArray[np.float32], corner: Array, edge: Array) -> float:
+    """Distance in the map at a ball's centre less its radius and what rounding to cells takes."""
+    nx, ny, nz = field.shape
+    inverse = 1.0 / edge[0]
+    x = frame[0, 0] * ball[0] + frame[0, 1] * ball[1] + frame[0, 2] * ball[2] + frame[0, 3] - corner[0]
+    y = frame[1, 0] * ball[0] + frame[1, 1] * ball[1] + frame[1, 2] * ball[2] + frame[1, 3] - corner[1]
+    z = frame[2, 0] * ball[0] + frame[2, 1] * ball[1] + frame[2, 2] * ball[2] + frame[2, 3] - corner[2]
+    # the nearest cell stands for a point outside: what is in the map is no nearer to the point than to it
+    i = min(max(math.floor(x * inverse), 0), nx - 1)
+    j = min(max(math.floor(y * inverse), 0), ny - 1)
+    k = min(max(math.floor(z * inverse), 0), nz - 1)
+    return field[i, j, k] - ball[3] - edge[1]
+
+
+#: More room than this is looked for between the balls of clusters only, not between the shapes in them, m.
+_CLOSE = 0.03
+
+
+@njit(cache=True, nogil=True)
+def place(q: Array, model: Model, work: Work) -> None:
+    """Bring bodies and the centres of what moves with them to where they are in a state."""
+    # fields are unpacked before loops here and below: each access costs a count of references
+    frames, middles, parents, placements, axes = work.frames, work.middles, model.parents, model.placements, model.axes
+    prismatic, clusters, centres = model.prismatic, model.clusters, model.centres
+    for i in range(parents.shape[0]):
+        p = parents[i]
+        x, y, z = axes[i, 0], axes[i, 1], axes[i, 2]
+        c, s = 1.0, 0.0
+        if not prismatic[i]:
+            c, s = math.cos(q[i]), math.sin(q[i])
+        v = 1.0 - c
+        t00, t01, t02 = c + x * x * v, x * y * v - z * s, x * z * v + y * s
+        t10, t11, t12 = y * x * v + z * s, c + y * y * v, y * z * v - x * s
+        t20, t21, t22 = z * x * v - y * s, z * y * v + x * s, c + z * z * v
+        for r in range(3):
+            p0, p1, p2 = frames[p, r, 0], frames[p, r, 1], frames[p, r, 2]
+            a0 = p0 * placements[i, 0, 0] + p1 * placements[i, 1, 0] + p2 * placements[i, 2, 0]
+            a1 = p0 * placements[i, 0, 1] + p1 * placements[i, 1, 1] + p2 * placements[i, 2, 1]
+            a2 = p0 * placements[i, 0, 2] + p1 * placements[i, 1, 2] + p2 * placements[i, 2, 2]
+            a3 = p0 * placements[i, 0, 3] + p1 * placements[i, 1, 3] + p2 * placements[i, 2, 3]
+            frames[i + 1, r, 0] = a0 * t00 + a1 * t10 + a2 * t20
+            frames[i + 1, r, 1] = a0 * t01 + a1 * t11 + a2 * t21
+            frames[i + 1, r, 2] = a0 * t02 + a1 * t12 + a2 * t22
+            along = (a0 * x + a1 * y + a2 * z) * q[i] if prismatic[i] else 0.0
+            frames[i + 1, r, 3] = a3 + frames[p, r, 3] + along
+    for k in range(model.runs.shape[0] - 1):
+        b = clusters[k]
+        x, y, z = centres[k, 0], centres[k, 1], centres[k, 2]
+        for r in range(3):
+            middles[k, r] = frames[b, r, 0] * x + frames[b, r, 1] * y + frames[b, r, 2] * z + frames[b, r, 3]
+    work.done[model.kinds.shape[0]] += 1
+
+
+@njit(cache=True, nogil=True)
+def sift(share: float, model: Model, work: Work) -> int:
+    """List the groups whose balls may come too near within `share` of their sways; returns how many. Maps are added."""
+    near, middles, points, runs, reaches = work.near, work.middles, model.points, model.runs, model.spans
+    groups, sways, lists = model.groups, work.sways, work.lists
+    for c in range(runs.shape[0] - 1):
+        x, y, z = middles[c, 0], middles[c, 1], middles[c, 2]
+        for g in range(runs[c], runs[c + 1]):
+            u, v, w = points[0, g] - x, points[1, g] - y, points[2, g] - z
+            reach = reaches[g] + share * sways[g]
+            near[g] = u * u + v * v + w * w <= reach * reach
+    for g in range(runs[-1], groups.shape[0]):
+        a, b = groups[g, 0], groups[g, 1]
+        u, v, w = middles[b, 0] - middles[a, 0], middles[b, 1] - middles[a, 1], middles[b, 2] - middles[a, 2]
+        reach = reaches[g] + share * sways[g]
+        near[g] = u * u + v * v + w * w <= reach * reach
+    count = 0
+    for g in range(groups.shape[0]):
+        if near[g]:
+            lists[count] = g
+            count += 1
+    for g in range(groups.shape[0], sways.shape[0]):
+        lists[count] = g
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def look(start: int, count: int, end: int, share: float, model: Model, work: Work) -> int:
+    """Look at listed groups (and bodies in the map) in the state that things were placed for.
+
+    Args:
+        start: Where the list begins.
+        count: How many are in it.
+        end: Where those are listed that may come too near within `share` of their sways; nothing is for -1.
+        share: See `end`.
+        model: The scene.
+        work: Room.
+
+    Returns:
+        How many are listed at `end`; -1 when one is too near (or not proven to be far enough) in this state.
+    """
+    groups, middles, bounds, spans, kinds = model.groups, work.middles, model.bounds, model.spans, model.kinds
+    world, sizes, radii, pairs, keeps = work.world, model.sizes, model.radii, model.pairs, model.keep
+    bodies, poses, frames, done = model.bodies, model.poses, work.frames, work.done
+    lists, sways, kept = work.lists, work.sways, 0
+    balls, about, field, corner, edge = (
+        model.sphere_groups,
+        model.sphere_bounds,
+        model.field,
+        model.corner,
+        model.edge,
+    )
+    for at in range(start, start + count):
+        g = lists[at]
+        enough = float(share * sways[g])
+        if g >= groups.shape[0]:
+            m = g - groups.shape[0]
+            if map_distance(frames[balls[m, 0]], about[m], field, corner, edge) >= enough:
+                continue
+            least = map_room(m, enough, model, work)
+        else:
+            a, b, j = groups[g, 0], groups[g, 1], groups[g, 4]
+            x, y, z = middles[a, 0] - middles[b, 0], middles[a, 1] - middles[b, 1], middles[a, 2] - middles[b, 2]
+            apart, reach = x * x + y * y + z * z, spans[g]
+            if j >= 0 and kinds[j] == BOX and apart <= (reach + enough) * (reach + enough):
+                # a large one, say a table: its faces say more than the ball about it
+                u = abs(x * world[j, 0, 0] + y * world[j, 1, 0] + z * world[j, 2, 0]) - sizes[j, 0]
+                v = abs(x * world[j, 0, 1] + y * world[j, 1, 1] + z * world[j, 2, 1]) - sizes[j, 1]
+                w = abs(x * world[j, 0, 2] + y * world[j, 1, 2] + z * world[j, 2, 2]) - sizes[j, 2]
+                u, v, w = max(u, 0.0), max(v, 0.0), max(w, 0.0)
+                apart, reach = u * u + v * v + w * w, reach - bounds[b]
+            if apart > (reach + enough) * (reach + enough):
+                continue
+            close = enough < _CLOSE
+            if apart > reach * reach and not close:
+                # free here; to prove more by looking at each pair would cost more than it saves
+                if end >= 0:
+                    lists[end + kept] = g
+                    kept += 1
+                continue
+            least = enough if close else 0.0
+            for p in range(groups[g, 2], groups[g, 3]):
+                i, j, keep = pairs[p, 0], pairs[p, 1], keeps[p]
+                put_shape(i, bodies, poses, frames, done, world)
+                put_shape(j, bodies, poses, frames, done, world)
+                x, y, z = (
+                    world[i, 0, 3] - world[j, 0, 3],
+                    world[i, 1, 3] - world[j, 1, 3],
+                    world[i, 2, 3] - world[j, 2, 3],
+                )
+                reach = max(radii[i] + radii[j] + keep + least, 0.0)
+                if x * x + y * y + z * z > reach * reach:
+                    continue
+                least = min(least, separation(i, j, keep + least, kinds, sizes, world) - keep)
+                if least < 0.0:
+                    return -1
+        if least < 0.0:
+            return -1
+        if end >= 0 and least < enough:
+            lists[end + kept] = g
+            kept += 1
+    return kept
+
+
+@njit(cache=True, nogil=True)
+def near(q: Array, model: Model, work: Work) -> bool:
+    """Whether in a state (n,) something is not proven to be as far from all else as it must be."""
+    place(q, model, work)
+    return look(0, sift(0.0, model, work), -1, 0.0, model, work) < 0
+
+
+@njit(cache=True, nogil=True)
+def states_free(states: Array, model: Model, out: NDArray[np.bool_]) -> None:
+    """Whether each of the states (m, n) is proven free."""
+    work = workspace(model)
+    for k in range(states.shape[0]):
+        out[k] = not near(states[k], model, work)

@@ -1,0 +1,439 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motions of both arms at once that keep them apart all the way. Base frame, m, rad, s.
+
+Together: one path of all joints, timed as one. Staggered: each arm has a path of its own, and one of them starts later,
+by as little as keeps them apart; only pairs of moments are looked at for that, nothing is planned anew.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
+from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene, Contact, spread
+from openarm_motion.collision.fast import FastScene
+from openarm_motion.collision.occupancy import NOTHING, Environment
+from openarm_motion.collision.solids import Box
+from openarm_motion.planning.arm import Arm, StartState, segment_time
+from openarm_motion.planning.coordination import ActiveMotion, least_delay
+from openarm_motion.planning.failure import PlanFailedError
+from openarm_motion.planning.planner import PlanQuery, never
+from openarm_motion.planning.rrt import FastPlanner
+from openarm_motion.timing.blending import timings
+from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import JointLimits, Trajectory
+from openarm_motion.timing.validation import dense_times, validate_trajectory
+
+#: Two arms that move at once plan to stay this far apart, m: 20 mm remain when each lags behind its plan a little.
+SEPARATION = 0.025
+
+
+class DualArmScene:
+    """Exact checks of two arms in one set of surroundings; not for two threads at once.
+
+    Args:
+        first: Scene of the first arm, which also looks at the other arm's links.
+        second: Scene of the second arm.
+        split: Joints of the first arm.
+    """
+
+    def __init__(self, first: CollisionScene, second: CollisionScene, split: int) -> None:
+        self.first, self.second = first, second
+        self._split = split
+        self.levers: Array = np.concatenate([first.levers, second.levers])
+
+    def collides(self, q: ArrayLike) -> bool:
+        """Whether some pair is nearer than it may be at a configuration (n1 + n2,)."""
+        a, b = self._put(q)
+        return self.first.collides(a) or self.second.collides(b)
+
+    def contacts(self, q: ArrayLike) -> list[Contact]:
+        """All pairs that are nearer than they may be, the deepest first; a pair of both arms once."""
+        a, b = self._put(q)
+        found = self.first.contacts(a)
+        seen = {frozenset((c.first, c.second)) for c in found}
+        found += [c for c in self.second.contacts(b) if frozenset((c.first, c.second)) not in seen]
+        return sorted(found, key=lambda contact: contact.distance - contact.required)
+
+    def edge_free(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.02) -> bool:
+        """Whether the straight joint line between two configurations is free; see `CollisionScene.edge_free`."""
+        return self.first_hit(a, b, step, travel) is None
+
+    def first_hit(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.02) -> Array | None:
+        """Some colliding configuration on the line between two, or None; far-apart points are looked at first."""
+        difference, k = b - a, self._split
+        size = np.abs(difference)
+        way = size * self.levers
+        # two arms may close in on each other: their ways add up
+        n = int(np.ceil(max(float(size.max()) / step, float(way[:k].sum() + way[k:].sum()) / travel, 1.0)))
+        for u in spread(n):
+            q = a + u * difference
+            if self.collides(q):
+                return q
+        return None
+
+    @contextmanager
+    def lenient(self, share: float, arms: float | None = None) -> Iterator[None]:
+        """Ask for only a share of each positive distance meanwhile, `arms` of that between the arms."""
+        with self.first.lenient(share, arms), self.second.lenient(share, arms):
+            yield
+
+    def separation(self, q: ArrayLike) -> float:
+        """Distance of the arms from each other at a configuration (n1 + n2,), what they hold included, m."""
+        a, _ = self._put(q)
+        # what the second arm holds goes with it as the first one sees it
+        return self.first.gap(a, self.second.robot.arm.moving | self.first.carried)
+
+    def placed(self, q: ArrayLike) -> tuple[CollisionScene, CollisionScene]:
+        """Both scenes with the other arm where a configuration (n1 + n2,) has it."""
+        self._put(q)
+        return self.first, self.second
+
+    def _put(self, q: ArrayLike) -> tuple[Array, Array]:
+        values = np.asarray(q, dtype=np.float64)
+        a, b = values[: self._split], values[self._split :]
+        self.first.put_other(self.second.robot, b)
+        self.second.put_other(self.first.robot, a)
+        return a, b
+
+
+class DualArm:
+    """Two arms of one robot that are planned together.
+
+    Args:
+        first: One arm; its joints come first in every configuration.
+        second: The other.
+    """
+
+    def __init__(self, first: Arm, second: Arm) -> None:
+        self.arms = (first, second)
+        self.names: tuple[str, ...] = (*first.names, *second.names)
+        self.split = first.kinematics.n
+        self.lower: Array = np.concatenate([first.kinematics.lower, second.kinematics.lower])
+        self.upper: Array = np.concatenate([first.kinematics.upper, second.kinematics.upper])
+
+    def parts(self, values: Array) -> tuple[Array, Array]:
+        """What belongs to each arm, of values (..., n1 + n2)."""
+        return values[..., : self.split], values[..., self.split :]
+
+    def scene(
+        self,
+        state: Mapping[str, float],
+        boxes: Sequence[Box] = (),
+        separation: float = SEPARATION,
+        held: tuple[Sequence[Box], Sequence[Box]] = ((), ()),
+        known: Environment = NOTHING,
+    ) -> DualArmScene:
+        """Surroundings of both arms with the table in them.
+
+        Args:
+            state: The robot's joints.
+            boxes: Obstacles, base frame.
+            separation: Distance that the arms keep from each other, m.
+            held: Boxes held by each arm, its tool frame.
+            known: Bodies of the planning scene and the map.
+        """
+        scenes = [self.scene_of(i, state, boxes, separation, held, known) for i in range(2)]
+        return DualArmScene(scenes[0], scenes[1], self.split)
+
+    def scene_of(
+        self,
+        index: int,
+        state: Mapping[str, float],
+        boxes: Sequence[Box] = (),
+        separation: float = SEPARATION,
+        held: tuple[Sequence[Box], Sequence[Box]] = ((), ()),
+        known: Environment = NOTHING,
+    ) -> CollisionScene:
+        """Surroundings of one of the arms, the other one in them where `state` says; arguments as `scene`."""
+        arm = self.arms[index]
+        keep = arm.config.clearance.model_copy(update={"arms": separation})
+        certain = (*arm.static, *known.solids)
+        fixed = frozenset(body.id for body in certain)
+        around = CollisionContext(
+            state,
+            [*certain, *boxes],
+            held=held[index],
+            carried=self.arms[1 - index].robot.on_tool(held[1 - index]),
+            supports=fixed,
+            fixed=fixed,
+            clearance=keep,
+            map=known.map,
+        )
+        return CollisionScene(arm.robot, around)
+
+    def pair_scene(
+        self, state: Mapping[str, float], separation: float, held: tuple[Sequence[Box], Sequence[Box]] = ((), ())
+    ) -> DualArmScene:
+        """Nothing but the arms and what they hold; arguments as `scene`."""
+        first, second = (
+            CollisionContext(
+                state,
+                held=held[i],
+                carried=self.arms[1 - i].robot.on_tool(held[1 - i]),
+                clearance=Clearance(arms=separation),
+                own=False,
+            )
+            for i in range(2)
+        )
+        a, b = self.arms
+        return DualArmScene(CollisionScene(a.robot, first), CollisionScene(b.robot, second), self.split)
+
+    def limits(self, scale: float) -> JointLimits:
+        """Limits of all joints at a velocity scale."""
+        a, b = (arm.limits(scale) for arm in self.arms)
+        return JointLimits(
+            np.concatenate([a.velocity, b.velocity]),
+            np.concatenate([a.acceleration, b.acceleration]),
+            np.concatenate([a.jerk, b.jerk]),
+        )
+
+    def query(
+        self,
+        scene: DualArmScene,
+        start: Array,
+        goals: Array,
+        scale: float,
+        time_limit: float,
+        stopped: Callable[[], bool] = never,
+        fineness: float = 1.0,
+    ) -> PlanQuery:
+        """What a planner is asked for a path (n1 + n2,) to one of several configurations (k, n1 + n2)."""
+        search = self.arms[0].config.planning
+        step, travel = search.edge_step / fineness, search.edge_travel / fineness
+        limits = self.limits(scale)
+        return PlanQuery(
+            start=start,
+            goals=goals,
+            lower=self.lower,
+            upper=self.upper,
+            collides=scene.collides,
+            edge_free=lambda a, b: scene.edge_free(a, b, step, travel),
+            cost=lambda a, b: segment_time(a, b, limits),
+            time_limit=time_limit,
+            iterations=search.iterations,
+            seed=search.seed,
+            stopped=stopped,
+            fast=cache(lambda: FastScene([scene.first, scene.second], scene.first.distances)),
+            resolution=(step, travel),
+            limits=(limits.velocity, limits.acceleration, limits.jerk),
+        )
+
+
+#: Pairs of goals that one search gets.
+_GOALS = 24
+#: No point of the arms moves further between two looks, m, and as much less than planned they may be apart there.
+_TRAVEL = 0.004
+_SEEN = SEPARATION - 0.25 * _TRAVEL
+#: Looks from one coarse look to the next.
+_STRIDE = 8
+#: Steps of the searches, how many times finer.
+_FINENESS = (1.0, 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class DualArmGoals:
+    """What both arms are asked.
+
+    Attributes:
+        goals: Of each arm, configurations (k, n); any will do, an earlier one is preferred.
+        obstacles: Boxes, base frame.
+        held: Boxes that each arm holds, tool frame.
+    """
+
+    goals: tuple[Array, Array]
+    obstacles: Sequence[Box] = ()
+    held: tuple[Sequence[Box], Sequence[Box]] = ((), ())
+
+
+@dataclass(frozen=True, eq=False)
+class DualArmPlan:
+    """Trajectories that begin at the same moment, how long each rests in it first, and the arms' least distance, m."""
+
+    trajectories: tuple[Trajectory, Trajectory]
+    delays: tuple[float, float]
+    separation: float
+
+
+def plan_together(both: DualArm, now: StartState, wanted: DualArmGoals, time_limit: float) -> DualArmPlan:
+    """One path of all joints.
+
+    Args:
+        both: The arms.
+        now: The robot's joints; `start` is that of both arms (n1 + n2,).
+        wanted: Where to.
+        time_limit: s.
+
+    Raises:
+        OpenArmError: IN_COLLISION, when the arms start or would end too near to something, naming the pair; NO_PLAN;
+            CANCELLED.
+    """
+    end = time.monotonic() + time_limit
+    scene = both.scene(now.state, wanted.obstacles, held=wanted.held, known=now.known)
+    for arm, part, start in zip(both.arms, scene.placed(now.start), both.parts(now.start), strict=True):
+        arm.relax(part, start)
+    goals = _pairs(scene, wanted.goals)
+    limits, search = both.limits(now.scale), both.arms[0].config.planning
+    least, fault, contact = _least(scene, now.start), "", None
+    for fineness in _FINENESS:
+        left = max(end - time.monotonic(), 0.1)
+        path = FastPlanner().plan(both.query(scene, now.start, goals, now.scale, left, now.stopped, fineness))
+        for whole in timings(search.timing, both.names, path.waypoints, limits, search.period):
+            try:
+                validate_trajectory(scene, whole, _TRAVEL)
+            except PlanFailedError as error:
+                fault, contact = error.message, error.contact
+                continue
+            gap = separation(scene, whole)
+            if gap >= least:
+                q, v, a = (both.parts(x) for x in (whole.q, whole.v, whole.a))
+                first, second = (Trajectory(arm.names, whole.t, q[i], v[i], a[i]) for i, arm in enumerate(both.arms))
+                return DualArmPlan((first, second), (0.0, 0.0), gap)
+            fault, contact = f"the arms would come within {gap * 1e3:.1f} mm of each other", None
+    text = f"the plan of both arms did not pass the dense look: {fault}"
+    raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
+
+
+def plan_staggered(both: DualArm, now: StartState, wanted: DualArmGoals, time_limit: float) -> DualArmPlan:
+    """A path of each arm alone; the later one waits as briefly as keeps them apart.
+
+    Of both orders the one that ends earlier is taken. The first arm is planned with the other where it is, the second
+    with the first at its goal: the second may always follow once the first has arrived.
+
+    Raises:
+        OpenArmError: as `plan_together`.
+    """
+    found: list[_Staggered] = []
+    faults: list[OpenArmError] = []
+    for first in range(2):
+        try:
+            found.append(_in_order(both, now, wanted, first, 0.5 * time_limit))
+        except OpenArmError as error:
+            if error.code not in (Code.NO_PLAN, Code.IN_COLLISION):
+                raise
+            faults.append(error)
+    if not found:
+        text = "; ".join(f"{arm.name} first: {e.message}" for arm, e in zip(both.arms, faults, strict=True))
+        raise OpenArmError(faults[0].code, f"neither arm can go first: {text}")
+    best = min(found, key=lambda plan: max(part.duration for part in plan.parts))
+    scene = both.scene(now.state, held=wanted.held)
+    return DualArmPlan(best.parts, best.waits, separation(scene, joined(both, best.parts)))
+
+
+def plan_any(both: DualArm, now: StartState, wanted: DualArmGoals, time_limit: float) -> DualArmPlan:
+    """Together where that is found in half of the time, else staggered.
+
+    Raises:
+        OpenArmError: as `plan_together`.
+    """
+    try:
+        return plan_together(both, now, wanted, 0.5 * time_limit)
+    except OpenArmError as error:
+        if error.code not in (Code.NO_PLAN, Code.IN_COLLISION):
+            raise
+        try:
+            return plan_staggered(both, now, wanted, 0.5 * time_limit)
+        except OpenArmError as second:
+            if second.code == Code.CANCELLED:
+                raise
+            raise error from second  # the first one knows more: it looked at both arms
+
+
+def separation(scene: DualArmScene, whole: Trajectory) -> float:
+    """Least distance of the arms on a timed motion of all joints, at looks no more than 4 mm of way apart, m."""
+    states = whole.at(dense_times(whole, scene.levers, _TRAVEL))[0]
+    gaps = {i: scene.separation(states[i]) for i in {*range(0, len(states), _STRIDE), len(states) - 1}}
+    least = min(gaps.values())
+    looked = sorted(gaps)
+    for i, j in itertools.pairwise(looked):
+        # the distance changes no faster than points move
+        if 0.5 * (gaps[i] + gaps[j] - (j - i) * _TRAVEL) < least:
+            least = min(least, *(scene.separation(states[k]) for k in range(i, j + 1)))
+    return least
+
+
+def delayed(trajectory: Trajectory, wait: float) -> Trajectory:
+    """The same after a rest of `wait` seconds."""
+    if wait <= 0.0:
+        return trajectory
+    rest = np.zeros_like(trajectory.v[:1])
+    return replace(
+        trajectory,
+        t=np.concatenate([[0.0], trajectory.t + wait]),
+        q=np.concatenate([trajectory.q[:1], trajectory.q]),
+        v=np.concatenate([rest, trajectory.v]),
+        a=np.concatenate([rest, trajectory.a]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Staggered:
+    parts: tuple[Trajectory, Trajectory]
+    waits: tuple[float, float]
+
+
+def _in_order(both: DualArm, now: StartState, wanted: DualArmGoals, first: int, time_limit: float) -> _Staggered:
+    second = 1 - first
+    early = _alone(both, first, now, now.state, wanted, time_limit)
+    there = {**now.state, **dict(zip(both.arms[first].names, early.q[-1].tolist(), strict=True))}
+    late = _alone(both, second, now, there, wanted, time_limit)
+    one, other = (
+        ActiveMotion(both.arms[i], Motion.of(part), wanted.held[i]) for i, part in ((first, early), (second, late))
+    )
+    wait = least_delay(other, [one], now.state, stopped=now.stopped)
+    if first == 0:
+        return _Staggered((early, delayed(late, wait)), (0.0, wait))
+    return _Staggered((delayed(late, wait), early), (wait, 0.0))
+
+
+def joined(both: DualArm, parts: tuple[Trajectory, Trajectory]) -> Trajectory:
+    """Both trajectories as one of all joints."""
+    times = np.union1d(parts[0].t, parts[1].t)
+    (q0, v0, a0), (q1, v1, a1) = (part.at(times) for part in parts)
+    return Trajectory(both.names, times, np.hstack([q0, q1]), np.hstack([v0, v1]), np.hstack([a0, a1]))
+
+
+def _alone(
+    both: DualArm, index: int, now: StartState, state: Mapping[str, float], wanted: DualArmGoals, time_limit: float
+) -> Trajectory:
+    """The path of one arm with the other one where `state` says."""
+    arm, start = both.arms[index], both.parts(now.start)[index]
+    scene = both.scene_of(index, state, wanted.obstacles, held=wanted.held, known=now.known)
+    arm.relax(scene, start)
+    goals = [q for q in wanted.goals[index] if not scene.collides(q)][:_GOALS]
+    if not goals:
+        contact = scene.contacts(wanted.goals[index][0])[0]
+        raise PlanFailedError(Code.IN_COLLISION, f"goal of the {arm.name} arm: {contact}", "goal", contact)
+    mine = StartState(state, start, now.scale, now.stopped, now.known)
+    return arm.plan_validated(scene, mine, np.array(goals), time_limit).trajectory
+
+
+def _pairs(scene: DualArmScene, goals: tuple[Array, Array]) -> Array:
+    """Goals of both arms that go together, the preferred ones first; (k, n1 + n2)."""
+    order = sorted(np.ndindex(len(goals[0]), len(goals[1])), key=sum)
+    found: list[Array] = []
+    for i, j in order:
+        q = np.concatenate([goals[0][i], goals[1][j]])
+        if not scene.collides(q):
+            found.append(q)
+            if len(found) == _GOALS:
+                break
+    if not found:
+        contact = scene.contacts(np.concatenate([goals[0][0], goals[1][0]]))[0]
+        text = f"goals of both arms: {contact} (all {len(order)} pairs of goals collide)"
+        raise PlanFailedError(Code.IN_COLLISION, text, "goal", contact)
+    return np.array(found)
+
+
+def _least(scene: DualArmScene, start: Array) -> float:
+    """Distance that the arms keep: less only where they start nearer to each other already."""
+    return min(_SEEN, scene.separation(start) - 0.25 * _TRAVEL)
