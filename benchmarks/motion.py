@@ -206,7 +206,7 @@ def main() -> None:
 
     def dual(problem: Problem) -> PlanQuery:
         scene = both.scene(problem.state, problem.boxes)
-        return both.query(scene, problem.start, problem.goals, 0.5, 5.0)
+        return both.query(scene, StartState(problem.state, problem.start, 0.5), problem.goals, 5.0)
 
     def problems(name: str, most: int, few: int) -> tuple[int, int]:
         return (few if quick else most), seeds[name]

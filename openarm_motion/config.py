@@ -40,7 +40,7 @@ class StraightClearance(Clearance):
 
     hand: float = Field(default=0.003, ge=0.0, le=0.1, description="hand, or what it holds, to boxes, m")
     rest: float = Field(
-        default=-0.004, ge=-0.02, le=0.05, description="held box to what it stands on; < 0 allows overlap, m"
+        default=-0.004, ge=-0.02, le=0.05, description="held box to what it rests on; < 0 allows overlap, m"
     )
 
 
@@ -102,9 +102,14 @@ class MapConfig(Config):
         description="required: no plan without a fresh map; optional: plans go without one that is missing or old",
     )
     max_age: float = Field(
-        default=3.0, gt=0.0, le=60.0, description="oldest update, and oldest look of each camera, that counts, s"
+        default=3.0,
+        gt=0.0,
+        le=60.0,
+        description="oldest update, and oldest contribution of each camera, that counts, s",
     )
-    cameras: tuple[str, ...] = Field(default=(), description="cameras that must have looked; empty: all of the map's")
+    cameras: tuple[str, ...] = Field(
+        default=(), description="cameras that must have contributed; empty: all of the map's"
+    )
     name: str = Field(
         default="", pattern=r"^[A-Za-z0-9_.-]*$", description="of the map's shared memory; empty: by ROS domain"
     )
@@ -114,7 +119,7 @@ class MapConfig(Config):
     estimate_padding: float = Field(
         default=0.03, ge=0.0, le=0.2, description="the same for a request's boxes and for what is held, m"
     )
-    robot_padding: float = Field(default=0.005, ge=0.0, le=0.2, description="the same for the robot where it stands, m")
+    robot_padding: float = Field(default=0.005, ge=0.0, le=0.2, description="the same for the robot itself, m")
 
     @field_validator("use", mode="before")
     @classmethod
@@ -139,4 +144,4 @@ class MotionConfig(Config):
     clearance: Clearance = Field(default_factory=Clearance, description="on free paths")
     straight: StraightClearance = Field(default_factory=StraightClearance, description="clearance on straight parts")
     planning: PlanningConfig = Field(default_factory=PlanningConfig, description="search")
-    execution: ExecutionConfig = Field(default_factory=ExecutionConfig, description="watching execution")
+    execution: ExecutionConfig = Field(default_factory=ExecutionConfig, description="monitoring of execution")

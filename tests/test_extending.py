@@ -16,8 +16,7 @@ from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_grasp.strategies import registry
-from openarm_motion.planning.planner import PlanQuery
-from openarm_motion.planning.planners import make_planner
+from openarm_motion.planning.planner import PlanQuery, make_planner
 from tests.openarm_grasp.scripted import Wait, World, standing
 
 ROOT = Path(__file__).parents[1]

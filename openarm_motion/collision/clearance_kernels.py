@@ -38,10 +38,10 @@ class Model(NamedTuple):
         clusters: (c,) body of each cluster; those that move come first.
         centres: (c, 3) of the ball about a cluster, in its body.
         bounds: (c,) radius of that ball.
-        runs: (moving clusters + 1,) where the groups of each moving cluster with clusters that stand still begin.
+        runs: (moving clusters + 1,) where the groups of each moving cluster with clusters at rest begin.
         groups: (g, 5) clusters a (moving) and b, the first and last + 1 of their pairs, and b's shape if it is one
-            that stands still, else -1; groups of two moving clusters come last.
-        points: (3, g) centre of cluster b where it stands still.
+            at rest, else -1; groups of two moving clusters come last.
+        points: (3, g) centre of cluster b where it is at rest.
         reaches: (g,) greatest distance that a pair of the group must keep.
         spans: (g,) the same with the radii of both balls.
         swings: (g + m, n) how far, at most, a point of cluster a (of a body's spheres) moves as seen by cluster b (the
@@ -97,7 +97,7 @@ class Work(NamedTuple):
         done: (s + 1,) the number of the state that each shape was last placed for; the last one is that number.
         middles: (c, 3) centres of clusters.
         near: (g,) flags.
-        sways: (g + m,) how far things come nearer over a line, m.
+        sways: (g + m,) how far bodies come nearer over a line, m.
         lists: Numbers of groups.
         spans: (k, 4) intervals of a line: first and last point, where the list of its groups begins, its length.
         q: (n,) a state.
@@ -156,7 +156,7 @@ def put_shape(k: int, bodies: Ints, poses: Array, frames: Array, done: Ints, wor
 
 @njit(cache=True, nogil=True)
 def map_room(m: int, enough: float, model: Model, work: Work) -> float:
-    """By how much a body is further from the map than it must be; looked for until it is `enough`."""
+    """By how much a body is further from the map than it must be; searched until it is `enough`."""
     groups, spheres, shapes, keeps = model.sphere_groups, model.spheres, model.sphere_shapes, model.sphere_keep
     field, corner, edge = model.field, model.corner, model.edge
     kinds, sizes, bodies, poses = model.kinds, model.sizes, model.bodies, model.poses
@@ -168,7 +168,7 @@ def map_room(m: int, enough: float, model: Model, work: Work) -> float:
         if room >= 0.0:
             least = min(least, room)
             continue
-        # the ball is too near: look at the shape itself and each cell that the ball may be near to
+        # the ball is too near: check the shape itself and each cell that the ball may be near to
         i, keep, least = shapes[k], keeps[k], 0.0
         put_shape(i, bodies, poses, frames, done, world)
         reach = spheres[k, 3] + width
@@ -207,7 +207,7 @@ def map_distance(frame: Array, ball: Array, field: NDArray[np.float32], corner: 
     return field[i, j, k] - ball[3] - edge[1]
 
 
-#: More room than this is looked for between the balls of clusters only, not between the shapes in them, m.
+#: More clearance than this is searched between the balls of clusters only, not between the shapes in them, m.
 _CLOSE = 0.03
 
 
@@ -274,8 +274,8 @@ def sift(share: float, model: Model, work: Work) -> int:
 
 
 @njit(cache=True, nogil=True)
-def look(start: int, count: int, end: int, share: float, model: Model, work: Work) -> int:
-    """Look at listed groups (and bodies in the map) in the state that things were placed for.
+def check_listed(start: int, count: int, end: int, share: float, model: Model, work: Work) -> int:
+    """Check listed groups (and bodies in the map) in the state that bodies were placed for.
 
     Args:
         start: Where the list begins.
@@ -322,7 +322,7 @@ def look(start: int, count: int, end: int, share: float, model: Model, work: Wor
                 continue
             close = enough < _CLOSE
             if apart > reach * reach and not close:
-                # free here; to prove more by looking at each pair would cost more than it saves
+                # free here; to prove more by checking each pair would cost more than it saves
                 if end >= 0:
                     lists[end + kept] = g
                     kept += 1
@@ -355,7 +355,7 @@ def look(start: int, count: int, end: int, share: float, model: Model, work: Wor
 def near(q: Array, model: Model, work: Work) -> bool:
     """Whether in a state (n,) something is not proven to be as far from all else as it must be."""
     place(q, model, work)
-    return look(0, sift(0.0, model, work), -1, 0.0, model, work) < 0
+    return check_listed(0, sift(0.0, model, work), -1, 0.0, model, work) < 0
 
 
 @njit(cache=True, nogil=True)

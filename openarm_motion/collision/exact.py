@@ -8,6 +8,7 @@ frame (the description's root), held boxes in the frame of the tool centre point
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -40,7 +41,7 @@ class Clearance(Config):
         default=0.002, ge=0.0, le=0.05, description="arm and palm to a box that the fingers may touch, m"
     )
     rest: float = Field(
-        default=0.0, ge=-0.02, le=0.05, description="held box to what it stands on; < 0 allows overlap, m"
+        default=0.0, ge=-0.02, le=0.05, description="held box to what it rests on; < 0 allows overlap, m"
     )
 
 
@@ -54,10 +55,10 @@ class CollisionContext:
         held: Boxes held by this arm, pose in the tool frame.
         carried: Boxes that go with the other arm: the joint that each hangs on, pose in that joint's frame.
         touchable: Ids of boxes that the fingers may touch.
-        supports: Ids of boxes that a held box may stand on.
+        supports: Ids of boxes that a held box may rest on.
         fixed: Ids of boxes that are where they are said to be; the others are estimates.
         clearance: Distances to keep.
-        map: What the cameras see beside all that; None is nothing.
+        map: What the cameras observe in addition; None is nothing.
         own: Whether the arm is checked against itself and the robot's body; False leaves the other arm and the boxes.
     """
 
@@ -75,7 +76,7 @@ class CollisionContext:
 
 @dataclass(frozen=True)
 class Contact:
-    """Two things nearer to each other than allowed.
+    """Two bodies nearer to each other than allowed.
 
     Attributes:
         first: Link or held box.
@@ -123,7 +124,36 @@ _LESS = 1e-3
 _REPORT_RANGE = 1.0
 
 
-class CollisionScene:
+class LineChecks(ABC):
+    """Checks of straight joint lines by single configurations."""
+
+    #: (n,) how far the points that a joint moves are from its axis, at most, m.
+    levers: Array
+
+    @abstractmethod
+    def collides(self, q: ArrayLike) -> bool:
+        """Whether some pair is nearer than it may be at a configuration (n,)."""
+
+    def edge_free(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.04) -> bool:
+        """Whether the straight joint line between two configurations is free, the ends included.
+
+        Args:
+            a: (n,) rad.
+            b: (n,) rad.
+            step: No joint turns further than this between two checks, rad.
+            travel: No point moves further than this between two checks, m; travels of two arms add up.
+        """
+        return self.first_hit(a, b, step, travel) is None
+
+    def first_hit(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.04) -> Array | None:
+        """Some colliding configuration on the line between two, or None; far-apart points are checked first."""
+        difference = b - a
+        size = np.abs(difference)
+        n = int(np.ceil(max(float(size.max()) / step, float(size @ self.levers) / travel, 1.0)))
+        return next((q for q in (a + u * difference for u in spread(n)) if self.collides(q)), None)
+
+
+class CollisionScene(LineChecks):
     """One arm in one set of surroundings. Not for two threads at once; build one for each query (4 ms).
 
     Args:
@@ -231,28 +261,6 @@ class CollisionScene:
         found = [self._contact(k) for k in self._colliding(q)]
         return sorted(found, key=lambda contact: contact.distance - contact.required)
 
-    def edge_free(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.04) -> bool:
-        """Whether the straight joint line between two configurations is free, the ends included.
-
-        Args:
-            a: (n,) rad.
-            b: (n,) rad.
-            step: No joint turns further than this between two checks, rad.
-            travel: No point of the arm moves further than this between two checks, m.
-        """
-        return self.first_hit(a, b, step, travel) is None
-
-    def first_hit(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.04) -> Array | None:
-        """Some colliding configuration on the line between two, or None; far-apart points are looked at first."""
-        difference = b - a
-        size = np.abs(difference)
-        n = int(np.ceil(max(float(size.max()) / step, float(size @ self.levers) / travel, 1.0)))
-        for u in spread(n):
-            q = a + u * difference
-            if self.collides(q):
-                return q
-        return None
-
     def relax(self, q: ArrayLike, allowance: float, estimates: float | None = None) -> Contact | None:
         """Let pairs that are too near at `q` stay as near as they are: an arm must be able to leave where it is.
 
@@ -306,7 +314,7 @@ class CollisionScene:
     def _measure(self) -> None:
         """Set how far points are from the joints' axes, what is held included."""
         held = [self._geometry.geometryObjects[self._boxes[self._held_name(b.id)]] for b in self._around.held]
-        self.levers: Array = np.max([self._robot.levers, *(self._robot.levers_of(o) for o in held)], axis=0)
+        self.levers = np.max([self._robot.levers, *(self._robot.levers_of(o) for o in held)], axis=0)
 
     def set_state(self, state: Mapping[str, float]) -> None:
         """Move the robot's other joints."""
@@ -326,7 +334,7 @@ class CollisionScene:
         centres, radii = np.zeros((max(used) + 1, 3)), np.zeros(max(used) + 1)
         for i, (centre, radius) in used.items():
             centres[i], radii[i] = centre, radius
-        # balls about the shapes say which pairs are worth a look
+        # balls about the shapes say which pairs are worth a check
         least = np.linalg.norm(centres[first] - centres[second], axis=1) - radii[first] - radii[second]
         best = float("inf")
         for n in np.argsort(least):

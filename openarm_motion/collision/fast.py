@@ -61,7 +61,7 @@ class FastScene:
         return out
 
     def edge_free(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.02) -> bool:
-        """Whether the straight joint line is free, at the states where the exact layer would look."""
+        """Whether the straight joint line is free, at the states where the exact layer would check."""
         return bool(line_free(a, b, step, travel, self.levers, self.model, self._work))
 
 
@@ -180,7 +180,7 @@ class _Packer:
         moving = sum(cluster.body > 0 for cluster in clusters)
         still = [int(row[0]) for row in groups if row[1] >= moving]
         spheres, sphere_groups, bounds, covered = self._spheres()
-        if self._field is not None:  # a cell of the map, which is put where it is when it is looked at
+        if self._field is not None:  # a cell of the map, which is put where it is when it is checked
             self._put(BOX, np.full(3, 0.5 * self._field.resolution), 0, np.eye(4))
         field = self._field
         slack = 0.0 if field is None else float(np.sqrt(3.0)) * field.resolution
@@ -258,7 +258,7 @@ class _Packer:
             if clusters[cluster].body == 0:
                 lone[cluster] = k
         i, j, keep = (np.array(column) for column in zip(*self._keep, strict=True))
-        a, b = np.sort([cluster_of[i], cluster_of[j]], axis=0)  # what stands still comes second
+        a, b = np.sort([cluster_of[i], cluster_of[j]], axis=0)  # what is at rest comes second
         order = np.lexsort((b, a, lone[b] < 0))
         a, b, keep = a[order], b[order], keep[order]
         first = np.flatnonzero(np.diff(a, prepend=-1) | np.diff(b, prepend=-1))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numba kernels of straight joint lines in the fast collision layer; they release the GIL. m, rad.
 
-A line is looked at in the same states as by the exact layer, the middle first, then the middles of its halves, and so
+A line is checked in the same states as by the exact layer, the middle first, then the middles of its halves, and so
 on. A group of shapes that is further apart in the middle than any point of it moves from there to the ends is left out
-of both halves: that is a proof for all states between, and most groups are gone after a few looks.
+of both halves: that is a proof for all states between, and most groups are gone after a few checks.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 from numba import njit
 
 from openarm_common.types import Array
-from openarm_motion.collision.clearance_kernels import Model, Work, look, near, place, sift
+from openarm_motion.collision.clearance_kernels import Model, Work, check_listed, near, place, sift
 
 
 @njit(cache=True, nogil=True)
@@ -56,7 +56,7 @@ def between_free(a: Array, b: Array, step: float, travel: float, levers: Array, 
         head += 1
         split = last - first > 2
         listed = split and end + count <= lists.shape[0]
-        kept = look(start, count, end if listed else -1, share, model, work)
+        kept = check_listed(start, count, end if listed else -1, share, model, work)
         if kept < 0:
             return False
         if listed:

@@ -28,7 +28,7 @@ _PACKAGE = "package://"
 
 
 def load_robot(urdf: Path, srdf: Path | None = None, packages: Mapping[str, Path] | None = None) -> RobotDescription:
-    """Read a robot; collision meshes become boxes, what is only to be seen is left out.
+    """Read a robot; collision meshes become boxes, visual shapes are left out.
 
     Args:
         urdf: The file.

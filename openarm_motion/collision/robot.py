@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collision shapes of a robot as one of its arms sees them: what moves, and which pairs are worth a look.
+"""Collision shapes of a robot as one of its arms sees them: what moves, and which pairs are worth a check.
 
 Shapes are the primitives of the URDF; pairs that may touch come from the SRDF. m, rad.
 """

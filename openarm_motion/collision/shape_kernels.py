@@ -40,7 +40,7 @@ def _outside(kind: int, s0: float, s1: float, s2: float, x: float, y: float, z: 
 
 @njit(cache=True, nogil=True)
 def separation(i: int, j: int, enough: float, kinds: Ints, sizes: Array, world: Array) -> float:
-    """Distance that two shapes are proven to keep (< 0: they overlap no deeper); looked for until it is `enough`.
+    """Distance that two shapes are proven to keep (< 0: they overlap no deeper); searched until it is `enough`.
 
     Everything is in numbers, not in small arrays: those would cost more than the arithmetic.
     """

@@ -98,7 +98,7 @@ def solve_line(
 
 
 def line_contact(scene: CollisionScene, line: Line) -> Contact | None:
-    """Something that the arm would come too near to on the line, or None; the ends are looked at first."""
+    """Something that the arm would come too near to on the line, or None; the ends are checked first."""
     m = len(line.q)
     order = [m - 1, 0, *range(m // 2, m - 1), *range(1, m // 2)]
     for k in order:

@@ -24,8 +24,8 @@ _RINGS = (0.02, 0.04, 0.07, 0.11, 0.16, 0.22)
 _SEARCH = 0.3
 #: Time for what is near to the target of an approach, s.
 _APPROACH = 0.5
-#: Configurations of a pose that are looked at.
-_LOOKS = 16
+#: Configurations of a pose that are checked.
+_CONFIGURATIONS = 16
 #: Steps back from a configuration towards the start.
 _STEPS = 20
 
@@ -81,7 +81,7 @@ def near_pose(
         solve = arm.inverse.position_solutions if free_orientation else arm.inverse.solutions
         found = solve(target, arm.config.planning.joint_margin, now.start)
         # of a whole turn of the elbow, some of every part
-        goals = [s.q for s in found[:: max(1, len(found) // _LOOKS)] if not scene.collides(s.q)]
+        goals = [s.q for s in found[:: max(1, len(found) // _CONFIGURATIONS)] if not scene.collides(s.q)]
         q = _planned(arm, scene, now, np.array(goals[:8])) if goals else None
         if q is not None:
             there = arm.kinematics.fk(q)

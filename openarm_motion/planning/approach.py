@@ -3,7 +3,7 @@
 
 For each target every configuration is followed along both lines on its own branch, and kept when limits and clearance
 hold all the way; then one search runs from the start to the beginnings of all that were kept. All three parts are timed
-and looked at densely before they are handed out. What is refused says why. Base frame, m, rad.
+and validated before they are returned. What is refused says why. Base frame, m, rad.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class ApproachRequest:
 
     Attributes:
         targets: Any of them will do.
-        obstacles: Boxes beside the robot and the table, base frame.
+        obstacles: Boxes in addition to the robot and the table, base frame.
         attached: Boxes held by the arm, tool frame.
         touchable: Ids of obstacles that the fingers may touch on the straight parts.
         attached_after: The touchable obstacles are carried on the retreat (a grasp).
@@ -122,7 +122,7 @@ class Refused:
 
 #: A configuration nearer to a joint limit than this is thought less of, rad.
 _COMFORT = 0.3
-#: Targets looked at for a start configuration before the search is tried.
+#: Targets checked for a start configuration before the search is tried.
 _GOALS = 24
 #: How far a target got, the furthest first.
 _CODES = (Code.NO_PLAN, Code.IN_COLLISION, Code.UNREACHABLE)
@@ -140,9 +140,9 @@ class ApproachPlan:
         retreat: Straight line away from it.
         refusals: Why others were not chosen.
         held_after: Boxes that the arm holds at the end, tool frame.
-        certificates: What the three parts were looked at with, in their order.
+        certificates: How the three parts were validated, in their order.
         limit_margins: Of each target, how near its best configuration (of the chosen one: that which was planned) comes
-            to a joint limit on both lines, rad; NaN for those that were refused or not looked at.
+            to a joint limit on both lines, rad; NaN for those that were refused or not checked.
     """
 
     chosen: int
@@ -180,14 +180,14 @@ def plan_approach(
 ) -> ApproachPlan:
     """Plan one of the targets.
 
-    Targets are looked at by score, those that differ by less than `score_step` together; within such a group short
+    Targets are checked by score, those that differ by less than `score_step` together; within such a group short
     travel and distance from joint limits decide.
 
     Args:
         arm: The arm.
         now: The robot's state, where the arm starts, the velocity scale.
         request: What is asked.
-        report: Called with "checking" or "planning" and the number of targets looked at so far.
+        report: Called with "checking" or "planning" and the number of targets checked so far.
 
     Raises:
         ApproachFailedError: UNREACHABLE, IN_COLLISION or NO_PLAN, with the reason for each target.
@@ -390,7 +390,7 @@ def _far(fault: PlanFailedError | Refused) -> tuple[int, int]:
 
 
 def _failed(arm: Arm, refusals: tuple[Refused, ...]) -> ApproachFailedError:
-    """The furthest that any target got is the code; its sentence stands for the others."""
+    """The furthest that any target got is the code; its message represents the others."""
     furthest = min(refusals, key=_far)
     ids = {refused.id for refused in refusals}
     others = f" ({len(ids) - 1} other targets refused)" if len(ids) > 1 else ""

@@ -16,12 +16,12 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
-from openarm_motion.collision.exact import CollisionContext, CollisionScene, Contact
+from openarm_motion.collision.exact import CollisionContext, CollisionScene, Contact, LineChecks
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.robot import CollisionRobot
 from openarm_motion.collision.solids import Box
-from openarm_motion.config import MotionConfig
+from openarm_motion.config import MotionConfig, PlanningConfig
 from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_motion.kinematics.line import Line
@@ -35,13 +35,13 @@ from openarm_motion.timing.validation import Validation, validate_trajectory
 _SAG = 0.05
 
 
-#: How many times finer the steps of the searches are that follow one whose result did not pass the dense look.
+#: How many times finer the steps of the searches are that follow one whose result failed the validation.
 _FINENESS = (1.0, 4.0)
 
 
 @dataclass(frozen=True, eq=False)
 class ValidatedPlan:
-    """A path, the same timed, and what it was looked at with."""
+    """A path, the same timed, and how it was validated."""
 
     path: PlannedPath
     trajectory: Trajectory
@@ -74,7 +74,7 @@ class Arm:
         name: For messages, for example "left".
         description: The robot.
         config: Parameters.
-        static: Boxes that are always there (the table), base frame; held objects may stand on them.
+        static: Boxes that are always there (the table), base frame; held objects may rest on them.
         planner: Finds free paths.
 
     Raises:
@@ -252,9 +252,9 @@ class Arm:
             raise PlanFailedError(Code.NO_PLAN, error.message + blocked, "search", contact) from error
 
     def plan_validated(self, scene: CollisionScene, now: StartState, goals: Array, time_limit: float) -> ValidatedPlan:
-        """Free path to one of several configurations, timed, and looked at densely on the exact layer.
+        """Free path to one of several configurations, timed, and validated on the exact layer.
 
-        Where the dense look finds what the search stepped over, the search is repeated with finer steps.
+        Where the validation finds what the search stepped over, the search is repeated with finer steps.
 
         Raises:
             OpenArmError: as `plan`; IN_COLLISION, when the finest search did not help.
@@ -268,36 +268,17 @@ class Arm:
                     return ValidatedPlan(path, trajectory, validate_trajectory(scene, trajectory))
                 except PlanFailedError as error:
                     fault, contact = error.message, error.contact
-        text = f"the {self.name} arm's plan did not pass the dense look: {fault}"
+        text = f"the {self.name} arm's plan failed the validation: {fault}"
         raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
 
     def query(
         self, scene: CollisionScene, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
     ) -> PlanQuery:
         """What a planner is asked for a path to one of several goals (k, n); steps are `fineness` times finer."""
-        search = self.config.planning
-        step, travel = search.edge_step / fineness, search.edge_travel / fineness
-        limits = self.limits(now.scale)
-
-        def edge_free(a: Array, b: Array) -> bool:
-            return scene.edge_free(a, b, step, travel)
-
-        return PlanQuery(
-            start=now.start,
-            goals=goals,
-            lower=self.kinematics.lower,
-            upper=self.kinematics.upper,
-            collides=scene.collides,
-            edge_free=edge_free,
-            cost=lambda a, b: segment_time(a, b, limits),
-            time_limit=time_limit,
-            iterations=search.iterations,
-            seed=search.seed,
-            stopped=now.stopped,
-            fast=cache(lambda: FastScene([scene], scene.distances)),
-            resolution=(step, travel),
-            limits=(limits.velocity, limits.acceleration, limits.jerk),
-        )
+        bounds = (self.kinematics.lower, self.kinematics.upper)
+        fast = cache(lambda: FastScene([scene], scene.distances))
+        search, limits = self.config.planning, self.limits(now.scale)
+        return plan_query(search, scene, fast, bounds, limits, now, goals, time_limit, fineness)
 
     def timings(self, path: PlannedPath, scale: float) -> Iterator[Trajectory]:
         """Timed free paths, the best first; see `blending.timings`."""
@@ -308,6 +289,49 @@ class Arm:
         """Timed straight line."""
         speed = self.config.limits.straight_speed * self.scale(scale)
         return time_path(self.names, line.q, line.s, self.limits(scale), speed, self.config.planning.period)
+
+
+def plan_query(
+    search: PlanningConfig,
+    scene: LineChecks,
+    fast: Callable[[], FastScene],
+    bounds: tuple[Array, Array],
+    limits: JointLimits,
+    now: StartState,
+    goals: Array,
+    time_limit: float,
+    fineness: float,
+) -> PlanQuery:
+    """Return what a planner is asked for a path to one of several goals.
+
+    Args:
+        search: Parameters.
+        scene: What the path keeps clear of.
+        fast: Makes the fast layer's view of the scene.
+        bounds: Lower and upper joint limits (n,).
+        limits: Of velocity, acceleration and jerk.
+        now: Where it starts, and whether it was stopped.
+        goals: (k, n) rad.
+        time_limit: s.
+        fineness: Checks are so many times closer than the parameters say.
+    """
+    step, travel = search.edge_step / fineness, search.edge_travel / fineness
+    return PlanQuery(
+        start=now.start,
+        goals=goals,
+        lower=bounds[0],
+        upper=bounds[1],
+        collides=scene.collides,
+        edge_free=lambda a, b: scene.edge_free(a, b, step, travel),
+        cost=lambda a, b: segment_time(a, b, limits),
+        time_limit=time_limit,
+        iterations=search.iterations,
+        seed=search.seed,
+        stopped=now.stopped,
+        fast=fast,
+        resolution=(step, travel),
+        limits=(limits.velocity, limits.acceleration, limits.jerk),
+    )
 
 
 def segment_time(a: Array, b: Array, limits: JointLimits) -> float:

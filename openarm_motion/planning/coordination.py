@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm sets out while another is under way: how long it must rest first so that they keep apart all the way.
+"""An arm starts while another is under way: how long it must rest first so that they keep apart all the way.
 
-Both are looked at as they go on and where they end up, at moments between which their points move no further than a
+Both are checked as they go on and where they end, at moments between which their points move no further than a
 few millimetres, on the exact layer. The rest is found on a grid of 0.1 s. Base frame, m, rad, s.
 """
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 #: Distance of two arms under way that is proven, m.
 APART = 0.020
-#: The points of both arms together move no further between two looks, m; half of it may be missed between them.
+#: The points of both arms together move no further between two checks, m; half of it may be missed between them.
 _TRAVEL = 0.004
-#: Asked for at each look, m: what is missed between two, and a little for arms that lag behind.
+#: Asked for at each check, m: what is missed between two, and a little for arms that lag behind.
 _SEEN = APART + 0.5 * _TRAVEL + 0.002
 #: What is between two samples of a motion is taken for straight when they are no further apart, s.
 _GRID = 0.05
@@ -64,7 +64,7 @@ def least_delay(
     Arms that are nearer to each other now may stay as near as they are.
 
     Args:
-        mine: The arm that is to set out, its motion beginning now.
+        mine: The arm that is to start, its motion beginning now.
         others: The other arms.
         state: Present positions of the robot's joints.
         longest: It may rest no longer, s.
@@ -76,7 +76,7 @@ def least_delay(
     """
     pair = _Pair(mine, others, state)
     if pair.overlaps:
-        return 0.0  # any way out is better than none, and the plan has looked at it
+        return 0.0  # any way out is better than none, and the plan has checked it
     over = max([0.0, *(float(other.motion.t[-1]) for other in others)])  # the others stand still from then on
     last = min(over, longest)
     hit: tuple[float, Array] = (0.0, mine.motion.q[0])

@@ -2,14 +2,14 @@
 """Motions of both arms at once that keep them apart all the way. Base frame, m, rad, s.
 
 Together: one path of all joints, timed as one. Staggered: each arm has a path of its own, and one of them starts later,
-by as little as keeps them apart; only pairs of moments are looked at for that, nothing is planned anew.
+by as little as keeps them apart; only pairs of moments are checked for that, nothing is planned anew.
 """
 
 from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -19,14 +19,14 @@ from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene, Contact, spread
+from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene, Contact, LineChecks
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.solids import Box
-from openarm_motion.planning.arm import Arm, StartState, segment_time
+from openarm_motion.planning.arm import Arm, StartState, plan_query
 from openarm_motion.planning.coordination import ActiveMotion, least_delay
 from openarm_motion.planning.failure import PlanFailedError
-from openarm_motion.planning.planner import PlanQuery, never
+from openarm_motion.planning.planner import PlanQuery
 from openarm_motion.planning.rrt import FastPlanner
 from openarm_motion.timing.blending import timings
 from openarm_motion.timing.checks import Motion
@@ -37,11 +37,11 @@ from openarm_motion.timing.validation import dense_times, validate_trajectory
 SEPARATION = 0.025
 
 
-class DualArmScene:
+class DualArmScene(LineChecks):
     """Exact checks of two arms in one set of surroundings; not for two threads at once.
 
     Args:
-        first: Scene of the first arm, which also looks at the other arm's links.
+        first: Scene of the first arm, which also checks the other arm's links.
         second: Scene of the second arm.
         split: Joints of the first arm.
     """
@@ -49,7 +49,7 @@ class DualArmScene:
     def __init__(self, first: CollisionScene, second: CollisionScene, split: int) -> None:
         self.first, self.second = first, second
         self._split = split
-        self.levers: Array = np.concatenate([first.levers, second.levers])
+        self.levers = np.concatenate([first.levers, second.levers])
 
     def collides(self, q: ArrayLike) -> bool:
         """Whether some pair is nearer than it may be at a configuration (n1 + n2,)."""
@@ -63,23 +63,6 @@ class DualArmScene:
         seen = {frozenset((c.first, c.second)) for c in found}
         found += [c for c in self.second.contacts(b) if frozenset((c.first, c.second)) not in seen]
         return sorted(found, key=lambda contact: contact.distance - contact.required)
-
-    def edge_free(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.02) -> bool:
-        """Whether the straight joint line between two configurations is free; see `CollisionScene.edge_free`."""
-        return self.first_hit(a, b, step, travel) is None
-
-    def first_hit(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.02) -> Array | None:
-        """Some colliding configuration on the line between two, or None; far-apart points are looked at first."""
-        difference, k = b - a, self._split
-        size = np.abs(difference)
-        way = size * self.levers
-        # two arms may close in on each other: their ways add up
-        n = int(np.ceil(max(float(size.max()) / step, float(way[:k].sum() + way[k:].sum()) / travel, 1.0)))
-        for u in spread(n):
-            q = a + u * difference
-            if self.collides(q):
-                return q
-        return None
 
     @contextmanager
     def lenient(self, share: float, arms: float | None = None) -> Iterator[None]:
@@ -198,43 +181,20 @@ class DualArm:
         )
 
     def query(
-        self,
-        scene: DualArmScene,
-        start: Array,
-        goals: Array,
-        scale: float,
-        time_limit: float,
-        stopped: Callable[[], bool] = never,
-        fineness: float = 1.0,
+        self, scene: DualArmScene, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
     ) -> PlanQuery:
-        """What a planner is asked for a path (n1 + n2,) to one of several configurations (k, n1 + n2)."""
-        search = self.arms[0].config.planning
-        step, travel = search.edge_step / fineness, search.edge_travel / fineness
-        limits = self.limits(scale)
-        return PlanQuery(
-            start=start,
-            goals=goals,
-            lower=self.lower,
-            upper=self.upper,
-            collides=scene.collides,
-            edge_free=lambda a, b: scene.edge_free(a, b, step, travel),
-            cost=lambda a, b: segment_time(a, b, limits),
-            time_limit=time_limit,
-            iterations=search.iterations,
-            seed=search.seed,
-            stopped=stopped,
-            fast=cache(lambda: FastScene([scene.first, scene.second], scene.first.distances)),
-            resolution=(step, travel),
-            limits=(limits.velocity, limits.acceleration, limits.jerk),
-        )
+        """What a planner is asked for a path to one of several configurations (k, n1 + n2); as `Arm.query`."""
+        fast = cache(lambda: FastScene([scene.first, scene.second], scene.first.distances))
+        search, bounds = self.arms[0].config.planning, (self.lower, self.upper)
+        return plan_query(search, scene, fast, bounds, self.limits(now.scale), now, goals, time_limit, fineness)
 
 
 #: Pairs of goals that one search gets.
 _GOALS = 24
-#: No point of the arms moves further between two looks, m, and as much less than planned they may be apart there.
+#: No point of the arms moves further between two checks, m, and as much less than planned they may be apart there.
 _TRAVEL = 0.004
 _SEEN = SEPARATION - 0.25 * _TRAVEL
-#: Looks from one coarse look to the next.
+#: Checks from one coarse check to the next.
 _STRIDE = 8
 #: Steps of the searches, how many times finer.
 _FINENESS = (1.0, 4.0)
@@ -286,7 +246,7 @@ def plan_together(both: DualArm, now: StartState, wanted: DualArmGoals, time_lim
     least, fault, contact = _least(scene, now.start), "", None
     for fineness in _FINENESS:
         left = max(end - time.monotonic(), 0.1)
-        path = FastPlanner().plan(both.query(scene, now.start, goals, now.scale, left, now.stopped, fineness))
+        path = FastPlanner().plan(both.query(scene, now, goals, left, fineness))
         for whole in timings(search.timing, both.names, path.waypoints, limits, search.period):
             try:
                 validate_trajectory(scene, whole, _TRAVEL)
@@ -299,7 +259,7 @@ def plan_together(both: DualArm, now: StartState, wanted: DualArmGoals, time_lim
                 first, second = (Trajectory(arm.names, whole.t, q[i], v[i], a[i]) for i, arm in enumerate(both.arms))
                 return DualArmPlan((first, second), (0.0, 0.0), gap)
             fault, contact = f"the arms would come within {gap * 1e3:.1f} mm of each other", None
-    text = f"the plan of both arms did not pass the dense look: {fault}"
+    text = f"the plan of both arms failed the validation: {fault}"
     raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
 
 
@@ -345,16 +305,16 @@ def plan_any(both: DualArm, now: StartState, wanted: DualArmGoals, time_limit: f
         except OpenArmError as second:
             if second.code == Code.CANCELLED:
                 raise
-            raise error from second  # the first one knows more: it looked at both arms
+            raise error from second  # the first one knows more: it considered both arms
 
 
 def separation(scene: DualArmScene, whole: Trajectory) -> float:
-    """Least distance of the arms on a timed motion of all joints, at looks no more than 4 mm of way apart, m."""
+    """Least distance of the arms on a timed motion of all joints, at checks no more than 4 mm of travel apart, m."""
     states = whole.at(dense_times(whole, scene.levers, _TRAVEL))[0]
     gaps = {i: scene.separation(states[i]) for i in {*range(0, len(states), _STRIDE), len(states) - 1}}
     least = min(gaps.values())
-    looked = sorted(gaps)
-    for i, j in itertools.pairwise(looked):
+    checked = sorted(gaps)
+    for i, j in itertools.pairwise(checked):
         # the distance changes no faster than points move
         if 0.5 * (gaps[i] + gaps[j] - (j - i) * _TRAVEL) < least:
             least = min(least, *(scene.separation(states[k]) for k in range(i, j + 1)))

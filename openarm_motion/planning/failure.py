@@ -12,8 +12,8 @@ from openarm_common.types import Array
 if TYPE_CHECKING:
     from openarm_motion.collision.exact import Contact
 
-#: How far planning got: the request itself, the start, the goal, the straight line, the search, the dense look at the
-#: timed plan, the planning scene, beside another arm under way.
+#: How far planning got: the request itself, the start, the goal, the straight line, the search, the validation of
+#: the timed plan ("certificate"), the planning scene, next to another arm under way ("execution").
 Stage = Literal["request", "start", "goal", "line", "search", "certificate", "scene", "execution"]
 
 
@@ -40,7 +40,7 @@ class PlanFailedError(OpenArmError):
         message: As `OpenArmError`.
         stage: How far planning got.
         contact: The pair in the way, where there is one.
-        alternative: The nearest goal that works, where one was looked for and found.
+        alternative: The nearest goal that works, where one was searched and found.
     """
 
     def __init__(

@@ -18,7 +18,7 @@ from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.timing.trajectory import Trajectory
 from openarm_motion.timing.validation import validate_trajectory
 
-#: A joint that is told to go no further than this from its limit is taken at its word, rad.
+#: A joint goal no further than this beyond its limit is moved to the limit, rad.
 _ROUNDING = 1e-3
 #: Goals of one search.
 _GOALS = 24
@@ -56,10 +56,7 @@ def to_named(arm: Arm, now: StartState, posture: str, around: RequestBoxes) -> T
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing the postures there are; as `to_joints`.
     """
-    state = arm.description.group_state(arm.config.group.format(arm=arm.name), posture)
-    start: dict[str, float] = dict(zip(arm.names, now.start.tolist(), strict=True))
-    goal = [state.get(name, start[name]) for name in arm.names]
-    return to_joints(arm, now, goal, around, f"posture {posture!r}")
+    return to_joints(arm, now, named_posture(arm, posture, now.start), around, f"posture {posture!r}")
 
 
 def to_pose(
@@ -70,16 +67,8 @@ def to_pose(
     Raises:
         OpenArmError: UNREACHABLE, with the nearest reachable pose; IN_COLLISION, naming the pair; NO_PLAN; CANCELLED.
     """
-    margin = arm.config.planning.joint_margin
     scene = free_scene(arm, now, around)
-    if free_orientation:
-        solutions = arm.inverse.position_solutions(pose, margin, now.start)
-    else:
-        solutions = arm.inverse.solutions(pose, margin, now.start)
-    if not solutions:
-        raise unreachable(arm, pose, free_orientation=free_orientation)
-    limits = arm.limits(now.scale)
-    ordered = sorted((s.q for s in solutions), key=lambda q: segment_time(now.start, q, limits))
+    ordered = _configurations(arm, now.scale, now.start, pose, free_orientation=free_orientation)
     goals = [q for q in ordered if not scene.collides(q)][:_GOALS]
     if not goals:
         contact = scene.contacts(ordered[0])[0]
@@ -89,7 +78,7 @@ def to_pose(
 
 
 def to_pose_on_line(arm: Arm, now: StartState, pose: Array, around: RequestBoxes) -> Trajectory:
-    """Straight line of the tool to a pose (4, 4), without a change of branch, looked at densely when it is timed.
+    """Straight line of the tool to a pose (4, 4), without a change of branch, validated when it is timed.
 
     Raises:
         OpenArmError: UNREACHABLE, saying where the line ends and why; IN_COLLISION, naming the pair.
@@ -125,7 +114,7 @@ def to_pose_on_line(arm: Arm, now: StartState, pose: Array, around: RequestBoxes
 def unreachable(
     arm: Arm, pose: Array, *, free_orientation: bool, margin: float | None = None, near: Array | None = None
 ) -> OpenArmError:
-    """The error for a pose that the arm can't reach: the reason, and the nearest pose to it, looked for from `near`."""
+    """The error for a pose that the arm can't reach: the reason, and the nearest pose to it, searched from `near`."""
     x, y, z = pose[:3, 3]
     kept = arm.config.planning.joint_margin if margin is None else margin
     why = arm.inverse.why_not(pose, kept, near, position_only=free_orientation)
@@ -153,7 +142,7 @@ def _plan(arm: Arm, scene: CollisionScene, now: StartState, goals: Array) -> Tra
 _MOST = 24
 
 
-def posture(arm: Arm, name: str, start: Array) -> Array:
+def named_posture(arm: Arm, name: str, start: Array) -> Array:
     """A posture of the SRDF (n,); joints that it does not name stay.
 
     Raises:
@@ -166,7 +155,7 @@ def posture(arm: Arm, name: str, start: Array) -> Array:
 
 def yielding(arm: Arm, start: Array, name: str) -> Array:
     """Stay, or else the posture of that name; (2, n)."""
-    return np.stack([start, posture(arm, name, start)])
+    return np.stack([start, named_posture(arm, name, start)])
 
 
 def goal_configurations(
@@ -177,11 +166,16 @@ def goal_configurations(
     Raises:
         PlanFailedError: UNREACHABLE, with the reason.
     """
+    # of a whole turn of the elbow, some of every part: the nearest alone may all meet the other arm
+    ordered = _configurations(arm, now.scale, start, pose, free_orientation=free_orientation)
+    return np.array(ordered[:: max(1, len(ordered) // _MOST)][:_MOST])
+
+
+def _configurations(arm: Arm, scale: float, start: Array, pose: Array, *, free_orientation: bool) -> list[Array]:
+    """All configurations with the tool at a pose, those that are reached first come first; UNREACHABLE without one."""
     solve = arm.inverse.position_solutions if free_orientation else arm.inverse.solutions
     solutions = solve(pose, arm.config.planning.joint_margin, start)
     if not solutions:
         raise unreachable(arm, pose, free_orientation=free_orientation)
-    limits = arm.limits(now.scale)
-    # of a whole turn of the elbow, some of every part: the nearest alone may all meet the other arm
-    ordered = sorted((s.q for s in solutions), key=lambda q: segment_time(start, q, limits))
-    return np.array(ordered[:: max(1, len(ordered) // _MOST)][:_MOST])
+    limits = arm.limits(scale)
+    return sorted((s.q for s in solutions), key=lambda q: segment_time(start, q, limits))

@@ -86,10 +86,10 @@ class OmplPlanner:
             planner.setRange(self._range)
             planner.setProblemDefinition(problem)
             planner.setup()
-        end, looks = time.monotonic() + query.time_limit, itertools.count()
+        end, samples = time.monotonic() + query.time_limit, itertools.count()
 
         def enough() -> bool:  # asked once a sample
-            limit = next(looks) >= query.iterations if query.iterations else time.monotonic() > end
+            limit = next(samples) >= query.iterations if query.iterations else time.monotonic() > end
             return limit or query.stopped()
 
         planner.solve(ob.PlannerTerminationCondition(enough))

@@ -103,7 +103,7 @@ def cancelled() -> OpenArmError:
 def make_planner(name: str) -> Planner:
     """The planner of a name: fast, ompl, or `package.module:Class`, whose class is made without arguments.
 
-    Whatever it answers is timed, held against the limits and looked at densely on the exact layer like our own paths.
+    Whatever it answers is timed, checked against the limits and validated on the exact layer like our own paths.
 
     Raises:
         OpenArmError: CONFIG_INVALID, when there is no such class, or it can't plan.

@@ -22,12 +22,12 @@ from openarm_motion.planning.planner import PlannedPath, Planner, PlanQuery, can
 
 #: Two configurations nearer than this in every joint are one, rad.
 _SAME = 1e-6
-#: Configurations a tree has room for, and samples between two looks at the clock.
+#: Configurations a tree has room for, and samples between two checks of the clock.
 _ROOM = 20_000
 _CHUNK = 500
 #: Way points that a path may grow by while it is shortened.
 _SPARE = 8
-#: How many times longer the steps of the first search are than those of the last look.
+#: How many times longer the steps of the first search are than those of the final check.
 _COARSE = 3.0
 #: Share of the time after which the exact layer gets its turn.
 _SHARE = 0.5
@@ -60,7 +60,7 @@ class FastPlanner:
             if float(np.max(np.abs(goal - query.start))) < _SAME or scene.edge_free(query.start, goal, step, travel):
                 return PlannedPath(np.stack([query.start, goal]), i, i + 1)
         end = begin + _SHARE * query.time_limit
-        # a coarse search first; what it finds counts only when a close look agrees
+        # a coarse search first; what it finds counts only when a fine check agrees
         for factor in (_COARSE, 1.0):
             found = self._search(query, scene, (step * factor, travel * factor), end)
             if found is None:

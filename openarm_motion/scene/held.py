@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each arm holds, as far as plans say so: a plan tells what will be held on each of its parts."""
+"""What each arm holds, as far as plans say so: a plan says what will be held on each of its parts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PLANS = 32
 
 
 class HeldObjects:
-    """The one thing that the motion node remembers between requests."""
+    """What the hands hold, and what they will hold when a plan is executed."""
 
     def __init__(self) -> None:
         self._held: dict[str, tuple[Box, ...]] = {}

@@ -21,9 +21,9 @@ _TRIES = 3
 
 @dataclass(frozen=True)
 class MapState:
-    """What there is of the map: `seen` is None where plans go without it, and `why` says so."""
+    """The map as it is now: `occupied` is None where plans go without it, and `why` says so."""
 
-    seen: OccupancyMap | None
+    occupied: OccupancyMap | None
     version: int = 0
     age_s: float = -1.0
     why: str = ""
@@ -42,7 +42,7 @@ class FieldSource(Protocol):
 
 
 class MapView:
-    """Looks at the map.
+    """Reads the map.
 
     Args:
         config: Whether it is needed, and how old it may be.
@@ -55,7 +55,7 @@ class MapView:
         self._reader = source
         self._cells: OccupancyMap | None = None
 
-    def look(self, now_ns: int) -> MapState:
+    def read(self, now_ns: int) -> MapState:
         """The present map.
 
         Args:
@@ -94,7 +94,7 @@ class MapView:
 
 
 def unexplained(
-    seen: OccupancyMap,
+    occupied: OccupancyMap,
     config: MapConfig,
     robot: RobotDescription,
     state: Mapping[str, float],
@@ -102,6 +102,6 @@ def unexplained(
     estimates: Sequence[Solid],
 ) -> OccupancyMap:
     """The map without the robot, the bodies of the scene, and those of the request and the hands (base frame)."""
-    left = seen.without(certain, config.certain_padding)
+    left = occupied.without(certain, config.certain_padding)
     left = left.without(estimates, config.estimate_padding)
     return left.without(robot_bodies(robot, state), config.robot_padding)

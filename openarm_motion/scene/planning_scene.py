@@ -25,7 +25,7 @@ class PlanningScene:
 
     @property
     def solids(self) -> tuple[Solid, ...]:
-        """Bodies beside the fixed ones, in the order in which they came."""
+        """Bodies in addition to the fixed ones, in the order in which they came."""
         return tuple(self._solids.values())
 
     def apply(self, *, clear: bool, remove: Sequence[str], add: Sequence[Solid], expected: int = 0) -> int:
@@ -65,7 +65,7 @@ class PlanningScene:
         return self.version
 
     def require(self, expected: int) -> None:
-        """Refuse what was meant for another version of the scene; 0 is any.
+        """Refuse what was made for another version of the scene; 0 is any.
 
         Raises:
             PlanFailedError: STALE_DATA, with both versions.

@@ -65,9 +65,9 @@ class PlanningContext:
         self._robot, self._arms, self._scene, self._held = robot, arms, scene, held
         self._coordination, self._map, self._config = coordination, map_view, config
 
-    def look(self) -> MapState:
-        """Return the map as it is now; what is required and missing is an error, see `MapView.look`."""
-        return self._map.look(round(self._robot.now() * 1e9))
+    def map_state(self) -> MapState:
+        """Return the map as it is now; what is required and missing is an error, see `MapView.read`."""
+        return self._map.read(round(self._robot.now() * 1e9))
 
     def prepare(
         self,
@@ -93,7 +93,7 @@ class PlanningContext:
             expected: Version that the scene must have; 0 is any.
 
         Raises:
-            OpenArmError: from `Arm.situation`, `PlanningScene.require` and `MapView.look`; NOT_READY without joints.
+            OpenArmError: from `Arm.situation`, `PlanningScene.require` and `MapView.read`; NOT_READY without joints.
         """
         self._scene.require(expected)
         now = self.start(arm, start, scale, stopped)
@@ -144,18 +144,18 @@ class PlanningContext:
         later: Mapping[str, float],
         apart: float = 0.0,
     ) -> Prepared:
-        look, config = self.look(), self._config.map
+        view, config = self.map_state(), self._config.map
         certain = (*self._scene.fixed, *solids)
         robot = next(iter(self._arms.values())).description  # with what is mounted on it
 
         def complete() -> StartState:
-            seen = look.seen
-            if seen is not None:
-                seen = unexplained(seen, config, robot, now.state, certain, estimates)
-            return replace(now, state=later, known=Environment(solids, seen, apart))
+            occupied = view.occupied
+            if occupied is not None:
+                occupied = unexplained(occupied, config, robot, now.state, certain, estimates)
+            return replace(now, state=later, known=Environment(solids, occupied, apart))
 
         # a graph without a map is as it should be; one with an old map is not
-        note = f" without the map: {look.why}" if look.why and look.version else ""
+        note = f" without the map: {view.why}" if view.why and view.version else ""
         return Prepared(now, self._scene.version, note, complete)
 
     def _others_hold(self, arm: Arm, state: Mapping[str, float]) -> list[Box]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arms next to each other: execute a trajectory, starting it late enough to keep clear of an arm under way.
 
-Two arms that are sent out at the same time go one after the other through the part that looks for clearance; from then
+Two arms that are sent out at the same time go one after the other through the search for clearance; from then
 on each knows when the other began. An arm that stops on its way makes the other one check again.
 """
 
@@ -18,7 +18,7 @@ from openarm_motion.service.follower import TrajectoryFollower
 from openarm_motion.service.robot import RobotInterface
 from openarm_motion.timing.checks import Motion, check_against_others, check_trajectory
 
-#: An arm begins so long after the newest joint state, s: time to look for clearance and to send the trajectory. When
+#: An arm begins so long after the newest joint state, s: time to search for clearance and to send the trajectory. When
 #: that was not enough, the next.
 _HEAD_STARTS = (0.1, 0.4, 1.5, 5.0)
 #: What of it must be left to send the trajectory, s.

@@ -26,7 +26,7 @@ from openarm_motion.planning.alternative import explained, explained_approach, n
 from openarm_motion.planning.approach import ApproachFailedError, ApproachPlan, plan_approach
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.dual_arm import DualArm, DualArmGoals, DualArmPlan, plan_any, plan_staggered, plan_together
-from openarm_motion.planning.moves import goal_configurations, posture, yielding
+from openarm_motion.planning.moves import goal_configurations, named_posture, yielding
 from openarm_motion.planning.planner import never
 from openarm_motion.scene.held import HeldObjects
 from openarm_motion.scene.map_view import FieldSource, MapView
@@ -321,8 +321,8 @@ class MotionService:
         scene = self.scene
         used, version, age, why = False, 0, -1.0, ""
         try:
-            look = self._context.look()
-            used, version, age, why = look.seen is not None, look.version, look.age_s, look.why
+            view = self._context.map_state()
+            used, version, age, why = view.occupied is not None, view.version, view.age_s, view.why
         except OpenArmError as error:
             why = error.message
         solids = (*scene.fixed, *scene.solids)
@@ -331,7 +331,7 @@ class MotionService:
     def apply_scene(self, *, clear: bool, remove: Sequence[str], add: Sequence[Solid], expected: int = 0) -> str:
         """Change the planning scene, all as asked or nothing; see `PlanningScene.apply`. Return it in a sentence."""
         self.scene.apply(clear=clear, remove=remove, add=add, expected=expected)
-        names = ", ".join(solid.id for solid in self.scene.solids) or "nothing beside what is fixed"
+        names = ", ".join(solid.id for solid in self.scene.solids) or "nothing but what is fixed"
         return f"version {self.scene.version}: {names}"
 
     def check_map(self) -> str:
@@ -340,8 +340,8 @@ class MotionService:
         Raises:
             OpenArmError: NOT_READY or STALE_DATA, when it is required.
         """
-        look = self._context.look()
-        return look.why or f"version {look.version}, {look.age_s:.1f} s old"
+        view = self._context.map_state()
+        return view.why or f"version {view.version}, {view.age_s:.1f} s old"
 
     def tool_paths(self, plans: Mapping[str, Sequence[Trajectory]]) -> dict[str, Array]:
         """Return the paths (n, 3) of the tools on the trajectories of each arm, one after the other, base frame, m."""
@@ -367,7 +367,7 @@ class MotionService:
         if isinstance(goal, NamedGoal):
             return lambda now: explained(
                 lambda: moves.to_named(arm, now, goal.name, around),
-                lambda: near_joints(arm, now, around, posture(arm, goal.name, now.start)),
+                lambda: near_joints(arm, now, around, named_posture(arm, goal.name, now.start)),
             )
         pose = self.in_base(goal.pose, goal.frame)
         if isinstance(goal, PoseGoal):
@@ -385,7 +385,7 @@ class MotionService:
             q = arm.configuration(goal.q, f"goal of the {arm.name} arm", 1e-3)
             return lambda _: q[None]
         if isinstance(goal, NamedGoal):
-            return lambda _: posture(arm, goal.name, start)[None]
+            return lambda _: named_posture(arm, goal.name, start)[None]
         if isinstance(goal, YieldGoal):
             return lambda _: yielding(arm, start, goal.name)
         pose, free = self.in_base(goal.pose, goal.frame), goal.free_orientation

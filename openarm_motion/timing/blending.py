@@ -2,8 +2,8 @@
 """Other timings of joint polylines: without stops in the corners, and quintic polynomials as the simple choice.
 
 A corner is rounded by beginning its second segment before the first has ended: the two motions add up, so the path
-stays in the triangle of the corner, and the sum is looked at against the limits. A path so rounded is not the one that
-was planned: it needs a certificate of its own. s, rad, rad/s, rad/s², rad/s³.
+stays in the triangle of the corner, and the sum is checked against the limits. A path so rounded is not the one that
+was planned: it needs a validation of its own. s, rad, rad/s, rad/s², rad/s³.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from openarm_motion.timing.trajectory import (
     time_polyline,
 )
 
-#: Shares of the longest overlap of two segments that are tried, and looks at each.
+#: Shares of the longest overlap of two segments that are tried, and checks of each.
 _SHARES = (1.0, 0.8, 0.65, 0.5, 0.35, 0.2, 0.1)
-_LOOKS = 60
+_CHECKS = 60
 #: Excess over a limit that is rounding.
 _ROUNDING = 1.0 + 1e-6
 #: Greatest derivatives of 10 u³ - 15 u⁴ + 6 u⁵ over 0 to 1.
@@ -151,7 +151,7 @@ def _overlap(last: _Segment, way: Profile, difference: Array, ends: float, limit
         fresh = _Segment(way, difference, ends - overlap)
         borders = np.concatenate([last.begin + last.way.t, fresh.begin + way.t])
         borders = borders[(borders > ends - overlap) & (borders < ends)]
-        t = np.concatenate([np.linspace(ends - overlap, ends - 1e-9, _LOOKS), borders, borders - 1e-9])
+        t = np.concatenate([np.linspace(ends - overlap, ends - 1e-9, _CHECKS), borders, borders - 1e-9])
         one, two = last.at(t), fresh.at(t)
         if all(
             np.all(np.abs(one[k] + two[k]) <= limit * _ROUNDING)

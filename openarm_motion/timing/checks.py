@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 #: What rounding (or another interpolation between the points) may add to a limit.
 _SLACK = 1.02
 _ROUNDING = 1e-3
-#: Time between two looks at a pair of moving arms, s.
+#: Time between two checks of a pair of moving arms, s.
 _PAIR_STEP = 0.04
 #: Arms on their way keep this distance, m: less than plans keep, so that a plan is not refused for rounding.
 _PAIR_CLEARANCE = 0.005
@@ -73,7 +73,7 @@ class Motion:
 
 
 def check_trajectory(arm: Arm, motion: Motion, state: Mapping[str, float]) -> Motion:
-    """Refuse a trajectory that the arm should not be told to follow.
+    """Refuse a trajectory that the arm should not follow.
 
     Args:
         arm: The arm.
@@ -147,7 +147,7 @@ def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float], o
     keep = Clearance(arms=_PAIR_CLEARANCE)
     scene = CollisionScene(arm.robot, CollisionContext(state=state, clearance=keep, own=False))
     if scene.relax(motion.q[0], arm.config.planning.start_overlap) is not None:
-        return  # it is in contact already: any way out is better than none, and the plan has looked at it
+        return  # it is in contact already: any way out is better than none, and the plan has checked it
     end = max([motion.duration, *(other.duration for other in others)])
     for t in np.linspace(0.0, end, max(2, int(np.ceil(end / _PAIR_STEP)) + 1)):
         if others:

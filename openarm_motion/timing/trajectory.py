@@ -21,7 +21,7 @@ from scipy.interpolate import make_interp_spline
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 
-#: Samples of a path at which limits are looked at, and the excess over them that rounding may leave.
+#: Samples of a path at which limits are checked, and the excess over them that rounding may leave.
 _FINE = 400
 #: A path shorter than this, rad or m, is none.
 _NOTHING = 1e-9

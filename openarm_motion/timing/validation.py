@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Proof that a timed trajectory is free: looked at densely on the exact layer, with room for a robot that lags behind.
+"""Validation of a timed trajectory: checked densely on the exact layer, with clearance for a robot that lags behind.
 
-A plan keeps the clearance of its scene where the search looked. The certificate looks again, as the controller will
-interpolate, so closely that no point of the arm moves further than `travel` between two looks, and asks for a share of
-the clearance there. Half a look away from a sample no point has moved further than half of `travel`. m, rad, s.
+A plan keeps the clearance of its scene where the search checked. The validation checks again, as the controller will
+interpolate, so closely that no point of the arm moves further than `travel` between two checks, and asks for a share of
+the clearance there. Half a step away from a sample no point has moved further than half of `travel`. m, rad, s.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from openarm_motion.timing.trajectory import Trajectory
 if TYPE_CHECKING:
     from openarm_motion.collision.exact import Contact
 
-#: Share of the clearance that must be left between the looks of the search.
+#: Share of the clearance that must be left between the checks of the search.
 _SHARE = 0.5
 #: The same to the other arm: 27 mm of 30, so that there is room for it when that one sets out.
 _ARMS = 0.9
-#: No point of the arm moves further between two looks, m.
+#: No point of the arm moves further between two checks, m.
 _TRAVEL = 0.004
 
 
 @dataclass(frozen=True)
 class Validation:
-    """What was looked at.
+    """What was checked.
 
     Attributes:
         states: How many states.
@@ -46,7 +46,7 @@ class Validation:
 
 
 class Checked(Protocol):
-    """What a trajectory is looked at in: a scene of one arm, or of two."""
+    """What a trajectory is checked in: a scene of one arm, or of two."""
 
     levers: Array
 
@@ -66,12 +66,12 @@ class Checked(Protocol):
 def validate_trajectory(
     scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL, share: float = _SHARE
 ) -> Validation:
-    """Look at a trajectory densely.
+    """Check a trajectory densely.
 
     Args:
         scene: What it was planned in; its clearances are reduced meanwhile, not for good.
         trajectory: As it goes to the controller.
-        travel: Greatest way of a point between two looks, m.
+        travel: Greatest travel of a point between two checks, m.
         share: Share of each positive clearance to ask for; overlaps that are allowed stay so.
 
     Raises:

@@ -106,7 +106,7 @@ def test_corners_of_plans_are_rounded_only_where_the_exact_layer_agrees(right: A
 def test_a_rounded_corner_that_touches_is_done_with_a_stop(
     right: Arm, home: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is rounded may not be what was planned: a timing that fails the dense look gives way to the next one."""
+    """What is rounded may not be what was planned: a timing that fails the validation gives way to the next one."""
     scene = right.scene(home)
     start = np.array([home[name] for name in right.names])
     path = PlannedPath(np.stack([start, start + 0.05, start]), 0, 2)

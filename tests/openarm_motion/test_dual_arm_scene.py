@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from openarm_motion.collision.solids import Box, box_from
-from openarm_motion.planning.arm import Arm
+from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.dual_arm import DualArm, DualArmScene
 from openarm_motion.planning.ompl_planner import OmplPlanner
 
@@ -57,7 +57,7 @@ def test_arms_that_swap_sides_of_a_box_keep_apart_all_the_way(both: DualArm, hom
     # one arm leaves the middle while the other enters it: the straight line meets half-way
     a, b = np.concatenate([left_in, start[7:]]), np.concatenate([start[:7], right_in])
     scene: DualArmScene = both.scene(home)
-    path = OmplPlanner().plan(both.query(scene, a, b[None], 0.5, 10.0))
+    path = OmplPlanner().plan(both.query(scene, StartState({}, a, 0.5), b[None], 10.0))
     finer = both.scene(home, separation=0.020)
     for p, q in itertools.pairwise(path.waypoints):
         assert finer.edge_free(p, q, 0.01, 0.005)

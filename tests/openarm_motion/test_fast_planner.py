@@ -106,7 +106,7 @@ def test_both_arms_keep_apart_on_the_whole_path(arms: dict[str, Arm], home: dict
     scene, judge = both.scene(home), both.scene(home, separation=0.020)
     states = [q for q in rng.uniform(both.lower, both.upper, (600, 14)) if not scene.collides(q)][:10]
     for start, goal in itertools.pairwise(states):
-        path = FastPlanner().plan(both.query(scene, start, goal[None], 0.5, 10.0))
+        path = FastPlanner().plan(both.query(scene, StartState({}, start, 0.5), goal[None], 10.0))
         for a, b in itertools.pairwise(path.waypoints):
             assert judge.edge_free(a, b, 0.02, 0.01)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The dense look at a timed trajectory."""
+"""Validation of a timed trajectory."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_what_a_search_stepped_over_is_searched_again_more_closely_and_never_han
     path = across(right, home)
     sheet = box_from("sheet", (0.32, -0.21, 0.6), (0.5, 0.001, 0.4))
     now = StartState(home, path.waypoints[0])
-    with pytest.raises(OpenArmError, match="did not pass the dense look") as caught:
+    with pytest.raises(OpenArmError, match="failed the validation") as caught:
         arm.plan_validated(arm.scene(home, [sheet]), now, path.waypoints[1:], 1.0)
     assert caught.value.code == Code.IN_COLLISION
     assert planner.resolutions == [(0.05, 0.02), (0.0125, 0.005)]
