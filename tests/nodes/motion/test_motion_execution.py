@@ -45,7 +45,7 @@ def test_cancel_holds(bench) -> None:
     handle, future = bench.start(
         bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=bench.slow_plan())
     )
-    bench.ros.spin_until(lambda: "right" in bench.robot.active, 5.0, "the arm to start")
+    bench.ros.spin_until(lambda: "right" in bench.robot.active, 20.0, "the arm to start")
     bench.ros.result(handle.cancel_goal_async())
     answer = bench.ros.result(future)
     assert answer.status == 5  # canceled
@@ -104,7 +104,7 @@ def test_a_silent_robot_ends_a_motion_within_two_seconds(bench) -> None:
     assert (result.success, result.code) == (False, "ROBOT_LOST")
     assert "no /joint_states" in result.message
     # and nothing new is begun
-    bench.ros.spin_until(lambda: bench.node.robot.state_age() > 0.6, 5.0)
+    bench.ros.spin_until(lambda: bench.node.robot.state_age() > 0.6, 20.0, "old joint states")
     result = bench.run(bench.move_client, bench.named("left"))
     assert result.code == "NOT_READY"
     assert "no fresh /joint_states" in result.message
@@ -126,8 +126,10 @@ def test_stopping_the_motion_process_on_the_way_holds_the_arm(make_bench) -> Non
     with subprocess.Popen(command, env=os.environ, stderr=subprocess.DEVNULL) as process:
         try:
             bench.ros.spin_until(bench.move_client.server_is_ready, 60.0, "the process")
-            goal = ExecuteTrajectory.Goal(arm="right", trajectory=bench.slow_plan())
-            bench.start(bench.execute_client, goal)
+            deadline = time.monotonic() + 30.0
+            while not (plan := bench.slow_plan()).points:  # it has not heard the robot or met its controllers yet
+                assert time.monotonic() < deadline, "the process does not plan"
+            bench.start(bench.execute_client, ExecuteTrajectory.Goal(arm="right", trajectory=plan))
             bench.ros.spin_until(lambda: "right" in bench.robot.active, 20.0, "the arm to start")
             process.send_signal(signal.SIGTERM)
             bench.ros.spin_until(lambda: process.poll() is not None, 20.0, "its end")
