@@ -180,7 +180,7 @@ class DirectLink:
         if self.plans_to_fail > 0:
             self.plans_to_fail -= 1
             await self.robot.wait(PLANNING_S)
-            raise OpenArmError(Code.NO_PLAN, f"{request.arm} arm: no path, on purpose")
+            raise OpenArmError(Code.NO_PLAN, f"{request.arm} arm: no path, by fault injection")
         after = request.after if isinstance(request, PlanPlace) else None
         asked = PlanApproachRequest(
             request.arm,

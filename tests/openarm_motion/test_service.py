@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion service on a robot that is a few lines of Python: no ROS, no physics, one tick of 10 ms a pause."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_motion.collision.solids import Sphere
+from openarm_motion.config import MotionConfig
+from openarm_motion.service.motion_service import MotionService
+from openarm_motion.service.requests import (
+    ArmGoal,
+    ExecuteRequest,
+    MoveArmsRequest,
+    MoveRequest,
+    NamedGoal,
+    PoseGoal,
+)
+from openarm_motion.service.robot import Outcome
+from openarm_motion.timing.checks import Motion
+
+TICK_NS = 10_000_000
+
+
+class Goal:
+    def __init__(self, motion: Motion, begin_ns: int) -> None:
+        self.motion, self.begin_ns = motion, begin_ns
+        self.accepted: bool | None = True
+        self.outcome: Outcome | None = None
+
+    def cancel(self) -> None:
+        self.outcome = self.outcome or Outcome(False, "cancelled")
+
+
+class Controller:
+    """Follows exactly, but for joints that are stuck."""
+
+    def __init__(self, robot: Robot, name: str) -> None:
+        self.robot, self.name = robot, name
+        self.goals: list[Goal] = []
+        self.there = True
+
+    def ready(self) -> bool:
+        return self.there
+
+    def start(self, motion: Motion, begin_ns: int) -> Goal:
+        self.goals.append(Goal(motion, begin_ns or self.robot.t_ns))
+        return self.goals[-1]
+
+    def tick(self) -> None:
+        for goal in self.goals:
+            if goal.outcome is not None:
+                continue
+            elapsed = (self.robot.t_ns - goal.begin_ns) * 1e-9
+            moved = goal.motion.at(max(elapsed, 0.0))
+            self.robot.state.update({name: x for name, x in moved.items() if name not in self.robot.stuck})
+            if elapsed >= goal.motion.duration:
+                goal.outcome = Outcome(True)
+
+
+class Robot:
+    """Implements `openarm_motion.service.robot.RobotInterface`."""
+
+    def __init__(self, description, home) -> None:
+        self.states, self.state = RobotStateBuffer(description), dict(home)
+        self.t_ns = self.heard_ns = 10**9
+        self.silent, self.stuck = False, set[str]()
+        self.controllers = {arm: Controller(self, arm) for arm in ("left", "right")}
+        self.tick()
+
+    def tick(self) -> None:
+        self.t_ns += TICK_NS
+        for controller in self.controllers.values():
+            controller.tick()
+        if not self.silent:
+            self.heard_ns = self.t_ns
+            self.states.add_joint_state(self.t_ns, list(self.state), list(self.state.values()))
+
+    def state_age(self) -> float:
+        return (self.t_ns - self.heard_ns) * 1e-9
+
+    def now(self) -> float:
+        return self.t_ns * 1e-9
+
+    def controller(self, arm: str) -> Controller:
+        return self.controllers[arm]
+
+    async def pause(self) -> None:
+        class Turn:
+            def __await__(self):
+                yield
+
+        await Turn()
+
+    async def compute(self, work, nominal: float = 0.1):
+        await self.pause()
+        return work()
+
+    async def together(self, parts) -> None:
+        left = [part().__await__() for part in parts]
+        while left:
+            for work in list(left):
+                try:
+                    next(work)
+                except StopIteration:
+                    left.remove(work)
+            await self.pause()
+
+
+class NoMap:
+    def latest(self):
+        raise OpenArmError(Code.NOT_READY, "no map")
+
+    def intact(self, field) -> bool:
+        return False
+
+
+class Bench:
+    def __init__(self, arms, description, home) -> None:
+        self.robot = Robot(description, home)
+        self.service = MotionService(self.robot, MotionConfig(), arms, NoMap(), (description.root,))
+
+    def run(self, *works, each: Callable[[], None] = lambda: None):
+        """Carry out coroutines at the same time; their answers in order."""
+        answers: list = [None] * len(works)
+
+        def part(k: int):
+            async def one() -> None:
+                answers[k] = await works[k]
+
+            return one
+
+        all_of_them = self.robot.together([part(k) for k in range(len(works))])
+        for _ in range(6000):
+            try:
+                all_of_them.send(None)
+            except StopIteration:
+                return answers
+            self.robot.tick()
+            each()
+        return pytest.fail("it did not end within a minute of the robot's time")
+
+    def move(self, arm: str = "right", posture: str = "official_home", **options):
+        return self.service.move(MoveRequest(arm, NamedGoal(posture), scale=1.0, **options))
+
+
+@pytest.fixture
+def bench(arms, description, home) -> Bench:
+    return Bench(arms, description, home)
+
+
+def test_a_move_is_planned_executed_and_its_arrival_verified(bench) -> None:
+    stages: list[str] = []
+    request = MoveRequest("right", NamedGoal("official_home"), scale=1.0)
+    (answer,) = bench.run(bench.service.move(request, report=lambda stage, _: stages.append(stage)))
+    assert (answer.code, answer.message) == (Code.OK, "arrived")
+    assert answer.trajectory.duration > 0.5
+    assert stages[0] == "planning"
+    assert stages[-1] == "executing"
+    np.testing.assert_allclose(
+        [bench.robot.state[n] for n in bench.service.arms["right"].names], answer.trajectory.q[-1], atol=1e-9
+    )
+
+
+def test_plan_only_sends_nothing_and_the_plan_is_executed_later(bench) -> None:
+    (plan,) = bench.run(bench.move(plan_only=True))
+    assert bench.robot.controllers["right"].goals == []
+    motion = Motion.of(plan.trajectory)
+    (answer,) = bench.run(bench.service.execute(ExecuteRequest("right", motion, scene_version=plan.scene_version)))
+    assert answer.code is Code.OK
+
+
+def test_a_plan_of_another_scene_is_not_executed(bench) -> None:
+    (plan,) = bench.run(bench.move(plan_only=True))
+    bench.service.apply_scene(clear=False, remove=(), add=[Sphere("ball", se3.make(None, (0.3, 0.0, 0.9)), 0.05)])
+    motion = Motion.of(plan.trajectory)
+    (answer,) = bench.run(bench.service.execute(ExecuteRequest("right", motion, scene_version=plan.scene_version)))
+    assert answer.code is Code.STALE_DATA
+    assert bench.robot.controllers["right"].goals == []
+
+
+def test_an_arm_takes_one_motion_at_a_time_and_two_arms_move_at_once(bench) -> None:
+    first, second, other = bench.run(bench.move(), bench.move(posture="home"), bench.move("left"))
+    assert (first.code, second.code, other.code) == (Code.OK, Code.BUSY, Code.OK)
+    assert "the right arm is moving already" in second.message
+
+
+def test_a_cancelled_motion_holds(bench) -> None:
+    stopped = lambda: bench.robot.t_ns > 1_600_000_000  # noqa: E731
+    (answer,) = bench.run(bench.service.move(MoveRequest("right", NamedGoal("official_home"), scale=0.1), stopped))
+    assert answer.code is Code.CANCELLED
+    assert "the right arm holds where it is" in answer.message
+    assert bench.robot.controllers["right"].goals[0].outcome == Outcome(False, "cancelled")
+    assert bench.service.moving == []
+
+
+def test_a_controller_that_says_success_is_not_evidence(bench) -> None:
+    bench.robot.stuck = {"openarm_right_joint2"}
+    (answer,) = bench.run(bench.move())
+    assert answer.code is Code.EXECUTION_FAILED
+    assert "openarm_right_joint2 ended" in answer.message
+
+
+@pytest.mark.parametrize(
+    ("lose", "text"),
+    [
+        (lambda robot: setattr(robot, "silent", True), "no /joint_states"),
+        (lambda robot: setattr(robot.controllers["right"], "there", False), "controller right is gone"),
+    ],
+)
+def test_a_robot_that_vanishes_ends_a_motion(bench, lose, text) -> None:
+    def each() -> None:
+        if bench.robot.t_ns > 1_500_000_000:
+            lose(bench.robot)
+
+    (answer,) = bench.run(bench.service.move(MoveRequest("right", NamedGoal("official_home"), scale=0.1)), each=each)
+    assert answer.code is Code.ROBOT_LOST
+    assert text in answer.message
+    assert bench.robot.controllers["right"].goals[0].outcome is not None  # it was withdrawn
+    assert bench.robot.now() < 4.0
+
+
+def test_a_dual_arm_motion_moves_both_arms_from_the_same_moment(bench) -> None:
+    targets = tuple(ArmGoal(arm, NamedGoal("official_home")) for arm in ("left", "right"))
+    (answer,) = bench.run(bench.service.move_arms(MoveArmsRequest(targets, scale=1.0)))
+    assert answer.code is Code.OK, answer.message
+    left, right = (controller.goals[0] for controller in bench.robot.controllers.values())
+    assert left.begin_ns == right.begin_ns > 0
+    assert answer.separation >= 0.02
+
+
+def test_an_unreachable_pose_carries_the_nearest_alternative(bench) -> None:
+    pose = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.9, -0.2, 0.6))
+    (answer,) = bench.run(bench.service.move(MoveRequest("right", PoseGoal(pose), scale=1.0, plan_only=True)))
+    assert answer.code is Code.UNREACHABLE
+    ik = bench.service.compute_ik("right", pose, (), free_orientation=False)
+    assert ik.error is not None
+    assert ik.position_error > 0.05
