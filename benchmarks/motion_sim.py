@@ -44,7 +44,6 @@ from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.coordination import ActiveMotion, least_delay
 from openarm_motion.planning.dual_arm import DualArm, DualArmGoals, plan_staggered, plan_together
-from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import Trajectory
 
 #: Plans of one scene.
@@ -174,8 +173,8 @@ def run_beside(
             later = state
             if other.name in under_way:
                 trajectory, since_ns = under_way[other.name]
-                held = ActiveMotion(other, Motion.of(trajectory).later((since_ns - stand.world.t_ns) * 1e-9))
-                later = {**state, **held.motion.at(held.motion.duration)}
+                held = ActiveMotion(other, trajectory.later((since_ns - stand.world.t_ns) * 1e-9))
+                later = {**state, **held.motion.joints_at(held.motion.duration)}
             goals = middle_goals(arm, later, boxes, rng)
             now = replace(
                 arm.start_state(later, scale=float(rng.choice([0.3, 0.5, 1.0]))), known=Environment(apart=_BESIDE)
@@ -183,7 +182,7 @@ def run_beside(
             try:
                 scene = moves.free_scene(arm, now, moves.RequestBoxes(boxes))
                 plan = arm.plan_validated(scene, now, goals, 2.0).trajectory
-                wait = least_delay(ActiveMotion(arm, Motion.of(plan)), [held], state)
+                wait = least_delay(ActiveMotion(arm, plan), [held], state)
             except OpenArmError as error:
                 if error.code not in _REFUSED:
                     raise

@@ -8,9 +8,9 @@ Example:
     >>> from openarm_common import RobotDescription, load_scene
     >>> from openarm_motion import MotionConfig, RequestBoxes, make_arms, table_box, to_named
     >>> robot = RobotDescription.load()
-    >>> arm = make_arms(MotionConfig(), robot, [table_box(load_scene("demo").table)])["left"]
-    >>> state = robot.group_state("left_arm", "home") | robot.group_state("right_arm", "home")
-    >>> to_named(arm, arm.start_state(state), "hands_up", RequestBoxes()).duration > 0.5
+    >>> arms = make_arms(MotionConfig(), robot, [table_box(load_scene("demo").table)])
+    >>> start = arms["left"].start_state(dict.fromkeys(robot.joints, 0.0))
+    >>> to_named(arms["left"], start, "hands_up", RequestBoxes()).duration > 0.5
     True
 """
 

@@ -23,6 +23,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.campaign import cluster, report
 from openarm_evaluation.campaign.one_task import run_one
 from openarm_evaluation.campaign.options import CampaignOptions, Row
+from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.judging import provenance
 
@@ -66,6 +67,7 @@ def run_campaign(
     """
     for seed in options.seeds[:1]:
         make_task(options.set_name, seed)  # faults of the call show before anything is started
+    suite_config(options.graph_parameters())
     campaign = Campaign(folder, options, read_rows(folder, options))
     campaign.resumed = len(campaign.rows)
     on_begin(campaign.resumed)

@@ -30,7 +30,6 @@ from openarm_motion.service.requests import (
     NamedGoal,
     PlanApproachRequest,
 )
-from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import Trajectory
 from openarm_sim_bridge.control.gripper import GripperGoal, GripperOutcome
 from openarm_sim_bridge.world.touch import pad_links
@@ -213,7 +212,7 @@ class DirectLink:
         """
         if not isinstance(trajectory, Trajectory):
             raise OpenArmError(Code.INTERNAL, f"{type(trajectory).__name__} is no trajectory of the planner")
-        request = ExecuteRequest(arm, Motion.of(trajectory), self.max_wait)
+        request = ExecuteRequest(arm, trajectory, self.max_wait)
         await self._moved(lambda stopped: self.robot.motion.execute(request, stopped), what, guard)
 
     async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:

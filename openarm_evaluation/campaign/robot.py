@@ -36,7 +36,7 @@ from openarm_grasp.perception.detections import Detection, Frame
 from openarm_motion.planning.arm import Arm
 from openarm_motion.service.motion_service import MotionService, make_arms, table_box
 from openarm_motion.service.robot import Outcome
-from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import Motion
 from openarm_octomap.grid import DepthScan
 from openarm_octomap.mapper import Frame as MapFrame
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask

@@ -19,7 +19,7 @@ from openarm_motion.collision.exact import Clearance, CollisionContext, Collisio
 from openarm_motion.collision.solids import Box
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.planner import never
-from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import Motion
 from openarm_motion.timing.validation import ends_first, subdivided
 
 if TYPE_CHECKING:

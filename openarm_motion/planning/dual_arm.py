@@ -29,7 +29,6 @@ from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.planner import PlanQuery
 from openarm_motion.planning.rrt import FastPlanner
 from openarm_motion.timing.blending import timings
-from openarm_motion.timing.checks import Motion
 from openarm_motion.timing.trajectory import JointLimits, Trajectory
 from openarm_motion.timing.validation import dense_times, validate_trajectory
 
@@ -346,9 +345,7 @@ def _in_order(both: DualArm, now: StartState, wanted: DualArmGoals, first: int, 
     early = _alone(both, first, now, now.state, wanted, time_limit)
     there = {**now.state, **dict(zip(both.arms[first].names, early.q[-1].tolist(), strict=True))}
     late = _alone(both, second, now, there, wanted, time_limit)
-    one, other = (
-        ActiveMotion(both.arms[i], Motion.of(part), wanted.held[i]) for i, part in ((first, early), (second, late))
-    )
+    one, other = (ActiveMotion(both.arms[i], part, wanted.held[i]) for i, part in ((first, early), (second, late)))
     wait = least_delay(other, [one], now.state, stopped=now.stopped)
     if first == 0:
         return _Staggered((early, delayed(late, wait)), (0.0, wait))

@@ -47,8 +47,7 @@ from openarm_motion.service.requests import (
     Strategy,
     YieldGoal,
 )
-from openarm_motion.timing.checks import Motion
-from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.trajectory import Motion, Trajectory
 
 _HELD_COLOR = (0.2, 0.8, 0.4, 0.5)
 _SCENE_COLOR = (0.8, 0.3, 0.2, 0.5)

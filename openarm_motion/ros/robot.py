@@ -18,7 +18,7 @@ from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
 from openarm_motion.config import MotionConfig
 from openarm_motion.service.robot import Outcome
-from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import Motion
 
 T = TypeVar("T")
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.collision.solids import Box
-from openarm_motion.timing.checks import Motion
-from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.trajectory import Motion, Trajectory
 
 #: Plans that are remembered; a caller executes what it planned last.
 _PLANS = 32

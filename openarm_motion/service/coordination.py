@@ -16,7 +16,8 @@ from openarm_motion.planning.coordination import ActiveMotion, least_delay
 from openarm_motion.scene.held import HeldObjects
 from openarm_motion.service.follower import TrajectoryFollower
 from openarm_motion.service.robot import RobotInterface
-from openarm_motion.timing.checks import Motion, check_against_others, check_trajectory
+from openarm_motion.timing.checks import check_against_others, check_trajectory
+from openarm_motion.timing.trajectory import Motion
 
 #: An arm begins so long after the newest joint state, s: time to search for clearance and to send the trajectory. When
 #: that was not enough, the next.
@@ -154,7 +155,7 @@ class ArmCoordination:
     def ends(self, arm: Arm) -> dict[str, float]:
         """Return where the joints of the other arms under way will end."""
         active = [f.active.motion for name, f in self.followers.items() if name != arm.name and f.active is not None]
-        return {joint: x for motion in active for joint, x in motion.at(motion.duration).items()}
+        return {joint: x for motion in active for joint, x in motion.joints_at(motion.duration).items()}
 
     def check_again(self, arm: Arm, name: str) -> OpenArmError | None:
         """Return what this arm would meet now that another one has stopped on its way, or None."""

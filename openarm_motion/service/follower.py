@@ -17,7 +17,7 @@ from openarm_motion.service.robot import ArmController, RobotInterface, Trajecto
 
 if TYPE_CHECKING:
     from openarm_motion.planning.arm import Arm
-    from openarm_motion.timing.checks import Motion
+    from openarm_motion.timing.trajectory import Motion
 
 #: A controller has this long to accept, to refuse, or to end a cancelled motion, s.
 _ANSWER = 2.0

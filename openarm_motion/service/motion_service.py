@@ -53,8 +53,7 @@ from openarm_motion.service.requests import (
     YieldGoal,
 )
 from openarm_motion.service.robot import RobotInterface, Watch
-from openarm_motion.timing.checks import Motion
-from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.trajectory import Motion, Trajectory
 
 #: Called with a stage ("planning", "executing", ...) and its progress: 0 to 1, or the targets that were checked.
 Report = Callable[[str, float], None]
@@ -151,7 +150,7 @@ class MotionService:
                 return explained_approach(lambda: plan_approach(arm, now, wanted, report), arm, now, wanted)
 
             plan = await self.robot.compute(work)
-            delay = await self.coordination.start_delay(arm, Motion.of(plan.transfer), wanted.attached, stopped)
+            delay = await self.coordination.start_delay(arm, plan.transfer, wanted.attached, stopped)
             parts = (plan.transfer, plan.approach, plan.retreat)
             self.on_plan({arm.name: parts})
             self.memory.expect(arm.name, parts[:2], wanted.attached)
@@ -194,7 +193,7 @@ class MotionService:
                 if not request.plan_only:
                     self.scene.require(prepared.version)
                     self.coordination.hold(arm.name, held)
-                    delay = await self._follow(arm, Motion.of(trajectory), stopped, report, request.max_start_delay)
+                    delay = await self._follow(arm, trajectory, stopped, report, request.max_start_delay)
                     answer = replace(answer, start_delay=delay, message=f"arrived{prepared.note}{holding}")
         except OpenArmError as error:
             return replace(answer, error=error, message=error.message + holding)
@@ -243,9 +242,8 @@ class MotionService:
                     self.scene.require(prepared.version)
                     for arm, boxes in zip(arms, held, strict=True):
                         self.coordination.hold(arm.name, boxes)
-                    motions = [Motion.of(part) for part in plan.trajectories]
                     await self.coordination.follow_together(
-                        arms, motions, stopped, lambda share: report("executing", share)
+                        arms, plan.trajectories, stopped, lambda share: report("executing", share)
                     )
                     answer = replace(answer, message=f"arrived, {apart} on the way")
         except OpenArmError as error:

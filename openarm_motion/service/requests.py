@@ -12,8 +12,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid
 from openarm_motion.planning.approach import ApproachRequest, Refused
-from openarm_motion.timing.checks import Motion
-from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.trajectory import Motion, Trajectory
 
 
 # --- goals of one arm

@@ -16,7 +16,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.robot_state import RobotStateBuffer
 
 if TYPE_CHECKING:
-    from openarm_motion.timing.checks import Motion
+    from openarm_motion.timing.trajectory import Motion
 
 T = TypeVar("T")
 

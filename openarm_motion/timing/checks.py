@@ -7,16 +7,13 @@ s, rad, rad/s.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.types import Array
 from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
-from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.trajectory import Motion
 
 if TYPE_CHECKING:
     from openarm_motion.planning.arm import Arm
@@ -28,48 +25,6 @@ _ROUNDING = 1e-3
 _PAIR_STEP = 0.04
 #: Arms on their way keep this distance, m: less than plans keep, so that a plan is not refused for rounding.
 _PAIR_CLEARANCE = 0.005
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Positions (m, n) of the joints `names` at times (m,), in between as a controller interpolates.
-
-    With velocities and accelerations (m, n) that is quintic, with velocities alone cubic, without either linear.
-    """
-
-    names: tuple[str, ...]
-    t: Array
-    q: Array
-    v: Array | None = None
-    a: Array | None = None
-
-    @classmethod
-    def of(cls, trajectory: Trajectory) -> Motion:
-        """A planned one."""
-        return cls(trajectory.names, trajectory.t, trajectory.q, trajectory.v, trajectory.a)
-
-    @property
-    def duration(self) -> float:
-        """Time of the last point, s."""
-        return float(self.t[-1])
-
-    def at(self, t: float) -> dict[str, float]:
-        """Positions by joint name; held beyond the ends."""
-        return dict(zip(self.names, self.states(np.array([t]))[0].tolist(), strict=True))
-
-    def states(self, times: Array) -> Array:
-        """Positions (k, n) at times (k,); held beyond the ends."""
-        if self.t.size == 1:
-            return np.repeat(self.q, times.size, axis=0)
-        if self.v is not None and self.a is not None:
-            return Trajectory(self.names, self.t, self.q, self.v, self.a).at(times)[0]
-        if self.v is not None:
-            return np.asarray(CubicHermiteSpline(self.t, self.q, self.v)(np.clip(times, self.t[0], self.t[-1])))
-        return np.stack([np.interp(times, self.t, column) for column in self.q.T], axis=1)
-
-    def later(self, seconds: float) -> Motion:
-        """The same, begun later; the arm rests before."""
-        return replace(self, t=self.t + seconds)
 
 
 def check_trajectory(arm: Arm, motion: Motion, state: Mapping[str, float]) -> Motion:
@@ -151,8 +106,8 @@ def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float], o
     end = max([motion.duration, *(other.duration for other in others)])
     for t in np.linspace(0.0, end, max(2, int(np.ceil(end / _PAIR_STEP)) + 1)):
         if others:
-            scene.set_state({**state, **{k: x for other in others for k, x in other.at(float(t)).items()}})
-        q = np.array([motion.at(float(t))[name] for name in arm.names])
+            scene.set_state({**state, **{k: x for other in others for k, x in other.joints_at(float(t)).items()}})
+        q = np.array([motion.joints_at(float(t))[name] for name in arm.names])
         if scene.collides(q):
             contact = scene.contacts(q)[0]
             raise OpenArmError(

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import ruckig
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import CubicHermiteSpline, make_interp_spline
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
@@ -49,19 +49,48 @@ class JointLimits:
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
-    """Samples of a motion: times (m,) from 0, positions, velocities and accelerations (m, n) of the joints `names`."""
+class Motion:
+    """Positions (m, n) of the joints `names` at times (m,), in between as a controller interpolates.
+
+    With velocities and accelerations (m, n) that is quintic, with velocities alone cubic, without either linear.
+    """
 
     names: tuple[str, ...]
     t: Array
     q: Array
-    v: Array
-    a: Array
+    v: Array | None = None
+    a: Array | None = None
 
     @property
     def duration(self) -> float:
-        """Time of the last sample, s."""
+        """Time of the last point, s."""
         return float(self.t[-1])
+
+    def joints_at(self, t: float) -> dict[str, float]:
+        """Positions by joint name; held beyond the ends."""
+        return dict(zip(self.names, self.states(np.array([t]))[0].tolist(), strict=True))
+
+    def states(self, times: Array) -> Array:
+        """Positions (k, n) at times (k,); held beyond the ends."""
+        if self.t.size == 1:
+            return np.repeat(self.q, times.size, axis=0)
+        if self.v is not None and self.a is not None:
+            return Trajectory(self.names, self.t, self.q, self.v, self.a).at(times)[0]
+        if self.v is not None:
+            return np.asarray(CubicHermiteSpline(self.t, self.q, self.v)(np.clip(times, self.t[0], self.t[-1])))
+        return np.stack([np.interp(times, self.t, column) for column in self.q.T], axis=1)
+
+    def later(self, seconds: float) -> Motion:
+        """The same, begun later; the arm rests before."""
+        return replace(self, t=self.t + seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory(Motion):
+    """A motion that is planned: with velocities and accelerations (m, n), its times begin at 0."""
+
+    v: Array = field()
+    a: Array = field()
 
     def at(self, t: ArrayLike) -> tuple[Array, Array, Array]:
         """Positions, velocities, accelerations (k, n) at times (k,), by quintic interpolation; held beyond the ends."""

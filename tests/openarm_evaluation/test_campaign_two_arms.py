@@ -16,7 +16,7 @@ from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
 from openarm_motion.collision.occupancy import OccupancyMap
 from openarm_motion.service.requests import ExecuteRequest, MotionAnswer
-from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import Motion
 
 
 def run(set_name: str, seed: int):

@@ -13,8 +13,8 @@ from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.moves import RequestBoxes
 from openarm_motion.scene.held import HeldObjects
-from openarm_motion.timing.checks import Motion, check_against_others, check_trajectory
-from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.checks import check_against_others, check_trajectory
+from openarm_motion.timing.trajectory import Motion, Trajectory
 
 
 @pytest.fixture

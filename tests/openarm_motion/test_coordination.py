@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -16,8 +14,7 @@ from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.coordination import ActiveMotion, least_delay
 from openarm_motion.planning.dual_arm import DualArm
 from openarm_motion.planning.moves import RequestBoxes
-from openarm_motion.timing.checks import Motion
-from openarm_motion.timing.trajectory import Trajectory
+from openarm_motion.timing.trajectory import Motion, Trajectory
 
 DOWN = se3.rotation_from_z_y((0, 0, -1), (0, 1, 0))
 
@@ -48,7 +45,7 @@ def meeting(arms: dict[str, Arm], home: dict[str, float]) -> tuple[dict[str, flo
     """The left arm stands over the middle and goes home slowly; the right one wants there."""
     left, right = arms["left"], arms["right"]
     there = to_the_middle(left, home)
-    return standing(home, left, there.q[-1]), back(there), Motion.of(to_the_middle(right, home))
+    return standing(home, left, there.q[-1]), back(there), to_the_middle(right, home)
 
 
 @pytest.mark.requirement("N-12")
@@ -73,15 +70,15 @@ def test_what_has_passed_of_a_motion_under_way_counts(arms, meeting) -> None:
 
 @pytest.mark.requirement("N-12")
 def test_arms_that_do_not_meet_set_out_at_once(arms, home) -> None:
-    left = Motion.of(to_the_middle(arms["left"], home, 0.25))
-    right = Motion.of(to_the_middle(arms["right"], home, -0.25))
+    left = to_the_middle(arms["left"], home, 0.25)
+    right = to_the_middle(arms["right"], home, -0.25)
     assert least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], home) == 0.0
     assert nearest(arms, home, left, right) >= 0.020
 
 
 @pytest.mark.requirement("A-74")
 def test_an_arm_that_ends_in_the_way_is_no_matter_of_time(arms, home) -> None:
-    left, right = (Motion.of(to_the_middle(arms[side], home)) for side in ("left", "right"))
+    left, right = (to_the_middle(arms[side], home) for side in ("left", "right"))
     with pytest.raises(OpenArmError, match=r"right arm after .*openarm_left_\w+.* no rest before it helps") as caught:
         least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], home)
     assert caught.value.code == Code.IN_COLLISION
@@ -101,8 +98,8 @@ def test_a_rest_that_is_too_long_is_refused(arms, meeting) -> None:
 def test_two_held_objects_keep_apart_too(arms, home) -> None:
     """Hands that pass each other with room, but carry plates that would not."""
     plate = box_from("plate", (0.0, 0.0, 0.10), (0.05, 0.26, 0.02))
-    left = Motion.of(to_the_middle(arms["left"], home, 0.20))
-    right = Motion.of(to_the_middle(arms["right"], home, -0.20))
+    left = to_the_middle(arms["left"], home, 0.20)
+    right = to_the_middle(arms["right"], home, -0.20)
     both = DualArm(arms["left"], arms["right"])
     ends = np.concatenate([left.q[-1], right.q[-1]])
     assert not both.pair_scene(home, 0.02).collides(ends)
@@ -122,13 +119,12 @@ def test_two_held_objects_keep_apart_too(arms, home) -> None:
 
 def test_motions_are_interpolated_as_controllers_do(arms, home) -> None:
     plan = to_the_middle(arms["left"], home, 0.25)
-    whole = Motion.of(plan)
+    whole = Motion(plan.names, plan.t, plan.q, plan.v, plan.a)
     times = np.linspace(-0.5, plan.duration + 0.5, 300)
     np.testing.assert_allclose(whole.states(times), plan.at(times)[0], atol=1e-12)
     cubic, linear = Motion(plan.names, plan.t, plan.q, plan.v), Motion(plan.names, plan.t, plan.q)
     for near, tolerance in ((cubic, 1e-4), (linear, 2e-3)):
         np.testing.assert_allclose(near.states(times), plan.at(times)[0], atol=tolerance)
     assert np.abs(linear.states(times) - cubic.states(times)).max() > 1e-5
-    for one, other in itertools.pairwise([whole.later(0.3).at(0.9), whole.at(0.6)]):
-        assert one == pytest.approx(other)
+    assert whole.later(0.3).joints_at(0.9) == pytest.approx(whole.joints_at(0.6))
     assert Motion(plan.names, plan.t[:1], plan.q[:1]).states(times).shape == (300, 7)

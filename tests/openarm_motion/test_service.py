@@ -23,7 +23,7 @@ from openarm_motion.service.requests import (
     PoseGoal,
 )
 from openarm_motion.service.robot import Outcome
-from openarm_motion.timing.checks import Motion
+from openarm_motion.timing.trajectory import Motion
 
 TICK_NS = 10_000_000
 
@@ -58,7 +58,7 @@ class Controller:
             if goal.outcome is not None:
                 continue
             elapsed = (self.robot.t_ns - goal.begin_ns) * 1e-9
-            moved = goal.motion.at(max(elapsed, 0.0))
+            moved = goal.motion.joints_at(max(elapsed, 0.0))
             self.robot.state.update({name: x for name, x in moved.items() if name not in self.robot.stuck})
             if elapsed >= goal.motion.duration:
                 goal.outcome = Outcome(True)
@@ -171,7 +171,7 @@ def test_a_move_is_planned_executed_and_its_arrival_verified(bench) -> None:
 def test_plan_only_sends_nothing_and_the_plan_is_executed_later(bench) -> None:
     (plan,) = bench.run(bench.move(plan_only=True))
     assert bench.robot.controllers["right"].goals == []
-    motion = Motion.of(plan.trajectory)
+    motion = plan.trajectory
     (answer,) = bench.run(bench.service.execute(ExecuteRequest("right", motion, scene_version=plan.scene_version)))
     assert answer.code is Code.OK
 
@@ -179,7 +179,7 @@ def test_plan_only_sends_nothing_and_the_plan_is_executed_later(bench) -> None:
 def test_a_plan_of_another_scene_is_not_executed(bench) -> None:
     (plan,) = bench.run(bench.move(plan_only=True))
     bench.service.apply_scene(clear=False, remove=(), add=[Sphere("ball", se3.make(None, (0.3, 0.0, 0.9)), 0.05)])
-    motion = Motion.of(plan.trajectory)
+    motion = plan.trajectory
     (answer,) = bench.run(bench.service.execute(ExecuteRequest("right", motion, scene_version=plan.scene_version)))
     assert answer.code is Code.STALE_DATA
     assert bench.robot.controllers["right"].goals == []
