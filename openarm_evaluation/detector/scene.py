@@ -19,7 +19,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES, RobotDescription
-from openarm_common.scene.scene import SHAPES, Scene, SceneObject, Shape, Table
+from openarm_common.scene.scene import SHAPES, Scene, SceneObject, Table
 from openarm_common.types import Array
 from openarm_evaluation.detector.appearance import colour, draw_shape, pattern, sensor, surface
 from openarm_sim_bridge.cameras.renderer import create_gl_context
@@ -31,7 +31,7 @@ Rng = np.random.Generator
 VIEWS = {"overhead": 0.65, "wrist": 0.35}
 #: Share of pictures for which no object is drawn.
 EMPTY = 0.15
-_SLOTS: dict[Shape, int] = {"box": 5, "cylinder": 5, "sphere": 4}
+_SLOTS = {"box": 5, "cylinder": 5, "sphere": 4}
 _SHEETS, _BARS, _TEXTURES = 3, 3, 9
 #: An object is labelled when this share of its silhouette and this many pixels are visible.
 _SEEN, _PIXELS = 0.35, 150
@@ -125,8 +125,8 @@ class RandomViews:
                 color="red",
                 position=(0.3, 0.0, 1.0),
             )
-            for kind, count in _SLOTS.items()
-            for i in range(count)
+            for kind in SHAPES
+            for i in range(_SLOTS[kind])
         ]
         spec = build_spec(self._description, Scene(table=self._table, objects=tuple(objects)), self._cameras)
         for i in range(_SHEETS + _BARS):
