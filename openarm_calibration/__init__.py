@@ -10,7 +10,7 @@ Example:
     >>> print(result.verdict.grade, result.calibration.T_parent_link)  # doctest: +SKIP
     >>> CalibrationStore(Path("calibrations")).save(result.calibration)  # doctest: +SKIP
 
-The nodes `calibration` and `calibration_publisher`, and a client of the former, stand in `ros/`.
+The nodes `calibration` and `calibration_publisher`, and a client of the former, are in `ros/`.
 """
 
 from typing import TYPE_CHECKING

@@ -42,7 +42,7 @@ class PlaceConfig(Config):
 
 
 class AutoConfig(Config):
-    """Calibration by itself, with the arm moved by /motion/move."""
+    """Automatic calibration, with the arm moved by /motion/move."""
 
     arm: Literal["left", "right"] = Field(default="right", description="that carries the camera, or the board")
     poses: int = Field(default=15, ge=4, le=100, description="samples at most")
@@ -52,12 +52,12 @@ class AutoConfig(Config):
     tries: int = Field(default=90, ge=1, description="poses that are tried for one sample before it is given up")
     velocity_scale: float = Field(default=0.5, gt=0.0, le=1.0, description="of the motions")
     delay_velocity_scale: float = Field(default=0.1, gt=0.0, le=1.0, description="while the delay is measured")
-    settle_timeout: float = Field(default=5.0, gt=0.0, description="longest wait for the arm to stand, s of wall clock")
+    settle_timeout: float = Field(default=5.0, gt=0.0, description="longest wait until the arm stands still, s")
     move_timeout: float = Field(default=60.0, gt=0.0, description="longest wait for a motion, s of wall clock")
     plate: float = Field(default=0.01, gt=0.0, description="thickness that plans allow for the board, m")
     on_table: PlaceConfig = Field(default_factory=PlaceConfig, description="board of a camera that moves, base frame")
     on_hand: PlaceConfig = Field(
-        default_factory=PlaceConfig, description="board of a camera that stands, frame of the carrier"
+        default_factory=PlaceConfig, description="board of a fixed camera, frame of the carrier"
     )
     search: SearchConfig = Field(default_factory=SearchConfig, description="for the next pose")
 
@@ -72,7 +72,7 @@ class CalibrationConfig(StoreConfig):
     carrier: str = Field(
         default="openarm_right_link7",
         min_length=1,
-        description="link that holds the board when the camera stands still",
+        description="link that holds the board when the camera is fixed",
     )
     algorithm: str = Field(default="REFINED", description="what compute_calibration uses at first")
     image_timeout: float = Field(default=2.0, gt=0.0, le=60.0, description="longest wait for an image, s of wall clock")
@@ -81,7 +81,7 @@ class CalibrationConfig(StoreConfig):
     )
     gate: GateConfig = GateConfig()
     limits: Limits = Limits()
-    auto: AutoConfig = Field(default_factory=AutoConfig, description="calibration by itself")
+    auto: AutoConfig = Field(default_factory=AutoConfig, description="automatic calibration")
 
     @field_validator("algorithm")
     @classmethod

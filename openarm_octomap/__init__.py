@@ -13,7 +13,7 @@ Example:
     >>> report.changed.size > 0
     True
 
-The node `octomap` stands in `ros/`.
+The node `octomap` is in `ros/`.
 """
 
 from typing import TYPE_CHECKING

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a map tells what is there: cells compared with the geometry that a simulator knows.
+"""Accuracy of a map: cells compared with the geometry that a simulator knows.
 
 Serves judges and tests; nothing that controls the robot reads it.
 """
@@ -25,11 +25,11 @@ class MapAccuracy:
     Attributes:
         occupied: Occupied cells of the map.
         surface: Cells that have a surface which a camera sees.
-        iou: Cells in both over cells in one of them, where a cell beside the other's counts as in both: a surface on
+        iou: Cells in both over cells in one of them, where a cell next to the other's counts as in both: a surface on
             the border of two cells belongs to either.
         iou_strict: The same without that tolerance.
-        ghosts: Occupied cells with nothing solid in them or beside them.
-        missed: Cells of seen surfaces with nothing occupied in them or beside them.
+        ghosts: Occupied cells with nothing solid in them or next to them.
+        missed: Cells of visible surfaces with nothing occupied in them or next to them.
     """
 
     occupied: int
@@ -49,9 +49,9 @@ def compare(states: Bytes, surface: Cells, solid: Cells) -> MapAccuracy:
         solid: Cells that have something solid, seen or not.
     """
     occupied = states == OCCUPIED
-    beside = generate_binary_structure(3, 3)
-    ghosts = occupied & np.logical_not(binary_dilation(solid, beside))
-    missed = surface & np.logical_not(binary_dilation(occupied, beside))
+    neighbours = generate_binary_structure(3, 3)
+    ghosts = occupied & np.logical_not(binary_dilation(solid, neighbours))
+    missed = surface & np.logical_not(binary_dilation(occupied, neighbours))
     hits, found = int(occupied.sum() - ghosts.sum()), int(surface.sum() - missed.sum())
     union = int(ghosts.sum()) + int(missed.sum()) + max(hits, found)
     strict = int((occupied | surface).sum())

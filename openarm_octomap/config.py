@@ -18,10 +18,10 @@ CLAMP = 2.0
 
 
 class GridConfig(Config):
-    """Where the map is and how it believes.
+    """Where the map is and how cells are updated.
 
-    A known cell changes its mind after `frames_to_mark` or `frames_to_clear` looks that all say the opposite; an
-    unknown cell believes the first one. To use log-odds as liboctomap counts them, give `hit` and `miss`.
+    A known cell changes its state after `frames_to_mark` or `frames_to_clear` observations that all contradict it; an
+    unknown cell takes the first one. To use log-odds as liboctomap counts them, give `hit` and `miss`.
     """
 
     resolution: float = Field(default=0.02, ge=0.005, le=0.2, description="edge of a cell, m")

@@ -33,7 +33,7 @@ class DepthScan(DepthView):
     """A depth image and where it was taken.
 
     Attributes:
-        label: (h, w): 0 surroundings, 1 robot, 2 not known; None is all surroundings.
+        label: (h, w): 0 environment, 1 robot, 2 not known; None: all environment.
     """
 
     label: Bytes | None = None
@@ -77,7 +77,7 @@ class OccupancyGrid:
     """Cells of a workspace; NaN log-odds are unknown.
 
     Args:
-        config: Workspace, resolution and how fast cells change their mind.
+        config: Workspace, resolution and how fast cells change their state.
     """
 
     def __init__(self, config: GridConfig) -> None:
@@ -87,7 +87,7 @@ class OccupancyGrid:
         shape = self.lattice.shape
         self.log_odds: Floats = np.full(shape, np.nan, np.float32)
         self.states: Bytes = np.zeros(shape, np.uint8)
-        self.seen: NDArray[np.int32] = np.zeros(shape, np.int32)  # ms of the newest look
+        self.seen: NDArray[np.int32] = np.zeros(shape, np.int32)  # ms of the newest observation
         self._marks = np.zeros(shape, np.uint8)
         self._ticks = np.zeros(shape, np.uint16)
         self._tick = 0
@@ -113,7 +113,7 @@ class OccupancyGrid:
         return Update(ends, valid, cleared, changed)
 
     def decay(self, t_ns: int) -> NDArray[np.int32]:
-        """Make occupied cells unknown that nothing looked at for `decay_s`; flat indices of those."""
+        """Make occupied cells unknown that were not observed for `decay_s`; flat indices of those."""
         if self.config.decay_s <= 0.0:
             return np.empty(0, np.int32)
         limit = self._milliseconds(t_ns) - round(self.config.decay_s * 1e3)
@@ -137,7 +137,7 @@ class OccupancyGrid:
         return self._changed[:n].copy()
 
     def oldest_s(self, t_ns: int) -> float:
-        """Seconds since the occupied cell was looked at that has waited longest; 0 without occupied cells."""
+        """Return the seconds since the occupied cell was observed that has waited longest; 0 without occupied cells."""
         seen = self.seen[self.states == OCCUPIED]
         if not seen.size or self._epoch_ns is None:
             return 0.0
@@ -238,7 +238,7 @@ class OccupancyGrid:
     def blocked_at(
         self, points: ArrayLike, unknown: UnknownPolicy = "occupied", depth: int = DEPTH
     ) -> NDArray[np.bool_]:
-        """Whether points (n, 3), m, must be kept clear of, at any depth; `unknown` says what unknown cells count as."""
+        """Whether points (n, 3), m, must be kept clear of, at any depth; `unknown` is what unknown cells count as."""
         states = self.states_at(points, depth)
         return np.asarray((states == OCCUPIED) | ((states == UNKNOWN) & (unknown == "occupied")))
 

@@ -93,7 +93,7 @@ def image_ends(
         ray_x: (w,).
         ray_y: (h,).
         T: (3, 4).
-        label: (h, w): 0 surroundings; 1 robot: the ray clears up to it and marks nothing; 2 nothing is known.
+        label: (h, w): 0 environment; 1 robot: the ray clears up to it and marks nothing; 2 nothing is known.
         resolution: Edge of a cell, m.
         key_min: (3,) key of marks[0, 0, 0].
         origin: (3,) the camera.
@@ -464,7 +464,7 @@ def apply_marks(
         marks: (n,) flat; a cell that a ray ended in counts as hit, whatever went through it.
         log_odds: (n,), NaN where unknown.
         states: (n,) UNKNOWN, FREE, OCCUPIED.
-        seen: (n,) when each cell was last looked at.
+        seen: (n,) when each cell was last observed.
         now: Written to `seen`.
         hit: Added for a hit.
         miss: Added for a miss.
@@ -503,7 +503,7 @@ def apply_marks(
 def forget_before(
     limit: int, log_odds: Floats, states: Bytes, seen: NDArray[np.int32], changed: NDArray[np.int32]
 ) -> int:
-    """Make occupied cells unknown that were last looked at before `limit`; flat arrays, returns how many."""
+    """Make occupied cells unknown that were last observed before `limit`; flat arrays, returns how many."""
     count = 0
     for i in range(states.size):
         if states[i] == OCCUPIED and seen[i] < limit:

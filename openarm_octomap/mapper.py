@@ -33,7 +33,7 @@ _FAR = 1e6
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What a camera (or another source of points) saw, and the joints at that moment.
+    """A scan of a camera or another source, and the joints at its stamp.
 
     Attributes:
         source: Name of the camera or cloud.
@@ -50,7 +50,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The map for those who look at it.
+    """The map at one moment.
 
     Attributes:
         lattice: Which cells.
@@ -67,7 +67,7 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What the map says at points.
+    """The state of the map at points.
 
     Attributes:
         states: (n,) UNKNOWN, FREE or OCCUPIED; a coarse cell is occupied when a part of it is.
@@ -210,7 +210,7 @@ class Mapper:
             self._transform.compute(self._grid.states, out)
 
     def counts(self, t_ns: int) -> dict[str, float]:
-        """Cells by state, and the longest time an occupied cell was not looked at, s."""
+        """Cells by state, and the longest time since an occupied cell was observed, s."""
         with self._lock:
             return self._grid.counts() | {"oldest_s": self._grid.oldest_s(t_ns)}
 
@@ -241,7 +241,7 @@ class Mapper:
         return payload.nodes
 
     def query(self, points: ArrayLike, resolution: float, unknown: UnknownPolicy) -> Answer:
-        """What the map says at points.
+        """Look up the state of points.
 
         Args:
             points: (n, 3), finite, m.

@@ -18,7 +18,7 @@ from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
 
 
 def warm() -> None:
-    """Run each kernel once with the types that the package uses; the compiled code is cached beside the sources."""
+    """Run each kernel once with the types that the package uses; the compiled code is cached next to the sources."""
     description = RobotDescription.load()
     robot = SelfFilter(description, SelfFilterConfig())
     joints = {name: 0.0 for name, joint in description.joints.items() if joint.type != "fixed"}

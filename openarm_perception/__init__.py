@@ -14,7 +14,7 @@ Example:
     >>> result = pipeline.run(rgb, depth, camera.intrinsics, T_base_camera)  # doctest: +SKIP
     >>> [(found.label, found.p_base, found.size) for found in result.located]  # doctest: +SKIP
 
-The nodes `cloud` and `detector` stand in `ros/`.
+The nodes `cloud` and `detector` are in `ros/`.
 """
 
 from typing import TYPE_CHECKING

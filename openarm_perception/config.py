@@ -30,7 +30,7 @@ class DetectNodeConfig(Config):
         default="/{camera}/depth/camera_info", description="CameraInfo of both; {camera} is filled in"
     )
     colors: str = Field(default="", description="YAML of the colours; empty is config/params/detector.yaml")
-    scene: str = Field(default="demo", description="scene whose table the objects stand on: a name or a path")
+    scene: str = Field(default="demo", description="scene whose table the objects are on: a name or a path")
     table_height: float | None = Field(
         default=None, ge=-1.0, le=2.0, description="of the table in the base frame, m; without one, the scene's"
     )
@@ -75,7 +75,7 @@ class CloudNodeConfig(Config):
     organised: bool = Field(
         default=True, description="a point for every pixel, NaN where invalid; false: valid points only"
     )
-    color: bool = Field(default=False, description="a field `rgb` beside x, y, z; organised clouds only")
+    color: bool = Field(default=False, description="a field `rgb` next to x, y, z; organised clouds only")
     color_topic: str = Field(default="/{camera}/color/image_raw", description="aligned colour; {camera} is filled in")
     held_topic: str = Field(default="/motion/attached_objects", description="what the hands hold, as markers on links")
     transform_wait: float = Field(

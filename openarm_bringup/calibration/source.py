@@ -132,7 +132,7 @@ def _from_bag(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str
     with open_bag(path) as bag:
         samples, found = samples_of(bag, options)
     digest = samples.save(session) if session is not None else samples.digest()
-    return samples, digest, stills.rows(found), stills.told(found)
+    return samples, digest, stills.rows(found), stills.summary(found)
 
 
 def _board(text: str) -> Board:

@@ -2,8 +2,8 @@
 """Calibration boards: an asymmetric circle grid, or ChArUco.
 
 Board frame: origin in the middle of the marks, x right and y down as the board is read, z into the board, away from
-who looks at it; metres. A board lies in an image so that its axes turn as those of the image do. (The mirror image of
-a circle grid is the grid itself after half a turn, so that a mirrored camera is told by ChArUco only.)
+the viewer; metres. A board lies in an image so that its axes turn as those of the image do. (The mirror image of
+a circle grid is the grid itself after half a turn, so that a mirrored camera is detected by ChArUco only.)
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class CircleGrid(Config):
     @classmethod
     def _odd(cls, value: int) -> int:
         if value % 2 == 0:
-            raise ValueError("an even number of rows looks the same after half a turn; expected an odd number")
+            raise ValueError("an even number of rows is the same after half a turn; expected an odd number")
         return value
 
     @model_validator(mode="after")
@@ -57,7 +57,7 @@ class CircleGrid(Config):
 
     @property
     def label(self) -> str:
-        """What people call it."""
+        """Name for messages and reports."""
         size = f"{self.spacing * 1e3:g} mm spacing, {self.diameter * 1e3:g} mm circles"
         return f"asymmetric circles {self.columns}x{self.rows}, {size}"
 
@@ -135,7 +135,7 @@ class Charuco(Config):
 
     @property
     def label(self) -> str:
-        """What people call it."""
+        """Name for messages and reports."""
         return f"ChArUco {self.columns}x{self.rows}, {self.spacing * 1e3:g} mm squares, {self.dictionary}"
 
     @property

@@ -190,7 +190,7 @@ def _diameter(board: CircleGrid, pixels: Array) -> float:
 def _ordered(board: CircleGrid, pixels: Array) -> Array:
     """The order of the marks in which they are the image of the board's front.
 
-    The grid finder may start at either end. A mirrored order fits a plane as well, and is told by its chirality.
+    The grid finder may start at either end. A mirrored order fits a plane as well; its chirality differs.
     """
     grid = pixels.reshape(board.rows, board.columns, 2)
     candidates = [grid, grid[::-1, ::-1], grid[::-1], grid[:, ::-1]]
@@ -207,7 +207,7 @@ def _ordered(board: CircleGrid, pixels: Array) -> Array:
 def _refined(board: CircleGrid, image: Grey, rough: Array) -> tuple[NDArray[np.int64], Array, float]:
     """Marks by their grey values: which, where, and their residual, px rms.
 
-    A blob beside a circle is moved to where the others want it; a mark that still is off is left out, and so is one
+    A blob next to a circle is moved to where the others predict it; a mark that still is off is left out, and so is one
     that something else comes near to.
     """
     plane = board.points[:, :2]

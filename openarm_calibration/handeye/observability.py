@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether poses determine the mounts, and if not, why and what to add.
 
-Two looks: at the robot's motion before anything is solved (too few poses, no rotation, one axis), and at the
-information matrix afterwards, scaled to 1 mm and 0.1°, whose smallest eigenvalue says how well the worst direction is
-known. Angles in degrees where a name says so, else rad.
+Two checks: of the robot's motion before anything is solved (too few poses, no rotation, one axis), and of the
+information matrix afterwards, scaled to 1 mm and 0.1°, whose smallest eigenvalue is the information on the worst
+direction. Angles in rad.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from openarm_common.types import Array
 
 #: Fewer can't determine twelve unknowns.
 FEWEST = 3
-#: Rotations below this tell nothing from the robot's own errors, rad.
+#: Rotations below this can't be distinguished from the robot's own errors, rad.
 _NO_ROTATION = math.radians(0.5)
 _NO_SECOND_AXIS = math.radians(0.4)
 _NO_TRANSLATION = 0.003  # m

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a set of samples to a calibration with its verdict: what the node and the command line both do."""
+"""From a set of samples to a calibration with its verdict: shared by the node and the command line."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def calibrate_together(
 
 
 def _part(joint: Solution, camera: int, own: Problem) -> Solution:
-    """What the solution of all says of one camera and its board."""
+    """Extract the solution of one camera and its board."""
     problem, estimate = joint.problem, joint.estimate
     rows = np.flatnonzero(problem.camera == camera)
     board = int(problem.board[rows[0]])
@@ -157,7 +157,7 @@ class Result:
     Args:
         solution: The refinement, also where a closed form was asked for: the verdict rests on it.
         verdict: Grade and figures.
-        methods: Every method beside the refinement.
+        methods: Every method compared with the refinement.
         calibration: To be stored: of the method that was asked for.
     """
 

@@ -220,7 +220,7 @@ Indices = NDArray[np.int64]
 
 Setup = Literal["in_hand", "to_hand", "fixed"]
 SETUPS: tuple[Setup, ...] = ("in_hand", "to_hand", "fixed")
-#: Unknowns beside the mounts: scale of the board (true over stated), delay of the images (s), intrinsics (px).
+#: Unknowns besides the mounts: scale of the board (true over stated), delay of the images (s), intrinsics (px).
 Extra = Literal["scale", "delay", "intrinsics"]
 
 
@@ -231,7 +231,7 @@ class View:
     Args:
         points: (n, 3) marks in the board frame, m.
         pixels: (n, 2) where they were detected.
-        A: (4, 4) T_base_gripper at the stamp of the image, as the robot says; not used when `fixed`.
+        A: (4, 4) T_base_gripper at the stamp of the image, as the robot reports; not used when `fixed`.
         setup: Which of camera and board the gripper carries.
         radius: Of the circles, m; 0 for corner points.
         camera: Index of the camera.

@@ -151,7 +151,7 @@ def robot_spread(
         KMK: See `criterion`.
         both: See `criterion`.
         start: Where to begin, m and rad.
-        whole: Whether the whole range is looked at first, or only what is near the start.
+        whole: Whether the whole range is searched first, or only what is near the start.
     """
     found: tuple[float, float] = _search(full, np.ascontiguousarray(KMK), np.ascontiguousarray(both), *start, whole)
     return found
@@ -491,7 +491,7 @@ def invert_scaled(information: Array) -> Array:
     """
     diagonal = np.diag(information)
     if not (np.isfinite(information).all() and (diagonal > 0.0).all()):
-        raise OpenArmError(Code.DEGENERATE, "the views say nothing of some unknown; add poses that differ in rotation")
+        raise OpenArmError(Code.DEGENERATE, "some unknown is not determined; add poses that differ in rotation")
     scale = np.sqrt(diagonal)
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     if values[0] <= 1e-14 * values[-1]:

@@ -2,8 +2,8 @@
 """From views to mounts: start, outliers, refinement, refusals.
 
 The order: refuse motions that determine nothing; a quick closed form; the refinement; a test of each robot pose
-against what the others predict for it. Where a pose fails, or the start looks spoiled, small random subsets vote for a
-clean one, and poses are taken out and let in again until the set stands still. m and rad.
+against what the others predict for it. Where a pose fails, or the start is spoiled, small random subsets vote for a
+clean one, and poses are taken out and let in again until the set does not change. m and rad.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def pose_tests(
         used: (n,) which views the estimate rests on.
         estimate: Of those.
         limit: Largest distance that is usual.
-        usable: (n,) views whose marks lie on a board; the others are not looked at, their distance is infinite.
+        usable: (n,) views whose marks lie on a board; the others are not tested, their distance is infinite.
 
     Returns:
         By number of the pose, as `problem.pose` counts.
@@ -72,7 +72,7 @@ def pose_tests(
     M = squares[:, :6, :6] * estimate.noise.px**-2.0
     G, K = design(problem, estimate.X, estimate.Z, T, B, estimate.extras)
     extra = 6 * (problem.cameras + problem.boards)
-    # extras act beside the twist; their effect on it is what a view's own fit would make of them
+    # extras act in addition to the twist; their effect on it is what a view's own fit would make of them
     G6 = G[:, :6].copy()
     fit = np.ones(len(problem), dtype=bool) if usable is None else usable
     M[~fit] = np.eye(6)
@@ -124,7 +124,7 @@ def _twist(T_from: Array, T_to: Array) -> Array:
     return np.concatenate([T_to[:3, 3] - T_from[:3, 3] - np.cross(w, half), w])
 
 
-#: With fewer poses the others can't tell which one is wrong; a clean set would lose poses by chance.
+#: With fewer poses it can't be determined which one is wrong; a clean set would lose poses by chance.
 _FEWEST_TO_REJECT = 7
 
 
@@ -157,7 +157,7 @@ class Outlier:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Mounts with what they rest on.
+    """Mounts and the data they are computed from.
 
     Args:
         problem: All views.

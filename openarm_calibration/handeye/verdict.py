@@ -48,7 +48,7 @@ class Held:
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that is looked at.
+    """One criterion.
 
     Args:
         name: What, in a word or two.
@@ -63,7 +63,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Grade, why, the figures (SI units, px), and everything that was looked at."""
+    """Grade, why, the figures (SI units, px), and all checks."""
 
     grade: Grade
     reasons: tuple[str, ...]
@@ -105,7 +105,7 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
 
 
 def side_by_side(problem: Problem, solution: Solution) -> dict[str, dict[str, float] | str]:
-    """Every closed form beside the refinement: distance from it (m, rad) and rms reprojection (px)."""
+    """Compare every closed form with the refinement: distance from it (m, rad) and rms reprojection (px)."""
     part = problem.subset(solution.used)
     setup: Setup = part.views[0].setup
     out: dict[str, dict[str, float] | str] = {}
@@ -198,7 +198,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
     if stored is not None:
         offset, angle = mount_error(solution.estimate.X[0], stored)
         figures |= {"drift": offset, "drift_rotation": angle}
-        # a drift is no fault of this result: it is told, never more than a warning
+        # a drift is no fault of this result: never more than a warning
         told = f"the camera is {offset * 1e3:.1f} mm and {math.degrees(angle):.2f}° from what is stored"
         checks.append(Check("drift", min(offset / limits.drift, 2.0), told))
     reasons = tuple(check.text for check in checks if check.ratio > 1.0)
@@ -220,7 +220,7 @@ def _focal(solution: Solution) -> tuple[float, float]:
     try:
         covariance = estimate.covariance()
     except OpenArmError:
-        return 1.0, math.inf  # views that do not tell it
+        return 1.0, math.inf  # views that do not determine it
     first = 6 * (part.cameras + part.boards)
     both = [
         (float(estimate.intrinsics[0, k]) / f, math.sqrt(float(covariance[first + k, first + k])) / f)

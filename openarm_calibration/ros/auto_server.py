@@ -47,9 +47,9 @@ def fill(message: AutoCalibrate.Result | ComputeCalibration.Response, solved: Re
     message.report = json.dumps(solved.as_json())
 
 
-#: What says that a pose can't be had, while another one may.
+#: Codes of a pose that can't be reached, while another one may.
 _ELSEWHERE = frozenset({Code.IN_COLLISION, Code.NO_PLAN, Code.UNREACHABLE, Code.LIMITS})
-#: What says that a pose gave no sample, while another one may.
+#: Codes of a pose that gave no sample, while another one may.
 _NO_SAMPLE = frozenset({Code.NOTHING_DETECTED, Code.STALE_DATA, Code.MOVING})
 #: Proposals of one search, and poses without a sample in a row before it is given up.
 _AT_ONCE, _MISSES = 15, 6
@@ -78,7 +78,7 @@ class AutoCalibrator:
         begin = time.monotonic()
         result = AutoCalibrate.Result()
         try:
-            with self._node.work("calibrating by itself"):
+            with self._node.work("calibrating automatically"):
                 run = _Run(self._node, self._mover, handle, result)
                 await run.sample()
                 await run.solve()
@@ -125,7 +125,7 @@ class _Run:
         missed = 0
         while len(self._node.samples) < self._poses:
             proposal = await self._next()
-            self._tell("sampling", "")
+            self._report("sampling", "")
             try:
                 await self._take()
             except OpenArmError as error:
@@ -145,8 +145,8 @@ class _Run:
                 break
 
     async def _first(self) -> None:
-        """A sample where the arm stands: shows where the board is."""
-        self._tell("sampling", "where the arm stands, to see where the board is")
+        """Take a sample at the present posture, to locate the board."""
+        self._report("sampling", "at the present posture, to locate the board")
         try:
             await self._take()
         except OpenArmError as error:
@@ -155,24 +155,24 @@ class _Run:
             key = "on_hand" if self._standing else "on_table"
             raise OpenArmError(
                 Code.NOTHING_DETECTED,
-                f"nobody said where the board is (parameter auto.{key}.position), and it is not in view:"
+                f"the position of the board is not configured (parameter auto.{key}.position), and it is not in view:"
                 f" {error.message}",
             ) from error
         await self._node.in_thread(self._search.learn, self._node.samples)
 
     async def _next(self) -> Proposal:
-        """Move to the most telling pose that the arm gets to.
+        """Move to the most informative pose that the arm reaches.
 
         Raises:
-            OpenArmError: What the planner said of the last one, when it gets to none; CANCELLED and the like at once.
+            OpenArmError: The planner's error for the last one, when none is reached; CANCELLED and the like at once.
         """
         fault: OpenArmError | None = None
         tried = 0
         while tried < self._config.tries:
-            self._tell("looking", "for the most telling pose")
+            self._report("looking", "for the most informative pose")
             state = await self._node.photographer.state()
             for proposal in await self._node.in_thread(self._search.propose, self._node.samples, state, _AT_ONCE):
-                self._tell("moving", f"try {tried + 1}: the arm did not get to the one before" if tried else "")
+                self._report("moving", f"try {tried + 1}: the arm did not reach the one before" if tried else "")
                 tried += 1
                 try:
                     await self._move(proposal.q, self._config.velocity_scale, self._stopped)
@@ -184,10 +184,10 @@ class _Run:
                     continue
                 return proposal
         last = fault.message if fault is not None else "none was proposed"
-        raise OpenArmError(Code.NO_PLAN, f"the arm gets to none of {tried} poses; of the last: {last}")
+        raise OpenArmError(Code.NO_PLAN, f"the arm reaches none of {tried} poses; of the last: {last}")
 
     async def _take(self) -> Sample:
-        """Take a sample as soon as the arm stands."""
+        """Take a sample as soon as the arm stands still."""
         until = time.monotonic() + self._config.settle_timeout
         while True:
             self._check()
@@ -208,7 +208,7 @@ class _Run:
         """Move to a posture.
 
         Raises:
-            OpenArmError: As /motion/move, or NOT_READY without it; CANCELLED, with the arm at rest.
+            OpenArmError: As /motion/move, or NOT_READY without it; CANCELLED, with the arm stopped.
         """
         if not await wait_until(self._node, self._mover.server_is_ready, _ANSWER):
             raise OpenArmError(Code.NOT_READY, "no action /motion/move: is the graph up (openarm up calibrate)?")
@@ -224,12 +224,12 @@ class _Run:
         ended = accepted.get_result_async()
         in_time = await wait_until(self._node, lambda: ended.done() or stopped(), self._config.move_timeout)
         if not ended.done():
-            accepted.cancel_goal_async()  # the motion node brings the arm to rest
+            accepted.cancel_goal_async()  # the motion node stops the arm
             await wait_until(self._node, ended.done, _ANSWER)
             self._check()
             if not in_time:
                 raise OpenArmError(Code.TIMEOUT, f"a motion took longer than {self._config.move_timeout:g} s")
-            return  # somebody else's reason to stop
+            return  # stopped for another reason than a cancel
         answer: MoveArm.Result = ended.result().result
         if not answer.success:
             self._check()
@@ -262,7 +262,7 @@ class _Run:
     async def solve(self) -> None:
         """Solve, judge, and do with the result what was asked."""
         goal, result, node = self._goal, self._result, self._node
-        self._tell("solving", f"{len(node.samples)} samples")
+        self._report("solving", f"{len(node.samples)} samples")
         if goal.session:
             node.samples.save(session_path(goal.session))
         solved: Result = await node.solve()
@@ -305,9 +305,9 @@ class _Run:
             raise OpenArmError(Code.INTERNAL, "the node has no executor")
         motion = executor.create_task(follow)
         while not ended and seen < _ENOUGH_MOVING:
-            self._tell("delay", f"{seen} images of the moving arm")
+            self._report("delay", f"{seen} images of the moving arm")
             try:
-                view = await node.look(moving=True)
+                view = await node.observe(moving=True)
             except OpenArmError as error:
                 if error.code not in _NO_SAMPLE:
                     raise
@@ -325,15 +325,15 @@ class _Run:
             )
         return await node.in_thread(estimate_delay, both)
 
-    # --- telling
+    # --- feedback
     def _stopped(self) -> bool:
         return bool(self._handle.is_cancel_requested)
 
     def _check(self) -> None:
         if self._stopped():
-            raise OpenArmError(Code.CANCELLED, f"cancelled after {len(self._node.samples)} samples; the arm stands")
+            raise OpenArmError(Code.CANCELLED, f"cancelled after {len(self._node.samples)} samples; the arm is stopped")
 
-    def _tell(self, stage: str, message: str) -> None:
+    def _report(self, stage: str, message: str) -> None:
         self._check()
         belief = self._search.belief
         feedback = AutoCalibrate.Feedback(stage=stage, message=message, poses=self._poses)

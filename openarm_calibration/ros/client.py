@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asks the calibration node: samples one by one, or all of a calibration by itself.
+"""Client of the calibration node: samples one by one, or an automatic calibration.
 
 Example:
     ``with CalibrationClient() as calibration: print(calibration.auto("wrist").message)``
@@ -94,7 +94,7 @@ class CalibrationClient(BackgroundNode):
             session: File for the samples (.npz, as the node sees the file system); empty is none.
             timeout: s of wall clock; then it is cancelled.
             on_feedback: Called with each feedback, in the background thread.
-            stop: When it is set the calibration is cancelled, the arm at rest.
+            stop: When it is set the calibration is cancelled, with the arm stopped.
 
         Raises:
             OpenArmError: NOT_READY, when no calibration node answers; TIMEOUT.
@@ -121,7 +121,7 @@ class CalibrationClient(BackgroundNode):
         )
 
     def take(self) -> TakeSample.Response:
-        """Take a sample where the arm stands."""
+        """Take a sample at the present posture of the arm."""
         return self.call(TakeSample, "/calibration/take_sample", TakeSample.Request())
 
     def remove(self, sample: str = "") -> RemoveSample.Response:

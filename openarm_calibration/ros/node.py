@@ -3,8 +3,8 @@
 
 The verbs are those of easy_handeye2: take_sample, remove_sample, get_sample_list, compute_calibration,
 save_calibration, list_algorithms, set_algorithm, save_samples, load_samples. A camera on a moving link is calibrated
-with the board standing (eye in hand), a camera on the base with the board on `carrier` (eye to hand). Images and joint
-states are subscribed to only while a sample is taken. The action /calibration/auto takes all samples by itself.
+with a fixed board (eye in hand), a camera on the base with the board on `carrier` (eye to hand). Images and joint
+states are subscribed to only while a sample is taken. The action /calibration/auto takes all samples automatically.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         self.samples, self._result = samples, None
         self._report()
 
-    async def look(self, *, moving: bool = False) -> View:
+    async def observe(self, *, moving: bool = False) -> View:
         """Detect the board in the next image, with the robot at its stamp.
 
         Args:
@@ -129,8 +129,8 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         return View(t_ns, matched, await self.in_thread(detect, self.samples.board, pixels), pixels)
 
     async def take(self) -> Sample:
-        """Take a sample; errors as `look`."""
-        view = await self.look()
+        """Take a sample; errors as `observe`."""
+        view = await self.observe()
         sample = self.samples.take(view.t_ns, view.matched, view.detection, view.pixels)
         self._change(self.samples)
         return sample
@@ -145,7 +145,7 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         found = self._store.find(self.camera.name)
         stored = found.calibration if found is not None else None
         if stored is not None and stored.mount_seed != self.samples.head.mount_seed:
-            stored = None  # of other mounts: its distance says nothing
+            stored = None  # of other mounts: its distance means nothing
         result: Result = await self.in_thread(
             calibrate, self.samples, algorithm=name, limits=self.config.limits, created=_now(), stored=stored
         )

@@ -21,7 +21,7 @@ from openarm_common.ros.convert import image_to_array, rgb_image
 from openarm_common.ros.node import BASE_FRAME, BaseNode
 from openarm_common.ros.tf import RobotStateListener
 
-#: Between looks at a condition that is waited for, s of wall clock.
+#: Period in which a condition is checked, s of wall clock.
 _POLL = 0.02
 
 
@@ -105,13 +105,13 @@ async def wait_until(node: BaseNode[Any], condition: Callable[[], bool], timeout
     future = Future(executor=node.executor)
     left = round(timeout / _POLL)
 
-    def look() -> None:
+    def check() -> None:
         nonlocal left
         left -= 1
         if not future.done() and (condition() or left <= 0):
             future.set_result(left > 0)
 
-    timer = node.create_timer(_POLL, look, clock=node.steady_clock)
+    timer = node.create_timer(_POLL, check, clock=node.steady_clock)
     try:
         return bool(await future)
     finally:

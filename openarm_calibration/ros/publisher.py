@@ -42,12 +42,12 @@ class PublisherNode(BaseNode[PublisherConfig]):
         self._last: dict[str, Array] = {}
         self._mounts = self.create_publisher(TFMessage, "/tf_static", QOS_LATCHED)
         self._publish()
-        self.create_timer(self.config.period, self._look, clock=self.steady_clock)
+        self.create_timer(self.config.period, self._check, clock=self.steady_clock)
 
     def _state(self) -> tuple[object, ...]:
         return tuple(store.state() for store in self._stores)
 
-    def _look(self) -> None:
+    def _check(self) -> None:
         state = self._state()
         if state != self._seen:
             self._seen = state
@@ -76,14 +76,14 @@ class PublisherNode(BaseNode[PublisherConfig]):
         if self.config.nominal:
             return camera.T_parent_link, "nominal, as asked"
         seed = self.config.seed if camera.mount_error else None
-        found, told = of_these_mounts(self._stores, camera.name, camera.parent, seed)
+        found, reasons = of_these_mounts(self._stores, camera.name, camera.parent, seed)
         if found is None:
-            faults += told
+            faults += reasons
             if camera.name in self._last:
                 return self._last[camera.name], "calibrated, the file before"
             return camera.T_parent_link, "nominal"
-        if told:  # one of other mounts may well be there beside the right one: that is no fault
-            self.get_logger().info("; ".join(told))
+        if reasons:  # a calibration of other mounts next to the right one is no fault
+            self.get_logger().info("; ".join(reasons))
         if found.warning:
             faults.append(found.warning)
         calibration = found.calibration

@@ -2,7 +2,7 @@
 """Which image may be paired with which joint state.
 
 The stamp of the image is the base. A joint state counts within 5 ms of it, or between two that bracket it, and only
-while the robot stands: 5 ms at 0.25 m/s are a millimetre and more. Nothing is ever paired with "the latest".
+while the robot stands still: 5 ms at 0.25 m/s are a millimetre and more. Nothing is ever paired with "the latest".
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where to look from next, among postures that an arm can take: what drives automatic calibration.
+"""The next best pose for a sample, among postures that an arm can take: the core of automatic calibration.
 
 Postures are drawn in joint space, at random and around those that showed the board, so that each is reachable; kept are
 those in which all of the board would be in the image, large enough and not behind the robot; and of these the ones that
 take most off the predicted error of the camera's mount, with what both mounts are known to by now (twelve unknowns).
-Whether the way there is free is for the planner to say. m, rad, px.
+Whether a path leads there is decided by the planner. m, rad, px.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def visible(board: Board, T_camera_board: Array, row: Array, size: tuple[int, in
 
 
 def advice(A: Sequence[Array] | Array) -> str:
-    """What to do next, in words, for someone who moves the arm by hand.
+    """Return what to do next, in words, for a user who moves the arm by hand.
 
     Args:
         A: Robot poses so far, (n, 4, 4).
@@ -68,7 +68,7 @@ def advice(A: Sequence[Array] | Array) -> str:
         return "move 5 cm or more nearer to the board, or farther from it, and tilt"
     if len(poses) < ENOUGH:
         return f"{ENOUGH - len(poses)} more of this kind; rotate about the wrist's {least} axis, which turned least"
-    return "enough; solve, and look at the predicted error"
+    return "enough; solve, and check the predicted error"
 
 
 def _least_turned(poses: Array) -> str:
@@ -85,7 +85,7 @@ _RULER = 45.0
 _FIRST_DRAWS = 20_000
 #: Drawn at once.
 _BATCH = 250
-#: Of postures that tell about equally much the nearest is taken.
+#: Of postures that are about equally informative the nearest is taken.
 _AS_GOOD = 1.1
 #: Postures that are enough for the first pose; finding them takes long.
 _ENOUGH = 24
@@ -97,7 +97,7 @@ class SearchConfig(Config):
     """How the next pose is searched for."""
 
     draws: int = Field(default=5000, ge=250, le=100_000, description="postures drawn for each choice")
-    candidates: int = Field(default=100, ge=5, le=5000, description="of them compared by what they tell")
+    candidates: int = Field(default=100, ge=5, le=5000, description="of them compared by their information")
     step: float = Field(default=0.6, gt=0.0, le=3.0, description="of each joint from a posture that shows the board")
     margin: float = Field(default=12.0, ge=0.0, le=200.0, description="kept from the edge of the image, px")
     smallest: float = Field(default=9.0, ge=2.0, description="diameter of a mark in the image, px")
@@ -116,7 +116,7 @@ class Belief:
 
     Args:
         X: (4, 4) mount of the camera (optical frame).
-        Z: (4, 4) mount of the board; None before it was seen or told.
+        Z: (4, 4) mount of the board; None before it was detected or configured.
         sigma_translation: Predicted error of X, m; infinite before it was solved for.
         sigma_rotation: Predicted error of X, rad; infinite before it was solved for.
     """
@@ -153,7 +153,7 @@ class PoseSearch:
     Args:
         description: The robot.
         nominal: (4, 4) T_parent_optical of the camera as mounted on paper.
-        board: (4, 4) mount of the board, roughly; None when nobody told.
+        board: (4, 4) mount of the board, roughly; None: unknown.
         config: Of the search.
     """
 
@@ -208,11 +208,14 @@ class PoseSearch:
             most: How many.
 
         Raises:
-            OpenArmError: NOT_READY, when nobody said where the board is; UNREACHABLE, when no posture shows it.
+            OpenArmError: NOT_READY, when the position of the board is unknown; UNREACHABLE, when no posture shows it.
         """
         Z = self.belief.Z
         if Z is None:
-            raise OpenArmError(Code.NOT_READY, "where the board is must be told, or seen, before poses are chosen")
+            raise OpenArmError(
+                Code.NOT_READY,
+                "the position of the board is not known; configure it, or take a sample that shows the board",
+            )
         whole = {**dict.fromkeys(self._description.joints, 0.0), **state}
         found, shadowed = self._showing(samples, Z, whole)
         if not found:
@@ -221,14 +224,14 @@ class PoseSearch:
                 f"no posture of {samples.head.carrier!r} shows all of {samples.board.label} to {samples.head.camera!r}"
                 f" ({shadowed} would, were the robot not in the way); move the board, or use a smaller one",
             )
-        told = self._told(samples, Z, found)
+        ranked = self._ranked(samples, Z, found)
         here = _vector(samples, state)
         out: list[Proposal] = []
-        while told and len(out) < most:
-            limit = _AS_GOOD * min(score for score, _ in told)
-            near = [k for k, (score, _) in enumerate(told) if score <= limit]
-            best = min(near, key=lambda k: float(np.abs(told[k][1].q - here).max()))
-            out.append(told.pop(best)[1])
+        while ranked and len(out) < most:
+            limit = _AS_GOOD * min(score for score, _ in ranked)
+            near = [k for k, (score, _) in enumerate(ranked) if score <= limit]
+            best = min(near, key=lambda k: float(np.abs(ranked[k][1].q - here).max()))
+            out.append(ranked.pop(best)[1])
         return out
 
     # --- parts
@@ -304,7 +307,7 @@ class PoseSearch:
         size = (round(optics.width - 2 * margin), round(optics.height - 2 * margin))
         return visible(samples.board, T, row, size)
 
-    def _told(self, samples: SampleSet, Z: Array, found: list[tuple[Array, Array]]) -> list[tuple[float, Proposal]]:
+    def _ranked(self, samples: SampleSet, Z: Array, found: list[tuple[Array, Array]]) -> list[tuple[float, Proposal]]:
         """What each posture leaves of the error: a score, smaller is better."""
         config, optics, board = self._config, samples.head.optics, samples.board
         noise = Noise(config.px, config.robot_translation, config.robot_rotation)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Samples of one camera and board, and the session file that keeps them.
 
-A session is one NPZ file without pickles: the head (camera, board, who carries what) as JSON, and of each sample the
+A session is one NPZ file without pickles: the head (camera, board, what carries what) as JSON, and of each sample the
 marks, the joint states with both stamps, and the image. It can be solved again without robot or ROS. Robot poses are
 recomputed from the joints by the description that reads it.
 """
@@ -36,7 +36,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 
-#: What is kept of each sample beside the JSON.
+#: What is kept of each sample in addition to the JSON.
 _ARRAYS = ("ids", "pixels", "pose", "png")
 
 
@@ -358,7 +358,7 @@ def moving_joints(head: SessionHead, description: RobotDescription) -> tuple[str
 
 
 def setup_of(description: RobotDescription, parent: str) -> Literal["in_hand", "to_hand"]:
-    """Whether a camera on a link moves with the arm, or stands and looks at a board that the arm carries."""
+    """Whether a camera on a link moves with the arm, or is fixed and observes a board that the arm carries."""
     moves = any(joint.type != "fixed" for joint in description.chain(parent))
     return "in_hand" if moves else "to_hand"
 

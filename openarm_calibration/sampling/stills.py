@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples from a recording: where the robot stood, which image of each stand is taken, and why others are not.
+"""Samples from a recording: where the robot stood still, which image of each standstill is used, why others are not.
 
-The gate is that of the node (`gate.match`). Of the images of one stand one is enough: they show the same but for their
-noise. Stamps in ns, joint positions in rad.
+The gate is that of the node (`gate.match`). Of the images of one standstill one is enough: they
+show the same but for their noise. Stamps in ns, joint positions in rad.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from openarm_common.robot.robot_state import RobotStateBuffer
 
 State = tuple[int, Mapping[str, float]]
 
-#: Images with joints nearer to each other than this are of one stand, rad.
+#: Images with joints nearer to each other than this are of one standstill, rad.
 SAME_POSTURE = 0.01
-#: Joint states after an image that the gate may look at.
+#: Joint states after an image that the gate uses.
 _AHEAD_NS = 1_000_000_000
-#: Of the images of a stand: which are looked at until one shows the board, as shares of their number.
+#: Of the images of a standstill: which are examined until one shows the board, as shares of their number.
 _TRIES = (0.5, 0.75, 0.999)
 
 
 @dataclass
 class Stretch:
-    """Images one after the other of which the gate says the same.
+    """Images one after the other with the same answer of the gate.
 
     Args:
         stamps: Of the images.
@@ -53,7 +53,7 @@ class Stretch:
 
     @property
     def tries(self) -> dict[int, Matched]:
-        """Images to look at, and the robot at each."""
+        """Images to examine, and the robot at each."""
         if self.code != Code.OK:
             return {}
         chosen = {int(share * len(self.stamps)) for share in _TRIES}
@@ -63,16 +63,16 @@ class Stretch:
 def stretches(
     stamps: Iterable[int], states: Sequence[State], names: tuple[str, ...], robot: RobotDescription, gate: GateConfig
 ) -> list[Stretch]:
-    """Divide the images of a recording by what the gate says of them.
+    """Divide the images of a recording by the answer of the gate.
 
     Args:
         stamps: Of the images.
         states: Joint states in the order of their stamps.
         names: Joints that move camera or board.
         robot: Their robot.
-        gate: When it stands.
+        gate: When it stands still.
     """
-    # states enter as if the images were live, so that the gate looks at a few seconds and not at all of an hour
+    # states enter as if the images were live, so that the gate reads a few seconds and not an hour
     buffer = RobotStateBuffer(robot, capacity=2000)
     out: list[Stretch] = []
     fed = 0
@@ -99,11 +99,11 @@ def _far(a: Matched, b: Matched, names: Sequence[str]) -> bool:
 
 
 class Picker:
-    """Takes a sample of each stand from the images that are offered to it.
+    """Takes a sample of each standstill from the images that are offered to it.
 
     Args:
         samples: Grows.
-        found: The recording's stretches; told what became of them.
+        found: The recording's stretches; updated with what became of them.
     """
 
     def __init__(self, samples: SampleSet, found: Sequence[Stretch]) -> None:
@@ -111,7 +111,7 @@ class Picker:
         self._open = {t: (stretch, matched) for stretch in found for t, matched in stretch.tries.items()}
 
     def wants(self, t_ns: int) -> bool:
-        """Whether the image of this stamp is one to look at."""
+        """Whether the image of this stamp is to be examined."""
         return t_ns in self._open and not self._open[t_ns][0].sample
 
     def offer(self, t_ns: int, image: NDArray[np.uint8], optics: Intrinsics) -> None:
@@ -145,8 +145,8 @@ def rows(found: Sequence[Stretch]) -> list[dict[str, Any]]:
     ]
 
 
-def told(found: Sequence[Stretch]) -> str:
-    """Lines for a terminal: each stand, and the images between them together."""
+def summary(found: Sequence[Stretch]) -> str:
+    """Lines for a terminal: each standstill, and the images between them together."""
     lines: list[str] = []
     between: Counter[Code] = Counter()
     why: dict[Code, str] = {}
@@ -158,4 +158,4 @@ def told(found: Sequence[Stretch]) -> str:
         span = f"{row['from_s']:8.2f} to {row['to_s']:8.2f} s"
         lines.append(f"  {span} {row['images']:5d} images  {stretch.sample or stretch.reason}")
     lines += [f"  {count:5d} images not used, {code}, such as: {why[code]}" for code, count in between.items()]
-    return "\n".join(["stands of the robot, and the sample of each", *lines])
+    return "\n".join(["standstills of the robot, and the sample of each", *lines])

@@ -2,8 +2,8 @@
 """Stored calibrations: one YAML a camera, checked by its own hash, with history and rollback.
 
 A mount is `T_parent_link` of the camera (position in m, quaternion x, y, z, w; link frame x forward, z up). Files are
-written beside and renamed, so that a reader sees an old or a new one, never a part. A file that is damaged is refused,
-and the newest good one of the history takes its place.
+written to another name and renamed, so that a reader gets an old or a new one, never a part. A damaged file is
+refused, and the newest good one of the history takes its place.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class StoreConfig(Config):
 class PublisherConfig(StoreConfig):
     """Parameters of the node `calibration_publisher`."""
 
-    period: float = Field(default=0.5, gt=0.0, le=60.0, description="between looks at the store, s of wall clock")
+    period: float = Field(default=0.5, gt=0.0, le=60.0, description="of the checks of the store, s of wall clock")
     nominal: bool = Field(default=False, description="publish the mounts of the configuration whatever is stored")
 
 
@@ -79,7 +79,7 @@ class StoredCalibration(Config):
         default=None, description="of the simulated mounts that were calibrated; None: real or nominal"
     )
     method: str = Field(default="REFINED", description="solver")
-    board: str = Field(default="", description="that was looked at")
+    board: str = Field(default="", description="that was observed")
     samples: int = Field(default=0, ge=0, description="that the result rests on")
     session: str = Field(default="", description="hash of the session file")
     created: str = Field(default="", description="when, as ISO 8601")
@@ -263,9 +263,9 @@ def read(path: Path) -> StoredCalibration:
         OpenArmError: CONFIG_INVALID, when it is not as it was written.
     """
     data = load_yaml(path)
-    told = data.pop("sha256", None)
+    stated = data.pop("sha256", None)
     calibration = validate(StoredCalibration, data, str(path))
-    if told != calibration.digest():
+    if stated != calibration.digest():
         raise OpenArmError(
             Code.CONFIG_INVALID,
             f"{path} is damaged or was edited: its contents do not have the hash that it states; calibrate and save"
@@ -290,7 +290,7 @@ def check_mount_seed(calibration: StoredCalibration, mount_seed: int | None) -> 
 
 
 def places(folder: Path, mount_seed: int | None) -> tuple[CalibrationStore, ...]:
-    """Where calibrations of the mounts in use are looked for, the first that has one wins.
+    """List where calibrations of the mounts in use are searched; the first that has one wins.
 
     That is the folder itself; for simulated mounts also its subfolder of that seed, and what comes with the suite.
     """
@@ -333,7 +333,7 @@ def of_these_mounts(
 
 
 def default_folder() -> Path:
-    """Where calibrations are when nothing else is said: OPENARM_CALIBRATIONS, or the user's data folder."""
+    """Return the default folder of calibrations: OPENARM_CALIBRATIONS, or the user's data folder."""
     given = os.environ.get("OPENARM_CALIBRATIONS", "")
     if given:
         return Path(given).expanduser()

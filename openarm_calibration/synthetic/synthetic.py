@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hand-eye problems with a known answer, for benchmarks and tests.
 
-A 1280×720 camera of 900 px focal length looks at a 4×11 circle grid: from the hand at 0.30 to 0.55 m, from the base at
+A 1280×720 camera of 900 px focal length observes a 4×11 circle grid: from the hand at 0.30 to 0.55 m, from the base at
 0.45 to 0.75 m, tilted by 5° to 40°. Noise is normal by axis: px on the marks, m and rad on the robot's pose.
 """
 
@@ -76,10 +76,10 @@ def make(setup: Setup, C: Array, noise: Noise, rng: np.random.Generator) -> Trut
     B = X @ C @ inverses(Z)
     A = inverses(B) if setup == "in_hand" else B
     error = rng.normal(0.0, 1.0, (len(C), 6)) * np.repeat((noise.translation, noise.rotation), 3)
-    told = moved(A, error)
+    reported = moved(A, error)
     seen = [project(BOARD.points, BOARD.radius, T, _ROW) + rng.normal(0.0, noise.px, (len(BOARD.points), 2)) for T in C]
     listed = [
-        View(BOARD.points, pixels, told[i], setup, radius=BOARD.radius, pose=i, name=f"s{i:02d}")
+        View(BOARD.points, pixels, reported[i], setup, radius=BOARD.radius, pose=i, name=f"s{i:02d}")
         for i, pixels in enumerate(seen)
     ]
     return Truth(assemble(listed, [INTRINSICS], list(C)), X, Z, A)

@@ -62,7 +62,7 @@ class FrameStream(Generic[T]):
         max_rate: Frames a second of the stamps, Hz; others are passed over; 0: all.
 
     Attributes:
-        heard: Streams of which something has come.
+        received: Streams of which something has come.
         counts: Frames by what became of them: `taken`, `refused` (no posture), `early` (before the first joint state),
             `superseded` (by a newer one), `overrun` (the queue was full), `incomplete` (a stream did not come).
     """
@@ -86,7 +86,7 @@ class FrameStream(Generic[T]):
         self._capacity = capacity
         self._period_ns = 0.999e9 / max_rate if max_rate else 0.0
         self._last_ns: int | None = None
-        self.heard: set[str] = set()
+        self.received: set[str] = set()
         self._partial: dict[int, dict[str, T]] = {}
         self._waiting: deque[_Waiting[T]] = deque()
 
@@ -98,7 +98,7 @@ class FrameStream(Generic[T]):
     @property
     def silent(self) -> list[str]:
         """Streams of which nothing has come."""
-        return [stream for stream in self._streams if stream not in self.heard]
+        return [stream for stream in self._streams if stream not in self.received]
 
     def add(self, stream: str, t_ns: int, frame_id: str, item: T, now: float) -> None:
         """Add an item; when it completes the frame of its stamp, earlier stamps are given up.
@@ -119,7 +119,7 @@ class FrameStream(Generic[T]):
                 f"{stream} is in frame {frame_id!r}, expected the optical frame {self._frame_id!r}"
                 " (z forward, x right), shared by colour, depth and CameraInfo",
             )
-        self.heard.add(stream)
+        self.received.add(stream)
         items = self._partial.setdefault(t_ns, {})
         items[stream] = item
         if len(items) == len(self._streams):
@@ -181,7 +181,7 @@ class FrameStream(Generic[T]):
         """Forget what waits, and the rate."""
         self._partial.clear()
         self._waiting.clear()
-        self.heard.clear()
+        self.received.clear()
         self._last_ns = None
 
     def _pending(self, frame: _Waiting[T], now: float) -> bool:

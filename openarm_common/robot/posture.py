@@ -90,12 +90,12 @@ class PostureTracker:
     def pending(self, frame: str, t_ns: int, since: float, now: float, joints: JointNeed = "required") -> bool:
         """Return whether what may still arrive can change a posture; arguments as for `posture`."""
         in_time = now < since + self._wait
-        heard = now < max(self._received_at, self._listening_since) + max(self._wait, _SILENT)
+        alive = now < max(self._received_at, self._listening_since) + max(self._wait, _SILENT)
         try:
             due = joints != "none" or self.buffer.moves(frame)
         except OpenArmError:
             return in_time  # the frame is not connected yet
-        return due and in_time and heard and self._listening and not self.buffer.settled(t_ns)
+        return due and in_time and alive and self._listening and not self.buffer.settled(t_ns)
 
     def posture(
         self, frame: str, t_ns: int, since: float, now: float, joints: JointNeed = "required"

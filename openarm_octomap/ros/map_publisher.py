@@ -19,7 +19,7 @@ from openarm_octomap.ros import convert
 
 
 class MapPublisher:
-    """Publishes snapshots; pictures of the map only while somebody looks.
+    """Publishes snapshots; clouds, markers and projection only while they have subscribers.
 
     Args:
         node: Its node.
@@ -38,7 +38,7 @@ class MapPublisher:
         ]
 
     def wanted(self, *, everything: bool = False) -> set[str]:
-        """What a snapshot must hold for those who listen."""
+        """Return what a snapshot must hold for the subscribers."""
         listening = [p for p, _ in self._pictures if everything or p.get_subscription_count()]
         wanted = {"states"} if listening or self._changes.get_subscription_count() else set[str]()
         return wanted | ({"full"} if self._full_wanted else set())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The services of the map: those of octomap_server, and those that say what became of a request.
+"""The services of the map: those of octomap_server, and those whose answers have a code and a message.
 
 Boxes and points are in the base frame, m.
 """

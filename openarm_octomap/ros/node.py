@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Node `octomap`: the surroundings of the robot as an octree, from depth images, under octomap_server's names.
+"""Node `octomap`: the environment of the robot as an octree, from depth images, under octomap_server's names.
 
 Publishes octomap_binary, octomap_full (latched), centres, markers, projected map, and the distance field in shared
 memory (`openarm_common.octree.distance_field`). Everything is in the base frame.
@@ -28,7 +28,7 @@ from openarm_octomap.ros.sources import Source, cloud_source, depth_source
 
 
 class OctomapNode(ManagedNode[OctomapNodeConfig]):
-    """Keeps the map, publishes it, answers what it knows; looks at the cameras while its state is active."""
+    """Keeps the map, publishes it and answers queries; subscribes to the cameras while its state is active."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("octomap", OctomapNodeConfig, **kwargs)
@@ -79,7 +79,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         self._timer.reset()
 
     def rest(self) -> None:
-        """Leave the map as it is: who asks how old it is will hear it."""
+        """Leave the map as it is; its age is in what it publishes."""
         self._timer.cancel()
         for source in self._sources:
             source.listen(False)
@@ -149,7 +149,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
     # --- health
     def _report(self) -> None:
         if not self.active:
-            self.diagnose(True, "rests: /octomap/change_state activates it", updates=self._updates)
+            self.diagnose(True, "inactive: /octomap/change_state activates it", updates=self._updates)
             return
         limit = self.config.stale_after
         faults = [self._fault] if self._fault else []

@@ -88,7 +88,7 @@ class Source:
     def missing(self) -> str:
         """Name the streams of which nothing has come, where others have."""
         frames = self._stream.frames
-        return f"{self.name}: no {' and no '.join(frames.silent)} yet" if frames.silent and frames.heard else ""
+        return f"{self.name}: no {' and no '.join(frames.silent)} yet" if frames.silent and frames.received else ""
 
     def _refuse(self, error: OpenArmError) -> None:
         self.fault = f"{self.name}: {error.message}"

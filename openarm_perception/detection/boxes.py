@@ -88,7 +88,7 @@ class Candidates:
 
 
 def decode(output: NDArray[np.float32], threshold: float, max_overlap: float, limit: int = 100) -> Candidates:
-    """Boxes of a network's output without the weaker ones of the same thing.
+    """Boxes of a network's output without the weaker ones of the same object.
 
     Args:
         output: (4 + classes, n): cx, cy, width, height in pixels, then a score per class.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Objects in colour images: what a detector is, one that goes by colour, and which detection to take.
+"""Objects in colour images: the interface of detectors, one by colour, and the ranking of detections.
 
-Pixel coordinates put the centre of the top-left pixel at (0, 0). A detection says where in the image a thing is; where
-it is in space is the business of `detection.localize`, which reads the mask and the depth, never the box.
+Pixel coordinates put the centre of the top-left pixel at (0, 0). A detection is a region of the image; its
+position in space is computed by `detection.localize` from the mask and the depth, never from the box.
 """
 
 from __future__ import annotations
@@ -95,9 +95,9 @@ class ColorClass(Config):
 
 
 class ColorDetectorConfig(Config):
-    """Colours to look for and how large an object must be."""
+    """Colours to detect and how large an object must be."""
 
-    classes: tuple[ColorClass, ...] = Field(min_length=1, description="colours that are looked for")
+    classes: tuple[ColorClass, ...] = Field(min_length=1, description="colours that are detected")
     min_area: int = Field(default=120, ge=9, description="smallest object, pixels")
     cleanup: int = Field(default=3, ge=1, le=31, description="edge of the morphological kernel, pixels; odd")
     sure_saturation: float = Field(

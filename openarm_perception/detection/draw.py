@@ -57,13 +57,13 @@ def _lines(found: Detection2D, place: LocatedObject | None) -> list[str]:
 
 
 def _tag(picture: Image, lines: list[str], box: Box, taken: list[Box], color: tuple[int, int, int]) -> Box:
-    """Write lines beside a box, where they cover least of the objects and the other tags; return what they cover."""
+    """Write lines next to a box, where they cover least of the objects and the other tags; return what they cover."""
     width = max(cv2.getTextSize(line, _FONT, _SCALE, 1)[0][0] for line in lines) + 6
     height = _LINE_HEIGHT * len(lines) + 4
-    beside = [(box[0], box[1] - height - 1), (box[0], box[3] + 2), (box[2] + 2, box[1]), (box[0] - width - 2, box[1])]
-    beside += [(box[2] - width, box[1] - height - 1), (box[2] - width, box[3] + 2)]
+    corners = [(box[0], box[1] - height - 1), (box[0], box[3] + 2), (box[2] + 2, box[1]), (box[0] - width - 2, box[1])]
+    corners += [(box[2] - width, box[1] - height - 1), (box[2] - width, box[3] + 2)]
     spots: list[Box] = []
-    for corner in beside:
+    for corner in corners:
         left = min(max(corner[0], 0), max(picture.shape[1] - width - 1, 0))
         top = min(max(corner[1], 0), max(picture.shape[0] - height - 1, 0))
         spots.append((left, top, left + width, top + height))

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a detection in the image to an object in the base frame: position, yaw, size. Usable without ROS.
 
-The base frame has z up; the table is a horizontal plane at a known height. The object is taken for a prism that stands
-on it (a box, an upright cylinder or can): its top gives the height, the outline of the top centre, yaw and footprint.
+The base frame has z up; the table is a horizontal plane at a known height. The object is modelled as a prism on
+it (a box, an upright cylinder or can): its top gives the height, the outline of the top centre, yaw and footprint.
 
 The outline is found where neighbouring pixels part. Where the far pixel lies lower, the edge is the ray between the
-two, cut with the plane of the top. Points on the sides of the object stand on its outline already. So edges are known
+two, cut with the plane of the top. Points on the sides of the object are on its outline already. So edges are known
 to a fraction of a pixel and nothing is eroded. Where the far pixel is nearer to the camera, something hides the object;
 such places are left out of the fit. What is no prism (a lying cylinder) gets the smallest rectangle around its points,
-and says so.
+and is marked so.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Localizer:
         T_base_camera: Array,
         robot: Mask | None = None,
     ) -> Patch:
-        """The surroundings of a detection, for the methods below; arguments and errors are those of `patch.cut`."""
+        """Cut out the neighbourhood of a detection, for the methods below; arguments and errors as `patch.cut`."""
         return cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
 
     def coarse(self, patch: Patch) -> Array:
@@ -132,7 +132,7 @@ class Localizer:
 
         Raises:
             OpenArmError: BAD_IMAGE, when the image border cuts the object or depths are missing; NOTHING_DETECTED, when
-                nothing stands above the table there, too much of it is hidden, or most of it is the robot.
+                nothing rises above the table there, too much of it is hidden, or most of it is the robot.
         """
         found = patch.found
         if found.truncated:
@@ -146,7 +146,7 @@ class Localizer:
         top = self._top_height(patch.points[..., 2][solid], patch.band)
         face = self._top_face(patch, top)
         pixel = float(np.median(patch.z[solid])) / patch.intrinsics.fx
-        # not beside its borders: where depth jumps, a real sensor reports any value between both sides
+        # not at its borders: where depth jumps, a real sensor reports any value between both sides
         flank = solid & (patch.points[..., 2] < top - patch.band)
         sides = patch.points[cv2.erode(flank.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0, :2]
         sides = sides[:: max(1, len(sides) // _SIDE_POINTS)]
@@ -251,7 +251,7 @@ class Localizer:
 
     @staticmethod
     def _top_face(patch: Patch, top: float) -> Mask:
-        """The largest patch at the height of the top; depth, not colour, says where it ends."""
+        """The largest patch at the height of the top; it is bounded by depth, not colour."""
         grown = cv2.dilate(patch.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         level = grown & ~patch.robot & (np.abs(patch.points[..., 2] - top) <= patch.band)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(level.astype(np.uint8), connectivity=4)
@@ -309,7 +309,7 @@ class Localizer:
 
 
 def _shape(found: Detection2D, method: footprint.Kind) -> str:
-    """Name the shape: as a network says, else by the outline."""
+    """Name the shape: by the network, else by the outline."""
     outline = {"rectangle": "box", "circle": "cylinder"}.get(method, "")
     # no box has a round outline; that of a cylinder that lies is a rectangle
     return outline if found.kind == "" or (found.kind, outline) == ("box", "cylinder") else found.kind

@@ -2,7 +2,7 @@
 """A detector that is a network in an ONNX file, run on the CPU by onnxruntime in one thread.
 
 Any file in the layout of YOLOv8 will do: input (1, 3, h, w) of red, green, blue 0 to 1; output (1, 4 + classes, n) of
-cx, cy, width, height in input pixels and a score per class, 0 to 1. Boxes of the same thing are sorted out here.
+cx, cy, width, height in input pixels and a score per class, 0 to 1. Non-maximum suppression is done here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Image = NDArray[np.uint8]
 
 #: Boxes that come this near to the border of the image may be cut by it, pixels.
 _BORDER = 2.0
-#: What the file is read with; the rest of the configuration says what to make of its boxes.
+#: What the file is read with; the rest of the configuration filters its boxes.
 _OF_THE_FILE = {"model", "names", "width", "height"}
 _LAYOUT = "expected the layout of YOLOv8: input (1, 3, h, w), output (1, 4 + classes, n)"
 
@@ -42,11 +42,11 @@ class NetworkConfig(Config):
     )
     names: tuple[str, ...] = Field(
         default=(),
-        description="of the classes; empty: those of the file, or `names` of the YAML beside it",
+        description="of the classes; empty: those of the file, or `names` of the YAML next to it",
         json_schema_extra=AT_RUN_TIME,
     )
     classes: tuple[str, ...] = Field(
-        default=(), description="classes that are looked for; empty: all", json_schema_extra=AT_RUN_TIME
+        default=(), description="classes that are detected; empty: all", json_schema_extra=AT_RUN_TIME
     )
     threshold: float = Field(
         default=0.5, gt=0.0, lt=1.0, description="least score, 0..1", json_schema_extra=AT_RUN_TIME
@@ -55,7 +55,7 @@ class NetworkConfig(Config):
         default=0.6,
         gt=0.0,
         lt=1.0,
-        description="boxes of one class that overlap more are one thing (IoU)",
+        description="boxes of one class that overlap more are one object (IoU)",
         json_schema_extra=AT_RUN_TIME,
     )
     width: int = Field(
@@ -74,7 +74,7 @@ class NetworkDetector:
 
     Raises:
         OpenArmError: CONFIG_INVALID, naming the file and what is wrong with it: missing, damaged, of another layout,
-            without names for its classes; INVALID_ARGUMENT, when a class is looked for that it does not know.
+            without names for its classes; INVALID_ARGUMENT, when a class is configured that it does not know.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -149,13 +149,13 @@ class NetworkDetector:
         """The network alone: (4 + classes, n) of an input (1, 3, h, w)."""
         return cast(NDArray[np.float32], self._session.run(None, {self._input: image})[0])[0]
 
-    # --- what the file says
+    # --- contents of the file
     def _check_input(self) -> tuple[str, tuple[int, int]]:
         inputs = self._session.get_inputs()
         shape: list[Any] = list(inputs[0].shape)
         if len(inputs) != 1 or len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":
-            told = "; ".join(f"{item.name} {item.shape} {item.type}" for item in inputs)
-            raise self._wrong(f"its input is {told}, of tensor(float); {_LAYOUT}")
+            found = "; ".join(f"{item.name} {item.shape} {item.type}" for item in inputs)
+            raise self._wrong(f"its input is {found}, of tensor(float); {_LAYOUT}")
         if shape[0] not in (1, None) and not isinstance(shape[0], str):
             raise self._wrong(f"it takes {shape[0]} images at a time, expected one; export it with a batch of 1")
         height, width = (
@@ -194,7 +194,7 @@ class NetworkDetector:
         if not names:
             raise self._wrong(
                 f"its {classes} classes have no names: give them in the parameter names, or in"
-                f" {self.path.with_suffix('.yaml').name} beside it (names: [a, b, …])"
+                f" {self.path.with_suffix('.yaml').name} next to it (names: [a, b, …])"
             )
         if len(names) != classes:
             raise self._wrong(f"it has {classes} classes, but {where} names {len(names)}: {', '.join(names)}")
@@ -221,7 +221,7 @@ def model_path(model: str) -> Path:
 
 
 def _open(path: Path) -> Any:
-    """A session of onnxruntime, which is imported here alone: who sees by colour does without."""
+    """A session of onnxruntime, imported here alone: detection by colour does not need it."""
     try:
         import onnxruntime
     except ImportError as error:
@@ -230,7 +230,7 @@ def _open(path: Path) -> Any:
         ) from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # cores are for the other nodes
-    options.log_severity_level = 4  # what is wrong is told by the exception
+    options.log_severity_level = 4  # the exception has the reason
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     # onnxruntime raises types of its own, which it does not document
@@ -243,7 +243,7 @@ def _open(path: Path) -> Any:
 
 
 def _names_of(path: Path, metadata: Mapping[str, str]) -> tuple[tuple[str, ...], str]:
-    """Names of the classes and who says so: the metadata of the file (a Python or JSON mapping or list), or a YAML."""
+    """Names of the classes and their source: the metadata of the file (a Python or JSON mapping or list), or a YAML."""
     names: Any = None
     where = "its metadata"
     if "names" in metadata:

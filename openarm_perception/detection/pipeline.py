@@ -35,7 +35,7 @@ class View:
         depth: (h, w) uint16 millimetres or float32 metres, planar.
         intrinsics: Of both.
         T_base_camera: (4, 4) optical frame in the base frame.
-        robot: (h, w) pixels that show the robot or what it holds; None when nobody looked for them.
+        robot: (h, w) pixels that show the robot or what it holds; None when it was not searched for.
     """
 
     rgb: Image
@@ -62,15 +62,15 @@ class View:
 
 @dataclass(frozen=True)
 class Doubt:
-    """Something that detectors do not agree on: it stands there, but must be looked at again before it is grasped."""
+    """An object that detectors do not agree on: an obstacle that must be observed again before it is grasped."""
 
     found: Detection2D
     why: str
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a detector sees: objects, and what it is not sure of."""
+class ImageDetections:
+    """What a detector finds in an image: objects, and those in doubt."""
 
     found: tuple[Detection2D, ...]
     doubts: tuple[Doubt, ...] = ()
@@ -78,14 +78,14 @@ class Seen:
 
 @dataclass(frozen=True)
 class Perceived:
-    """What a frame shows, the object to take first at the front.
+    """The objects of a frame, the first choice at the front.
 
     Attributes:
         found: In the image.
         located: In the base frame; those of `found` that could be.
         refused: Why the others could not be, one sentence each.
-        unmeasured: Boxes around what is seen of those, with score 0: in the way, but not to be grasped.
-        robot: (h, w) pixels that show the robot or what it holds; None when nobody looked for them.
+        unmeasured: Boxes around what is visible of those: obstacles, but no targets.
+        robot: (h, w) pixels that show the robot or what it holds; None when it was not searched for.
     """
 
     found: tuple[Detection2D, ...]
@@ -96,7 +96,7 @@ class Perceived:
 
     @property
     def boxes(self) -> tuple[LocatedObject, ...]:
-        """Everything that stands there, what could be measured first."""
+        """All objects, those that could be measured first."""
         return (*self.located, *self.unmeasured)
 
 
@@ -124,7 +124,7 @@ class Pipeline:
         T_base_camera: NDArray[np.float64],
         robot: Mask | None = None,
     ) -> Perceived:
-        """The objects of a frame.
+        """Detect and locate the objects of a frame.
 
         Args:
             rgb: (h, w, 3) uint8.
@@ -140,8 +140,8 @@ class Pipeline:
         check_size("depth image", depth.shape, intrinsics)
         unit_scale(depth)
         size = (intrinsics.width, intrinsics.height)
-        seen = self.look(View(rgb, depth, intrinsics, T_base_camera, robot))
-        found = rank(seen.found, self.policy, size, self.label)
+        detected = self.detect(View(rgb, depth, intrinsics, T_base_camera, robot))
+        found = rank(detected.found, self.policy, size, self.label)
         located: list[LocatedObject] = []
         refused: list[str] = []
         unmeasured: list[LocatedObject] = []
@@ -151,9 +151,9 @@ class Pipeline:
                 located.append(self.localizer.locate(patch))
             except OpenArmError as error:
                 refused.append(error.message)
-                with contextlib.suppress(OpenArmError):  # flat on the table, or the robot: it stands in nobody's way
+                with contextlib.suppress(OpenArmError):  # flat on the table, or the robot: it is no obstacle
                     unmeasured.append(self.localizer.enclose(patch))
-        for doubt in seen.doubts:
+        for doubt in detected.doubts:
             refused.append(doubt.why)
             patch = self.localizer.cut(doubt.found, depth, intrinsics, T_base_camera, robot)
             with contextlib.suppress(OpenArmError):
@@ -185,14 +185,14 @@ class Pipeline:
             )
         return of_block(blocks[0], block_height)
 
-    def look(self, view: View) -> Seen:
-        """Objects of a frame in the image; what else than colour they are told by is the business of subclasses."""
-        return Seen(self.detector.detect(view.rgb))
+    def detect(self, view: View) -> ImageDetections:
+        """Detect the objects of a frame in the image; subclasses use more than colour."""
+        return ImageDetections(self.detector.detect(view.rgb))
 
 
 #: Label of what is found without knowing what it is.
 ANYTHING = "anything"
-#: Pixels around a box of a network that are looked at: its sides are that exact.
+#: Pixels around a box of a network that are examined: its sides are that exact.
 _MARGIN = 4
 #: An object has a colour when this share of its pixels has it.
 _COLOURED = 0.5
@@ -200,12 +200,12 @@ _COLOURED = 0.5
 _SAME = 0.5
 #: Fewer pixels are nothing.
 _PIXELS = 60
-#: Beyond this height above the table nothing stands on it, m; where depth jumps by more, objects end, m.
+#: Nothing on the table is taller than this, m; where depth jumps by more, objects end, m.
 _TALLEST, _JUMP = 0.30, 0.020
 
 
 class NetworkPipeline(Pipeline):
-    """Sees with a network.
+    """Detects with a network.
 
     Args:
         network: Finds boxes.
@@ -226,9 +226,9 @@ class NetworkPipeline(Pipeline):
         super().__init__(network, localizer, policy, label)
         self.network, self.colors = network, colors
 
-    def look(self, view: View) -> Seen:
-        """What the network finds, with the pixels that are the object's."""
-        return Seen(self._by_network(view))
+    def detect(self, view: View) -> ImageDetections:
+        """Return what the network detects, with the pixels that are the object's."""
+        return ImageDetections(self._by_network(view))
 
     def _by_network(self, view: View) -> tuple[Detection2D, ...]:
         found = [cut_out(box, view, self.localizer) for box in self.network.detect(view.rgb)]
@@ -245,10 +245,10 @@ class NetworkPipeline(Pipeline):
 
 
 class CheckedPipeline(NetworkPipeline):
-    """Sees with a network and by colour; what they do not agree on is looked at again, not grasped."""
+    """Detects with a network and by colour; what they do not agree on is observed again, not grasped."""
 
-    def look(self, view: View) -> Seen:
-        """What both find; doubts about the rest, but for what has no colour that is looked for."""
+    def detect(self, view: View) -> ImageDetections:
+        """Return what both detect; the rest is in doubt, unless it has none of the configured colours."""
         by_shape, by_colour = list(self._by_network(view)), self.colors.detect(view.rgb)
         palette = {item.label for item in self.colors.config.classes}
         found: list[Detection2D] = []
@@ -256,7 +256,7 @@ class CheckedPipeline(NetworkPipeline):
         for coloured in by_colour:
             shaped = next((d for d in by_shape if same(coloured, d)), None)
             if shaped is None:
-                doubts.append(Doubt(coloured, _doubt(coloured, coloured.label, "the network sees nothing there")))
+                doubts.append(Doubt(coloured, _doubt(coloured, coloured.label, "the network detects nothing there")))
                 continue
             by_shape.remove(shaped)
             if shaped.label != coloured.label and shaped.label in palette:
@@ -266,18 +266,18 @@ class CheckedPipeline(NetworkPipeline):
                 found.append(replace(coloured, kind=shaped.kind, score=score))
         for shaped in by_shape:
             if shaped.label in palette:
-                doubts.append(Doubt(shaped, _doubt(shaped, shaped.kind, f"colour sees nothing {shaped.label} there")))
+                doubts.append(Doubt(shaped, _doubt(shaped, shaped.kind, f"by colour nothing {shaped.label} is there")))
             else:
                 found.append(shaped)
-        return Seen(tuple(sorted(found, key=lambda d: -d.area)), tuple(doubts))
+        return ImageDetections(tuple(sorted(found, key=lambda d: -d.area)), tuple(doubts))
 
 
 class ClusterPipeline(Pipeline):
-    """Sees whatever stands on the table, by depth alone; the detector that it is made with is not asked."""
+    """Detects everything on the table, by depth alone; the detector that it is made with is not used."""
 
-    def look(self, view: View) -> Seen:
-        """Everything that stands above the table and is not the robot."""
-        return Seen(clusters(view, self.localizer))
+    def detect(self, view: View) -> ImageDetections:
+        """Return everything above the table that is not the robot."""
+        return ImageDetections(clusters(view, self.localizer))
 
 
 def make_pipeline(
@@ -289,7 +289,7 @@ def make_pipeline(
     label: str = "",
     before: Pipeline | None = None,
 ) -> Pipeline:
-    """The pipeline of a kind; the network is read only by those that use it.
+    """Make the pipeline of a kind; the network is read only by those that use it.
 
     Args:
         kind: What finds objects.
@@ -313,7 +313,7 @@ def make_pipeline(
 
 
 def cut_out(box: Detection2D, view: View, localizer: Localizer) -> Detection2D | None:
-    """The object in a box: what stands above the table there and has the colour of its middle.
+    """Cut out the object in a box: what rises above the table there and has the colour of its middle.
 
     Returns:
         The detection with mask and box of those pixels, its class as `kind`; None when hardly any are left.
@@ -337,20 +337,20 @@ def cut_out(box: Detection2D, view: View, localizer: Localizer) -> Detection2D |
         return None
     alike = _alike(view.rgb[rows, columns], core)
     plain = np.count_nonzero(alike & core) >= 0.5 * np.count_nonzero(core)
-    # what is of many colours is told from its surroundings by depth alone
+    # what is of many colours is separated from the background by depth alone
     mask = _largest(standing & alike if plain else standing)
     return _detection(mask, (columns.start, rows.start), (width, height), box.label, box.score, kind=box.label)
 
 
 def clusters(view: View, localizer: Localizer) -> tuple[Detection2D, ...]:
-    """Everything that stands above the table, parted where depth jumps; the score is how full its outline is."""
+    """Return everything above the table, separated where depth jumps; the score is the share of its convex hull."""
     above = view.heights(localizer.limits) - np.float32(localizer.table_height)
     standing = (above > localizer.config.table_margin) & (above < _TALLEST)
     if view.robot is not None:
         standing &= ~view.robot
     z = view.depth.astype(np.float32) * np.float32(unit_scale(view.depth))
     for near, far in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
-        # the farther side of a jump is the surroundings of the nearer, whatever it belongs to
+        # the farther side of a jump is background of the nearer, whatever it belongs to
         standing[far] &= z[far] - z[near] < _JUMP
         standing[near] &= z[near] - z[far] < _JUMP
     count, labels, stats, _ = cv2.connectedComponentsWithStats(standing.astype(np.uint8), connectivity=4)
@@ -420,4 +420,4 @@ def _detection(
 
 
 def _doubt(found: Detection2D, name: str, other: str) -> str:
-    return f"{name} at pixel ({found.centre[0]:.0f}, {found.centre[1]:.0f}): {other}; it is looked at again"
+    return f"{name} at pixel ({found.centre[0]:.0f}, {found.centre[1]:.0f}): {other}; it is observed again"

@@ -17,7 +17,7 @@ from openarm_perception.detection.detector import Mask
 
 
 class RobotConfig(SelfFilterConfig):
-    """How the robot is told from objects; narrow, so that what stands between the fingers is not eaten."""
+    """How the robot is distinguished from objects; narrow, so that an object between the fingers is kept."""
 
     padding: float = Field(default=0.005, ge=0.0, le=0.2, description="around every link, m")
     held_padding: float = Field(default=0.01, ge=0.0, le=0.2, description="around what a hand holds, m")

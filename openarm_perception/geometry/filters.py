@@ -23,7 +23,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Ints
 from openarm_perception.geometry.depth import DepthImage, Points, unit_scale
 
-#: Cells along an axis that a packed key can tell apart, half of them on each side of zero.
+#: Cells along an axis that a packed key distinguishes, half of them on each side of zero.
 _HALF = 1 << 20
 #: A pixel of a surface has this many of its eight neighbours on it, also at a corner.
 _SAME_SURFACE = 3

@@ -72,7 +72,7 @@ def bound(points: Array, spacing: float) -> Footprint:
     """The smallest rectangle around points (n, 2), m: for what is neither rectangle nor circle."""
     (cx, cy), (width, height), angle_deg = cv2.minAreaRect((points * 1e3).astype(np.float32))
     yaw = math.radians(angle_deg) + (math.pi / 2.0 if width > height else 0.0)
-    # half a pixel is missing on every side that the camera does not look at
+    # half a pixel is missing on every side that faces away from the camera
     smaller, larger = (1e-3 * min(width, height) + spacing, 1e-3 * max(width, height) + spacing)
     std = (0.1 * smaller, 0.1 * larger)
     return Footprint(
@@ -127,7 +127,7 @@ def _fit_rectangle(outline: Array, spacing: float) -> tuple[Footprint | str, flo
         for axis, name in enumerate(names):
             for sign in (0, 1):
                 side = sides[2 * axis + sign]
-                # the direction comes from all sides, so a short piece says where its side is
+                # the direction comes from all sides, so a short piece is enough to locate its side
                 if len(side) < 6:
                     text = f"an edge across the {name} axis of the outline is in view at {len(side)} points only"
                     return text + "; something hides the object", _rectangle_rms(local, half)

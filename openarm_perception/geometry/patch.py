@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The surroundings of a detection as points of the base frame, m, without the noise of a real sensor."""
+"""The neighbourhood of a detection as points of the base frame, m, without the noise of a real sensor."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _CLEAN = 0.0006
 _FEW_HOLES = 0.001
 #: Stands for no depth among depths, m.
 _FAR = 100.0
-#: Pixels around a detection that are looked at.
+#: Pixels around a detection that belong to its patch.
 _MARGIN = 4
 
 
 @dataclass(frozen=True)
 class Patch:
-    """The surroundings of a detection: pixel rays and points, all (h, w, ...)."""
+    """The neighbourhood of a detection: pixel rays and points, all (h, w, ...)."""
 
     found: Detection2D
     intrinsics: Intrinsics
@@ -69,7 +69,7 @@ def cut(
     """
     scale = unit_scale(depth)
     check_size("depth image", depth.shape, intrinsics)
-    # some surroundings: edges are found between a pixel of the object and one that is not
+    # with a margin: edges are found between a pixel of the object and one that is not
     (u, v), (w, h) = found.origin, found.size
     u0, u1 = max(u - _MARGIN, 0), min(u + w + _MARGIN, intrinsics.width)
     v0, v1 = max(v - _MARGIN, 0), min(v + h + _MARGIN, intrinsics.height)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where things stand without depth: pixel rays cut with planes, for a camera in any attitude.
+"""Positions of objects without depth: pixel rays cut with planes, for a camera in any attitude.
 
 The base frame has z up; planes are given as ``normal · p = offset``. All lengths in metres, pixels as in
 `openarm_perception.detection.detector`.
@@ -16,7 +16,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_perception.detection.detector import Detection2D
 
-#: A ray this flat over a plane, as a sine, meets it nowhere that an image could tell.
+#: A ray this flat over a plane, as a sine, has no intersection that an image could resolve.
 _GRAZING = 0.02
 
 
@@ -43,7 +43,7 @@ def intersect(
     if not (slope * np.sign(height) > _GRAZING).all():
         raise OpenArmError(
             Code.NOTHING_DETECTED,
-            "a pixel looks along the plane or away from it; expected it below the plane's horizon in the image",
+            "a pixel's ray runs along the plane or away from it; expected it below the plane's horizon in the image",
         )
     return T_base_camera[:3, 3] + rays * (height / (rays @ n))[..., None]
 
@@ -69,7 +69,7 @@ def outline(
         (n, 2) points on the outline of the footprint.
 
     Raises:
-        OpenArmError: NOTHING_DETECTED, when the camera does not look down at the object, or the heights do not fit it.
+        OpenArmError: NOTHING_DETECTED, when the camera is not above the object, or the heights do not fit it.
     """
     if T_base_camera[2, 3] <= top:
         raise OpenArmError(

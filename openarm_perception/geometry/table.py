@@ -15,7 +15,7 @@ from openarm_common.types import Array
 from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.geometry.depth import Deprojector, DepthImage, DepthLimits
 
-#: How far from the expected height the table is looked for, m.
+#: Range around the expected height in which the table is searched, m.
 SEARCH = 0.08
 #: Points this near to the plane belong to it, m.
 _BAND = 0.008

@@ -90,7 +90,7 @@ class _Camera:
         self._node.get_logger().warning(self.fault, throttle_duration_sec=5.0)
 
     def values(self) -> dict[str, object]:
-        """Return what /diagnostics says of the camera."""
+        """Return the values for /diagnostics."""
         name = self._name
         removed = {f"{name}_removed/{link}": n for link, n in self._removed.items()}
         return {f"{name}_frames": self._frames, f"{name}_ms": f"{self._elapsed_ms:.2f}", **removed}

@@ -62,10 +62,10 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._localizer = Localizer(config.localizer, limits, config.table_top_z())
         self._pipeline = self._first_pipeline()
         self.accept_changes(self._take)
-        #: Without depth nothing says which pixels are the robot.
+        #: Without depth it is unknown which pixels are the robot.
         cuts = config.self_filter.enabled and bool(config.depth_topic)
         self._robot = RobotFinder(self.description, config.self_filter) if cuts else None
-        #: Pixels of the robot in the last image, by link or `held/NAME`; or why it could not be told from objects.
+        #: Pixels of the robot in the last image, by link or `held/NAME`; or why it was not found.
         self._removed: dict[str, int] = {}
         self._uncut = ""
         # Without joint states a fixed camera still detects objects, and takes the robot for one of them.
@@ -111,7 +111,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
     def _take(self, config: DetectNodeConfig) -> None:
         """Detect as configured from the next frame on."""
         if (config.detector, config.network) == (self.config.detector, self.config.network):
-            # holds too while colours stand in for a network that cannot be used
+            # valid too while colours replace a network that cannot be used
             self._pipeline.policy, self._pipeline.label = config.policy, config.label
             return
         self._pipeline = self._make(config, self._pipeline)

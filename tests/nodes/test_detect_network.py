@@ -145,7 +145,7 @@ def test_what_only_colour_sees_is_told_but_not_given_to_be_grasped(ros, camera, 
     bench = Bench(ros, camera=camera, detector="both", **{"network.model": str(blind)})
     (found,) = bench.detect().detections
     assert found.results[0].hypothesis.score == 0.0
-    bench.said("the network sees nothing there; it is looked at again")
+    bench.said("the network detects nothing there; it is observed again")
 
 
 def test_requests_in_words_are_answered_by_the_running_detector(ros, camera, model) -> None:

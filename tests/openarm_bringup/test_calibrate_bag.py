@@ -144,7 +144,7 @@ def test_a_bag_is_solved_and_says_what_became_of_its_images(capsys, bag, known, 
     assert (len(samples), digest) == (PLACES, stored.session)
     code, out, _ = run(capsys, "check", str(bag), "--store", str(store))
     assert code == 0
-    assert "stands of the robot" in out
+    assert "standstills of the robot" in out
     assert "images not used, MOVING, such as: the robot moves: openarm_right_joint" in out
 
 

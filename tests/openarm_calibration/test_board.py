@@ -221,7 +221,7 @@ def test_drawn_marks_are_where_points_say() -> None:
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        ({"rows": 10}, "looks the same after half a turn"),
+        ({"rows": 10}, "is the same after half a turn"),
         ({"diameter": 0.03}, "touch"),
         ({"border": 0.001}, "cuts the outer circles"),
         ({"kind": "chess"}, "no board 'chess'; boards: circles, charuco"),

@@ -109,7 +109,7 @@ def test_what_was_refused_is_not_proposed_again() -> None:
 def test_no_board_and_a_board_that_can_not_be_seen_are_refused_with_what_to_do() -> None:
     arm = Arm("wrist")
     unknown = PoseSearch(arm.description, arm.camera.T_parent_optical, None, QUICK)
-    with pytest.raises(OpenArmError, match="must be told, or seen") as caught:
+    with pytest.raises(OpenArmError, match="the position of the board is not known") as caught:
         unknown.propose(arm.samples, arm.state)
     assert caught.value.code == Code.NOT_READY
     with pytest.raises(OpenArmError, match="without a sample"):

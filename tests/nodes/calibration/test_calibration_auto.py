@@ -151,7 +151,7 @@ def test_cancel_stops_the_motion_and_the_node_is_free_again(ros, posed_robot, tm
     ros.spin_until(lambda: bench.planner.waiting is not None, 20.0, "a motion")
     busy = ros.call(ros.node.create_client(TakeSample, "/calibration/take_sample"), TakeSample.Request())
     assert busy.code == "BUSY"
-    assert "calibrating by itself" in busy.message
+    assert "calibrating automatically" in busy.message
     ros.result(handle.cancel_goal_async())
     result = ros.result(ended, 10.0).result
     assert result.code == "CANCELLED"

@@ -98,7 +98,8 @@ def test_what_the_network_does_not_see_is_looked_at_again(tabletop, perceive) ->
     assert sorted(place.label for place in seen.unmeasured) == ["blue", "red"]
     assert all(place.score == 0.0 for place in seen.unmeasured)
     assert any(
-        "red at pixel" in why and "the network sees nothing there; it is looked at again" in why for why in seen.refused
+        "red at pixel" in why and "the network detects nothing there; it is observed again" in why
+        for why in seen.refused
     )
 
 
@@ -114,7 +115,7 @@ def test_a_colour_that_only_paint_has_is_no_object(tabletop, perceive) -> None:
     assert "red" in [d.label for d in perceive("color", things, spoil=sheet).found]
     seen = perceive("both", things, spoil=sheet)
     assert sorted(place.label for place in seen.boxes) == ["blue", "box"]
-    assert any("red at pixel (330, 120): the network sees nothing there" in why for why in seen.refused)
+    assert any("red at pixel (330, 120): the network detects nothing there" in why for why in seen.refused)
 
 
 @pytest.mark.requirement("N-16")
@@ -132,7 +133,7 @@ def test_what_has_lost_its_colour_to_one_of_them_is_looked_at_again(tabletop, pe
     assert [d.label for d in perceive("color", things, spoil=specks).found] == ["blue"]
     seen = perceive("both", things, spoil=specks)
     assert [place.label for place in seen.located] == ["blue"]
-    assert any("box at pixel" in why and "colour sees nothing red there" in why for why in seen.refused)
+    assert any("box at pixel" in why and "by colour nothing red is there" in why for why in seen.refused)
 
 
 def test_a_large_neighbour_in_the_box_is_no_part_of_the_object(tabletop, perceive) -> None:
