@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where `models/` and `config/` are: in a checkout, in an installed wheel, or in a colcon install."""
+"""Files of the suite: where `models/` and `config/` are (checkout, wheel, colcon install), and files written whole."""
 
 from __future__ import annotations
 
+import os
 import sys
+import tempfile
 from functools import lru_cache
 from pathlib import Path
 
@@ -37,3 +39,21 @@ def models_dir() -> Path:
 def config_dir() -> Path:
     """Return the folder of graphs and parameters."""
     return resource_root() / "config"
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file under another name, then rename it: a reader gets the old or the new one, never a part.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, when it can't be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(file.name).chmod(0o644)
+        os.replace(file.name, path)
+    except OSError as error:
+        raise OpenArmError(Code.ENVIRONMENT, f"can't write {path}: {error.strerror}") from error

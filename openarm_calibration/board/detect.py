@@ -3,6 +3,10 @@
 
 Pixels are (u, v) with the centre of the top-left pixel at (0, 0). The pose of the board in the optical frame,
 `T_camera_board` (4, 4), is a starting point for least squares.
+
+Circles are located by their grey values once the grid is known. The centre of gravity of the darkness of a disc is the
+centre of its ellipse however it is blurred, as long as the blur is even and all of it is counted. Contours of a disc of
+ten pixels are three times as far off. The board's plane is in m.
 """
 
 from __future__ import annotations
@@ -93,7 +97,7 @@ _LEAST_SHARE = 0.7
 
 
 @dataclass(frozen=True, eq=False)
-class Detection:
+class BoardDetection:
     """Marks of a board in an image.
 
     Args:
@@ -107,7 +111,7 @@ class Detection:
     residual: float
 
 
-def detect(board: Board, image: Grey) -> Detection:
+def detect(board: Board, image: Grey) -> BoardDetection:
     """Find a board.
 
     Args:
@@ -122,7 +126,7 @@ def detect(board: Board, image: Grey) -> Detection:
     return _circles(board, image) if isinstance(board, CircleGrid) else _corners(board, image)
 
 
-def _circles(board: CircleGrid, image: Grey) -> Detection:
+def _circles(board: CircleGrid, image: Grey) -> BoardDetection:
     seen = 0
     size = (board.columns, board.rows)
     # A far board is looked for in an enlarged image; the contours of small blobs are too coarse otherwise.
@@ -144,7 +148,7 @@ def _circles(board: CircleGrid, image: Grey) -> Detection:
                 break
             ids, exact, residual = _refined(board, image, ordered)
             if len(ids) >= _LEAST_SHARE * len(ordered) and residual <= MOST_RESIDUAL:
-                return Detection(ids, exact, residual)
+                return BoardDetection(ids, exact, residual)
             if np.isfinite(residual) and residual <= MOST_RESIDUAL:
                 raise OpenArmError(
                     Code.NOTHING_DETECTED,
@@ -223,7 +227,7 @@ def _refined(board: CircleGrid, image: Grey, rough: Array) -> tuple[NDArray[np.i
     return ids, exact, _homography_residual(homography(plane, exact), plane, exact) if len(ids) >= 4 else np.inf
 
 
-def _corners(board: Charuco, image: Grey) -> Detection:
+def _corners(board: Charuco, image: Grey) -> BoardDetection:
     detector = cv2.aruco.CharucoDetector(board.board)
     corners, ids, markers, _ = detector.detectBoard(image)
     count = 0 if ids is None else len(ids)  # pyright: ignore[reportUnnecessaryComparison] - None without a board
@@ -245,7 +249,7 @@ def _corners(board: Charuco, image: Grey) -> Detection:
     if residual > MOST_RESIDUAL or mirrored:
         why = "the image is mirrored" if mirrored else f"{residual:.2f} px rms, expected at most {MOST_RESIDUAL} px"
         raise OpenArmError(Code.NOTHING_DETECTED, f"{count} corners do not lie as on {board.label}: {why}")
-    return Detection(index, pixels, residual)
+    return BoardDetection(index, pixels, residual)
 
 
 def _robust_homography(plane: Array, pixels: Array) -> Array:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_calibration.handeye.problem import Problem, Setup, inverses
 from openarm_common import se3
@@ -149,14 +148,12 @@ def _is_rigid(T: Array) -> bool:
     return bool(np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-4))
 
 
-def initial(problem: Problem, camera: int, board: int, keep: NDArray[np.bool_] | None = None) -> Mounts:
+def initial(problem: Problem, camera: int, board: int) -> Mounts:
     """Quick closed form of one camera and board of a problem.
 
     Raises:
         OpenArmError: DEGENERATE, from `kronecker`.
     """
     chosen = (problem.camera == camera) & (problem.board == board) & (problem.kind < 2)
-    if keep is not None:
-        chosen &= keep
     setup: Setup = "in_hand" if problem.kind[chosen][0] == 0 else "to_hand"
     return kronecker(setup, problem.A[chosen], problem.free[chosen])

@@ -11,6 +11,12 @@ carries it, and B comes from the robot's pose A = T_base_gripper:
 Every camera is the optical frame. A change of a mount or of A is six numbers: the translation in the parent's axes
 (m), then the rotation vector in its own axes (rad): `(p, R) → (p + d, R exp(w))`. All of them move the view by a
 twist in the camera's frame, so that a view counts only by its 6×6 normal equations.
+
+Pixels of marks are exact, with derivatives. The centre of the image of a circle is not the image of its centre. With
+`o` the circle's centre and `n` the board's normal in the optical frame (m), `r` its radius, the image ellipse has in
+normalised coordinates the dual conic `r² (I - n nᵀ) - o oᵀ`, whose centre is the quotient used below; `r = 0` is a
+plain point. Derivatives are taken by a camera-frame twist (translation, rotation) of the board, then by the scale of
+the board, then by fx, fy, cx, cy: `COLUMNS` in all.
 """
 
 from __future__ import annotations
@@ -216,8 +222,7 @@ def fit_poses(
     return out, final
 
 
-Indices = NDArray[np.int64]
-
+# --- the problem
 Setup = Literal["in_hand", "to_hand", "fixed"]
 SETUPS: tuple[Setup, ...] = ("in_hand", "to_hand", "fixed")
 #: Unknowns besides the mounts: scale of the board (true over stated), delay of the images (s), intrinsics (px).

@@ -4,7 +4,8 @@
 Each robot pose has a correction of six numbers (see `problem`) that costs `|d|²/translation² + |w|²/rotation²`, and is
 eliminated from the normal equations by its Schur complement. What remains is Gauss-Newton on the mounts (and extras),
 whose information matrix is at once the inverse covariance of the answer. The spread of the robot's errors, when not
-given, is that of the largest restricted likelihood: the one that does not count the unknowns' freedom as accuracy.
+given, is that of the largest restricted likelihood: minus twice its logarithm, the criterion, is that of the residuals
+with the unknowns integrated out, so that their freedom is not counted as accuracy. m and rad.
 """
 
 from __future__ import annotations

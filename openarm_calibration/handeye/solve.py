@@ -3,7 +3,11 @@
 
 The order: refuse motions that determine nothing; a quick closed form; the refinement; a test of each robot pose
 against what the others predict for it. Where a pose fails, or the start is spoiled, small random subsets vote for a
-clean one, and poses are taken out and let in again until the set does not change. m and rad.
+clean one, and poses are taken out and let in again until the set does not change.
+
+One linear step takes a pose out: with `h` its share of the information and `g` its share of the right-hand side, the
+answer without it moves by `-(H - h)⁻¹ g`. The prediction for the pose then has the spread of its own noise plus that
+of the answer without it. m, rad, px.
 """
 
 from __future__ import annotations
@@ -117,8 +121,6 @@ def pose_tests(
 
 def _twist(T_from: Array, T_to: Array) -> Array:
     """Camera-frame twist (6,) that takes one pose of the board to another, to first order in the translation."""
-    from openarm_common import se3
-
     w = se3.log_so3(T_to[:3, :3] @ T_from[:3, :3].T)
     half = T_from[:3, 3] + (T_to[:3, 3] - T_from[:3, 3]) / 2.0
     return np.concatenate([T_to[:3, 3] - T_from[:3, 3] - np.cross(w, half), w])

@@ -30,7 +30,7 @@ from openarm_interfaces.srv import (
 )
 
 from openarm_calibration.board.board import read_board
-from openarm_calibration.board.detect import Detection, detect
+from openarm_calibration.board.detect import BoardDetection, detect
 from openarm_calibration.config import CalibrationConfig
 from openarm_calibration.handeye.offline import ALGORITHMS, Result, calibrate, checked_algorithm
 from openarm_calibration.ros.auto_server import AutoCalibrator, fill
@@ -53,7 +53,7 @@ class View:
 
     t_ns: int
     matched: Matched
-    detection: Detection
+    detection: BoardDetection
     pixels: NDArray[np.uint8]
 
 

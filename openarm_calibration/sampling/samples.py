@@ -12,8 +12,6 @@ import hashlib
 import io
 import json
 import math
-import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -27,12 +25,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from openarm_calibration.board.board import Board, parse_board
-from openarm_calibration.board.detect import Detection, guess_pose
+from openarm_calibration.board.detect import BoardDetection, guess_pose
 from openarm_calibration.handeye.problem import Problem, View, assemble, difference
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
 from openarm_common.config import Config, validate
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import write_whole
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 
@@ -107,7 +106,7 @@ def _sample(entry: dict[str, Any], arrays: Mapping[str, NDArray[Any]], samples: 
         raise ValueError(f"sample {name} has a track of other joints")
     return Sample(
         name, int(entry["t_image_ns"]), int(entry["t_joints_ns"]), joints, float(entry["speed"]),
-        Detection(ids, pixels, float(entry["residual"])), pose, arrays["png"].tobytes(), track,
+        BoardDetection(ids, pixels, float(entry["residual"])), pose, arrays["png"].tobytes(), track,
     )  # fmt: skip
 
 
@@ -180,7 +179,7 @@ class Sample:
     t_joints_ns: int
     joints: Mapping[str, float]
     speed: float
-    detection: Detection
+    detection: BoardDetection
     T_camera_board: Array
     png: bytes = b""
     track: tuple[tuple[int, Mapping[str, float]], ...] = field(default=())
@@ -220,7 +219,7 @@ class SampleSet:
         return moving_joints(self.head, self._description)
 
     def take(
-        self, t_image_ns: int, matched: Any, detection: Detection, image: NDArray[np.uint8] | None = None
+        self, t_image_ns: int, matched: Any, detection: BoardDetection, image: NDArray[np.uint8] | None = None
     ) -> Sample:
         """Make a sample and add it.
 
@@ -341,13 +340,7 @@ class SampleSet:
         arrays["head"] = np.frombuffer(text.encode(), dtype=np.uint8)
         stream = io.BytesIO()
         np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
-                file.write(stream.getvalue())
-            os.replace(file.name, path)
-        except OSError as error:
-            raise OpenArmError(Code.ENVIRONMENT, f"can't write {path}: {error.strerror}") from error
+        write_whole(path, stream.getvalue())
         return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -8,11 +8,11 @@ refused, and the newest good one of the history takes its place.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import re
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ from pydantic import Field, field_validator
 from openarm_common import se3
 from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import config_dir
+from openarm_common.resources import config_dir, write_whole
 from openarm_common.types import Array
 
 
@@ -156,8 +156,8 @@ class CalibrationStore:
         text = yaml.safe_dump({**calibration.model_dump(mode="json"), "sha256": digest}, sort_keys=False)
         past = self._past(calibration.camera)
         number = 1 + max((_number(p) for p in past), default=0)
-        _write(self._history(calibration.camera) / f"{number:06d}-{digest[:12]}.yaml", text)
-        _write(path, text)
+        write_whole(self._history(calibration.camera) / f"{number:06d}-{digest[:12]}.yaml", text.encode())
+        write_whole(path, text.encode())
         return path
 
     def load(self, camera: str) -> StoredCalibration:
@@ -187,22 +187,15 @@ class CalibrationStore:
         try:
             return Found(self.load(camera))
         except OpenArmError as error:
-            for older in reversed(past):
-                try:
-                    return Found(read(older), f"{error.message}; the last good one, {older.name}, is used")
-                except OpenArmError:
-                    continue  # damaged too: the one before it is tried
-            raise
+            good = self._good(camera)
+            if not good:
+                raise
+            older, calibration = good[-1]
+            return Found(calibration, f"{error.message}; the last good one, {older.name}, is used")
 
     def history(self, camera: str) -> tuple[StoredCalibration, ...]:
         """All good calibrations of a camera, oldest first."""
-        out: list[StoredCalibration] = []
-        for path in self._past(camera):
-            try:
-                out.append(read(path))
-            except OpenArmError:
-                continue  # a damaged one is no part of the history
-        return tuple(out)
+        return tuple(calibration for _, calibration in self._good(camera))
 
     def rollback(self, camera: str) -> StoredCalibration:
         """Go back to the calibration before the present one; the present one leaves the history.
@@ -210,15 +203,14 @@ class CalibrationStore:
         Raises:
             OpenArmError: CONFIG_INVALID, when there is none before it.
         """
-        past = self._past(camera)
-        good = [(path, found) for path in past if (found := _try_read(path)) is not None]
+        past, good = self._past(camera), self._good(camera)
         if len(good) < 2:
             raise OpenArmError(
                 Code.CONFIG_INVALID,
                 f"going back needs a calibration of {camera!r} before the present one; stored: {len(good)}",
             )
         path, before = good[-2]
-        _write(self.path(camera), path.read_text(encoding="utf-8"))
+        write_whole(self.path(camera), path.read_bytes())
         for later in past[past.index(path) + 1 :]:
             later.unlink()
         return before
@@ -236,6 +228,14 @@ class CalibrationStore:
 
     def _history(self, camera: str) -> Path:
         return self.folder / "history" / checked_name(camera)
+
+    def _good(self, camera: str) -> list[tuple[Path, StoredCalibration]]:
+        """Return the calibrations of the history that are not damaged, oldest first."""
+        out: list[tuple[Path, StoredCalibration]] = []
+        for path in self._past(camera):
+            with contextlib.suppress(OpenArmError):
+                out.append((path, read(path)))
+        return out
 
     def _past(self, camera: str) -> list[Path]:
         folder = self._history(camera)
@@ -344,23 +344,3 @@ def default_folder() -> Path:
 def _number(path: Path) -> int:
     head = path.name.partition("-")[0]
     return int(head) if head.isdigit() else 0
-
-
-def _try_read(path: Path) -> StoredCalibration | None:
-    try:
-        return read(path)
-    except OpenArmError:
-        return None
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=".", delete=False, encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(file.name).chmod(0o644)
-        os.replace(file.name, path)
-    except OSError as error:
-        raise OpenArmError(Code.ENVIRONMENT, f"can't write {path}: {error.strerror}") from error

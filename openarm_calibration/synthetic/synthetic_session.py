@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from openarm_calibration.board.board import Board, CircleGrid
-from openarm_calibration.board.detect import Detection
+from openarm_calibration.board.detect import BoardDetection
 from openarm_calibration.handeye.problem import project
 from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead
 from openarm_common import se3
@@ -93,7 +93,7 @@ def make_session(
         track = tuple(
             (t + 10**7 * j, dict(zip(names, (q + v * 0.01 * j).tolist(), strict=True))) for j in range(-10, 11)
         )
-        detection = Detection(np.arange(len(BOARD.points)), pixels + rng.normal(0.0, px, pixels.shape), px)
+        detection = BoardDetection(np.arange(len(BOARD.points)), pixels + rng.normal(0.0, px, pixels.shape), px)
         joints = dict(zip(names, q.tolist(), strict=True))
         samples.add(Sample(f"s{len(samples) + 1:03d}", t, t, joints, speed, detection, T, b"", track if speed else ()))
     return Known(samples, X, description)

@@ -145,19 +145,16 @@ class Pipeline:
         located: list[LocatedObject] = []
         refused: list[str] = []
         unmeasured: list[LocatedObject] = []
-        for detection in found:
+        for detection, doubt in [*((one, "") for one in found), *((one.found, one.why) for one in detected.doubts)]:
             patch = self.localizer.cut(detection, depth, intrinsics, T_base_camera, robot)
             try:
+                if doubt:
+                    raise OpenArmError(Code.NOTHING_DETECTED, doubt)
                 located.append(self.localizer.locate(patch))
             except OpenArmError as error:
                 refused.append(error.message)
                 with contextlib.suppress(OpenArmError):  # flat on the table, or the robot: it is no obstacle
                     unmeasured.append(self.localizer.enclose(patch))
-        for doubt in detected.doubts:
-            refused.append(doubt.why)
-            patch = self.localizer.cut(doubt.found, depth, intrinsics, T_base_camera, robot)
-            with contextlib.suppress(OpenArmError):
-                unmeasured.append(self.localizer.enclose(patch))
         return Perceived(found, tuple(located), tuple(refused), robot, tuple(unmeasured))
 
     def measure_table(self, view: View, block_height: float = 0.0, label: str = "") -> TableMeasurement:

@@ -209,11 +209,6 @@ class CloudFilter:
         if config.outliers and config.outliers_by == "open3d":
             _open3d()
 
-    @property
-    def thins(self) -> bool:
-        """Whether points go away, so that a cloud is no image any more."""
-        return self._config.voxel > 0.0 or self._config.outliers
-
     def depth(self, depth: DepthImage) -> DepthImage:
         """The filters that work on the image."""
         if self._config.median:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from openarm_calibration.board.board import CircleGrid
-from openarm_calibration.board.detect import Detection
+from openarm_calibration.board.detect import BoardDetection
 from openarm_calibration.handeye.observability import UNITS
 from openarm_calibration.handeye.problem import project
 from openarm_calibration.handeye.refine import Noise, information_at, mount_error
@@ -59,7 +59,7 @@ class Arm:
             return False
         self.state |= joints
         count = len(self.samples)
-        detection = Detection(np.arange(len(BOARD.points)), pixels, 0.05)
+        detection = BoardDetection(np.arange(len(BOARD.points)), pixels, 0.05)
         self.samples.add(Sample(f"s{count:03d}", 10**9 * count, 10**9 * count, joints, 0.0, detection, T))
         return True
 

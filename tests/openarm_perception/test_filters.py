@@ -147,8 +147,6 @@ def test_open3d_that_is_asked_for_and_missing_is_named() -> None:
 def test_all_filters_together() -> None:
     config = FilterConfig(median=3, flying=0.03, voxel=0.01, outliers=True)
     cloud_filter = CloudFilter(config)
-    assert cloud_filter.thins
-    assert not CloudFilter(FilterConfig(median=5, flying=0.03)).thins
     deproject = Deprojector(DepthLimits(near=0.2, far=3.0))
     points = cloud_filter.points(deproject.valid_points(cloud_filter.depth(step()), K))
     assert 2000 < len(points) < 160 * 120
