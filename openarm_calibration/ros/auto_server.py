@@ -17,7 +17,7 @@ from rclpy.action.server import ServerGoalHandle
 
 from openarm_calibration.handeye.offline import Result
 from openarm_calibration.handeye.verdict import estimate_delay
-from openarm_calibration.ros.photo_client import wait_until
+from openarm_calibration.ros.image_capture import wait_until
 from openarm_calibration.sampling.next_pose import PoseSearch, Proposal
 from openarm_calibration.sampling.samples import Sample, session_path, without
 from openarm_common import se3
@@ -59,7 +59,7 @@ _ANSWER = 5.0
 _FEWEST_MOVING, _ENOUGH_MOVING = 4, 16
 
 
-class AutoCalibrator:
+class AutoCalibrateServer:
     """Serves the action.
 
     Args:
@@ -170,7 +170,7 @@ class _Run:
         tried = 0
         while tried < self._config.tries:
             self._report("looking", "for the most informative pose")
-            state = await self._node.photographer.state()
+            state = await self._node.capture.state()
             for proposal in await self._node.in_thread(self._search.propose, self._node.samples, state, _AT_ONCE):
                 self._report("moving", f"try {tried + 1}: the arm did not reach the one before" if tried else "")
                 tried += 1

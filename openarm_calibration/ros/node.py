@@ -33,8 +33,8 @@ from openarm_calibration.board.board import read_board
 from openarm_calibration.board.detect import BoardDetection, detect
 from openarm_calibration.config import CalibrationConfig
 from openarm_calibration.handeye.offline import ALGORITHMS, Result, calibrate, checked_algorithm
-from openarm_calibration.ros.auto_server import AutoCalibrator, fill
-from openarm_calibration.ros.photo_client import Photographer, grey
+from openarm_calibration.ros.auto_server import AutoCalibrateServer, fill
+from openarm_calibration.ros.image_capture import ImageCapture, grey
 from openarm_calibration.sampling.gate import Matched, match
 from openarm_calibration.sampling.next_pose import advice
 from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead, load_session, session_path, setup_of
@@ -64,12 +64,12 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         camera: The camera that is calibrated.
         samples: Of this camera, so far.
         algorithm: What `compute_calibration` uses.
-        photographer: Takes images of this camera.
+        capture: Takes images of this camera.
     """
 
     camera: CameraConfig
     samples: SampleSet
-    photographer: Photographer
+    capture: ImageCapture
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("calibration", CalibrationConfig, **kwargs)
@@ -93,7 +93,7 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
             ("load_samples", SampleFile, self._on_load_samples),
         ):
             self.create_service(kind, f"/calibration/{name}", handler)
-        self._auto = AutoCalibrator(self)
+        self._auto = AutoCalibrateServer(self)
 
     # --- the session
     def use(self, name: str) -> None:
@@ -105,7 +105,7 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         if name not in self._cameras:
             raise OpenArmError(Code.CONFIG_INVALID, f"no camera {name!r}; cameras: {', '.join(self._cameras)}")
         self.camera = self._cameras[name]
-        self.photographer = Photographer(self, self._states, name, self.config)
+        self.capture = ImageCapture(self, self._states, name, self.config)
         self._change(SampleSet(self._head(self.camera.intrinsics), self.description))
 
     def _change(self, samples: SampleSet) -> None:
@@ -122,7 +122,7 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         Raises:
             OpenArmError: NOT_READY, STALE_DATA, MOVING, NOTHING_DETECTED, BAD_IMAGE.
         """
-        frame = await self.photographer.take(self.config.gate.track if moving else 0.0)
+        frame = await self.capture.take(self.config.gate.track if moving else 0.0)
         pixels, t_ns = grey(frame.items["image"]), frame.t_ns
         self._check_optics(intrinsics_from_info(frame.items["camera_info"]))
         matched = match(self._states.buffer, t_ns, self.samples.joint_names, self.config.gate, moving=moving)

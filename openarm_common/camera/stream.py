@@ -100,6 +100,10 @@ class FrameStream(Generic[T]):
         """Streams of which nothing has come."""
         return [stream for stream in self._streams if stream not in self.received]
 
+    def given_up(self) -> dict[str, int]:
+        """Return how many frames were given up, for a report: incomplete, or waiting while the queue was full."""
+        return {key: self.counts[key] for key in ("incomplete", "overrun")}
+
     def add(self, stream: str, t_ns: int, frame_id: str, item: T, now: float) -> None:
         """Add an item; when it completes the frame of its stamp, earlier stamps are given up.
 

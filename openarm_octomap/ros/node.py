@@ -165,6 +165,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
                 faults.append(source.fault)
             values |= {f"{source.name}_used": source.used, f"{source.name}_refused": source.refused}
             values |= {f"{source.name}_late": source.late, f"{source.name}_age_s": f"{age:.2f}"}
+            values[f"{source.name}_incomplete"] = source.incomplete
         if self._last is not None:
             values |= {"changed": self._last.changed.size, "robot_cells": self._last.reset, "ends": self._last.ends}
             values |= self._mapper.counts(self._t_ns)

@@ -85,6 +85,11 @@ class Source:
         """Return the seconds of wall clock since a frame was last used; infinite before the first."""
         return (time.monotonic_ns() - self.used_at_ns) * 1e-9 if self.used_at_ns else float("inf")
 
+    @property
+    def incomplete(self) -> int:
+        """Images without a CameraInfo of the same stamp, and the other way round."""
+        return self._stream.frames.counts["incomplete"]
+
     def missing(self) -> str:
         """Name the streams of which nothing has come, where others have."""
         frames = self._stream.frames

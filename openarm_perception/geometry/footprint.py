@@ -140,8 +140,7 @@ def _fit_rectangle(outline: Array, spacing: float) -> tuple[Footprint | str, flo
         normal = np.linalg.eigh(scatter)[1][:, 0]
         turn = math.atan2(normal[1], normal[0])
         turn = (turn + math.pi / 2.0) % math.pi - math.pi / 2.0
-        c, s = math.cos(turn), math.sin(turn)
-        R = np.array([[c, -s], [s, c]])
+        R = _rotation(turn)
         offsets = [float((side @ R)[:, index // 2].mean()) for index, side in enumerate(sides)]
         middle = np.array([(offsets[0] + offsets[1]) / 2.0, (offsets[2] + offsets[3]) / 2.0])
         half = np.array([(offsets[1] - offsets[0]) / 2.0, (offsets[3] - offsets[2]) / 2.0])

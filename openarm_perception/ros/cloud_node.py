@@ -93,7 +93,8 @@ class _Camera:
         """Return the values for /diagnostics."""
         name = self._name
         removed = {f"{name}_removed/{link}": n for link, n in self._removed.items()}
-        return {f"{name}_frames": self._frames, f"{name}_ms": f"{self._elapsed_ms:.2f}", **removed}
+        given_up = {f"{name}_{key}": n for key, n in self.stream.frames.given_up().items()}
+        return {f"{name}_frames": self._frames, f"{name}_ms": f"{self._elapsed_ms:.2f}", **given_up, **removed}
 
 
 def _colors(message: Image, shape: tuple[int, ...]) -> NDArray[np.uint8]:

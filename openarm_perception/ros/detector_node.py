@@ -190,6 +190,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         message = f"in view: {', '.join(found.label for found in perceived.located) or 'nothing'}"
         message += f"; not located: {'; '.join(perceived.refused)}" if perceived.refused else ""
         values: dict[str, object] = {"processing_ms": f"{elapsed_ms:.1f}", "rate_hz": self._rate(), **self._counts}
+        values |= self._stream.frames.given_up()
         values["detector"] = "color" if self._fallback else self.config.detector
         if self._uncut:
             self._counts["uncut"] += 1

@@ -16,7 +16,7 @@ from tf2_msgs.msg import TFMessage
 from openarm_bringup.bags.bag import Bag
 from openarm_calibration.board.board import Board, CircleGrid
 from openarm_calibration.config import CalibrationConfig
-from openarm_calibration.ros.photo_client import grey
+from openarm_calibration.ros.image_capture import grey
 from openarm_calibration.sampling.gate import GateConfig
 from openarm_calibration.sampling.samples import SampleSet, SessionHead, setup_of
 from openarm_calibration.sampling.stills import Picker, Stretch, stretches

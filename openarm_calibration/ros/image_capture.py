@@ -25,7 +25,7 @@ from openarm_common.ros.tf import RobotStateListener
 _POLL = 0.02
 
 
-class Photographer:
+class ImageCapture:
     """Waits for an image that joint states come before and, if possible, after.
 
     Args:
