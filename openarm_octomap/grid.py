@@ -144,7 +144,7 @@ class OccupancyGrid:
         return max(0.0, (t_ns - self._epoch_ns) * 1e-9 - float(seen.min()) * 1e-3)
 
     def counts(self) -> dict[str, int]:
-        """How many cells are occupied, free and unknown."""
+        """Return how many cells are occupied, free and unknown."""
         number = np.bincount(self.states.reshape(-1), minlength=3)
         return {"occupied": int(number[OCCUPIED]), "free": int(number[FREE]), "unknown": int(number[UNKNOWN])}
 
@@ -195,11 +195,11 @@ class OccupancyGrid:
         return outside
 
     def binary(self) -> Payload:
-        """The map as OctoMap's binary form."""
+        """Return the map as OctoMap's binary form."""
         return self._encoder.binary(self.states)
 
     def full(self) -> Payload:
-        """The map as OctoMap's full form."""
+        """Return the map as OctoMap's full form."""
         return self._encoder.full(self.log_odds)
 
     def coarse(self, depth: int) -> tuple[Lattice, Bytes]:
@@ -227,7 +227,7 @@ class OccupancyGrid:
         return self.lattice.coarser(DEPTH - depth), states
 
     def states_at(self, points: ArrayLike, depth: int = DEPTH) -> Bytes:
-        """States (n,) of the cells that contain points (n, 3), m; UNKNOWN outside of the workspace."""
+        """Return states (n,) of the cells that contain points (n, 3), m; UNKNOWN outside of the workspace."""
         lattice, states = self.coarse(depth)
         index = lattice.indices(np.asarray(points, np.float64).reshape(-1, 3))
         inside = lattice.contains(index)
@@ -238,12 +238,18 @@ class OccupancyGrid:
     def blocked_at(
         self, points: ArrayLike, unknown: UnknownPolicy = "occupied", depth: int = DEPTH
     ) -> NDArray[np.bool_]:
-        """Whether points (n, 3), m, must be kept clear of, at any depth; `unknown` is what unknown cells count as."""
+        """Whether points (n, 3), m, must be kept clear of, at any depth; `unknown` is what unknown cells count as.
+
+        Args:
+            points: (n, 3), m.
+            unknown: What unknown cells count as.
+            depth: Of the tree; 16 is the resolution of the map.
+        """
         states = self.states_at(points, depth)
         return np.asarray((states == OCCUPIED) | ((states == UNKNOWN) & (unknown == "occupied")))
 
     def centres(self, state: int = OCCUPIED) -> Array:
-        """Centres (n, 3), m, of the cells of a state."""
+        """Return centres (n, 3), m, of the cells of a state."""
         return self.lattice.centres(np.argwhere(self.states == state))
 
     def _mark(self, scan: DepthScan | CloudScan) -> tuple[int, int, int]:
@@ -289,7 +295,7 @@ class OccupancyGrid:
         return max(1, min(int(pixels), self.config.no_return_block))
 
     def _milliseconds(self, t_ns: int) -> int:
-        """Time since the first scan; a clock that was set back begins anew."""
+        """Return the time since the first scan; a clock that was set back begins anew."""
         if self._epoch_ns is None or t_ns < self._epoch_ns:
             self._epoch_ns = t_ns
             self.seen[...] = 0

@@ -43,7 +43,7 @@ def image_points(
     depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32,
     ray_x: Floats, ray_y: Floats, T: Floats, out: Floats,
 ) -> int:  # fmt: skip
-    """Points of the valid pixels in the frame of the map, as `image_ends` computes them.
+    """Return points of the valid pixels in the frame of the map, as `image_ends` computes them.
 
     Args:
         depth: (h, w) planar depth in counts of `scale` metres.
@@ -80,7 +80,7 @@ def image_ends(
     resolution: float, key_min: Ints, origin: Floats, max_range: float,
     marks: Bytes, ticks: Shorts, tick: int, table: Ints, ends: NDArray[np.int32],
 ) -> tuple[int, int, int]:  # fmt: skip
-    """Cells where the rays of a depth image end, each once; those of surfaces are marked.
+    """Return cells where the rays of a depth image end, each once; those of surfaces are marked.
 
     Args:
         depth: As for `image_points`, and so are `scale`, `near`, `far`, `ray_x`, `ray_y`, `T`.
@@ -193,7 +193,7 @@ def cloud_ends(
     resolution: float, key_min: Ints, origin: Floats, max_range: float,
     marks: Bytes, ticks: Shorts, tick: int, table: Ints, ends: NDArray[np.int32],
 ) -> tuple[int, int]:  # fmt: skip
-    """As `image_ends` for points (n, 3) float32 in the frame of the map; `label` is (n,), the rest the same.
+    """Do as `image_ends` for points (n, 3) float32 in the frame of the map; `label` is (n,), the rest the same.
 
     Returns:
         How many ends there are, and how many points were finite.
@@ -299,7 +299,16 @@ def _norm(x: np.float32, y: np.float32, z: np.float32) -> np.float64:
 
 @njit(cache=True, nogil=True)
 def cell_distance(x: Whole, y: Whole, z: Whole, key_min: Ints, resolution: float, origin: Floats) -> np.float64:
-    """Distance of the centre of a cell, given by its index, from a point (3,), m; as liboctomap computes it."""
+    """Return the distance of the centre of a cell (index) from a point (3,), m; as liboctomap computes it.
+
+    Args:
+        x: Index of the cell.
+        y: Index of the cell.
+        z: Index of the cell.
+        key_min: (3,) key of the cell 0, 0, 0.
+        resolution: Edge of a cell, m.
+        origin: (3,), m.
+    """
     return _norm(
         _centre(x, key_min[0], resolution) - origin[0],
         _centre(y, key_min[1], resolution) - origin[1],
@@ -503,7 +512,15 @@ def apply_marks(
 def forget_before(
     limit: int, log_odds: Floats, states: Bytes, seen: NDArray[np.int32], changed: NDArray[np.int32]
 ) -> int:
-    """Make occupied cells unknown that were last observed before `limit`; flat arrays, returns how many."""
+    """Make occupied cells unknown that were last observed before `limit`; flat arrays, returns how many.
+
+    Args:
+        limit: ms.
+        log_odds: (n,), changed.
+        states: (n,), changed.
+        seen: (n,) when each cell was last observed, ms.
+        changed: Filled with the indices.
+    """
     count = 0
     for i in range(states.size):
         if states[i] == OCCUPIED and seen[i] < limit:

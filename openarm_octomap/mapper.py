@@ -188,12 +188,12 @@ class Mapper:
             )
 
     def snapshot(self, wanted: Collection[str] = ()) -> Snapshot:
-        """The map as it is; `wanted` as for `update`."""
+        """Return the map as it is; `wanted` as for `update`."""
         with self._lock:
             return self._snapshot(wanted)
 
     def coarse(self, depth: int) -> tuple[Lattice, Payload]:
-        """The map at another depth as an octree whose smallest cells are of that depth.
+        """Return the map at another depth as an octree whose smallest cells are of that depth.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, unless 1 <= depth <= 16.
@@ -210,7 +210,7 @@ class Mapper:
             self._transform.compute(self._grid.states, out)
 
     def counts(self, t_ns: int) -> dict[str, float]:
-        """Cells by state, and the longest time since an occupied cell was observed, s."""
+        """Return cells by state, and the longest time since an occupied cell was observed, s."""
         with self._lock:
             return self._grid.counts() | {"oldest_s": self._grid.oldest_s(t_ns)}
 
@@ -220,7 +220,13 @@ class Mapper:
             self._grid.reset()
 
     def clear_box(self, lower: ArrayLike, upper: ArrayLike, state: int) -> int:
-        """Make a box FREE or UNKNOWN; see `OccupancyGrid.clear_box`."""
+        """Make a box FREE or UNKNOWN; see `OccupancyGrid.clear_box`.
+
+        Args:
+            lower: Corner (3,), m.
+            upper: Opposite corner (3,), m.
+            state: FREE or UNKNOWN.
+        """
         with self._lock:
             return self._grid.clear_box(lower, upper, state)
 
@@ -294,7 +300,7 @@ class Mapper:
 
 
 def _without_flying(scan: DepthScan, config: FlyingConfig) -> tuple[DepthScan, int]:
-    """The image with its flying pixels labelled, and how many there are.
+    """Return the image with its flying pixels labelled, and how many there are.
 
     They mark nothing, and they clear nothing either. Of the two surfaces that such a pixel saw, only the nearer one's
     depth is surely free, and the neighbour on that surface clears the same cells: pixels are a few millimetres apart,

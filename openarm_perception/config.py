@@ -57,7 +57,7 @@ class DetectNodeConfig(Config):
     self_filter: RobotConfig = RobotConfig()
 
     def table_top_z(self) -> float:
-        """Height of the table in the base frame, m.
+        """Return the height of the table in the base frame, m.
 
         Raises:
             OpenArmError: SCENE_INVALID, from the scene.
@@ -94,7 +94,7 @@ class CloudNodeConfig(Config):
 
 
 def camera_of(name: str) -> CameraConfig:
-    """A camera of the suite.
+    """Return a camera of the suite.
 
     Raises:
         OpenArmError: CONFIG_INVALID, listing the cameras that there are.

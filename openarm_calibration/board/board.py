@@ -80,12 +80,12 @@ class CircleGrid(Config):
         return float(extent[0]) + 2.0 * self.border, float(extent[1]) + 2.0 * self.border
 
     def draw(self, pixels_per_metre: float) -> Pixels:
-        """Grey picture (h, w) of the plate, to scale within half a pixel of its size; black circles on white."""
+        """Return the grey picture (h, w) of the plate, to scale within half a pixel; black circles on white."""
         width, height = self.size
         return self.picture(round(width * pixels_per_metre), round(height * pixels_per_metre))
 
     def picture(self, columns: int, rows: int) -> Pixels:
-        """Grey picture (rows, columns) of exactly the plate; its pixels need not be square."""
+        """Return the grey picture (rows, columns) of exactly the plate; its pixels need not be square."""
         width, height = self.size
         # places of the samples on the plate, m
         u = ((np.arange(columns * _SAMPLES) + 0.5) / (columns * _SAMPLES) - 0.5) * width
@@ -162,12 +162,12 @@ class Charuco(Config):
         return self.columns * self.spacing + 2.0 * self.border, self.rows * self.spacing + 2.0 * self.border
 
     def draw(self, pixels_per_metre: float) -> Pixels:
-        """Grey picture (h, w) of the plate, to scale within half a pixel of its size."""
+        """Return the grey picture (h, w) of the plate, to scale within half a pixel of its size."""
         width, height = self.size
         return self.picture(round(width * pixels_per_metre), round(height * pixels_per_metre))
 
     def picture(self, columns: int, rows: int) -> Pixels:
-        """Grey picture (rows, columns) of exactly the plate; its pixels need not be square."""
+        """Return the grey picture (rows, columns) of exactly the plate; its pixels need not be square."""
         width, height = self.size
         fine = 4 if columns * rows < 5_000_000 else 2
         # whole pixels a square here, then stretched to the samples without smoothing, then averaged

@@ -40,7 +40,7 @@ _RIM: Array = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)
 def refined(
     image: NDArray[np.uint8], centres: Array, plane: Array, radius: float, H: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Centres of circles (n, 2) by the grey values around them.
+    """Return the centres of circles (n, 2) by the grey values around them.
 
     Args:
         image: (h, w) grey.
@@ -82,7 +82,7 @@ def refined(
 
 
 def mapped(H: Array, points: Array) -> Array:
-    """Points (n, 2) through a homography (3, 3)."""
+    """Return points (n, 2) through a homography (3, 3)."""
     p = points @ H[:, :2].T + H[:, 2]
     return p[:, :2] / p[:, 2:]
 
@@ -169,7 +169,7 @@ def _circles(board: CircleGrid, image: Grey) -> BoardDetection:
 
 
 def _blob_detector(area: int, circles: int) -> cv2.SimpleBlobDetector:
-    """For circles of any size that fits: OpenCV's own limits are 80 px of diameter and 10 px of distance."""
+    """Make a detector of circles of any size: OpenCV's own limits are 80 px of diameter and 10 px of distance."""
     params = cv2.SimpleBlobDetector.Params()
     params.filterByArea = True
     params.minArea = 12.0
@@ -185,14 +185,14 @@ def _blob_detector(area: int, circles: int) -> cv2.SimpleBlobDetector:
 
 
 def _diameter(board: CircleGrid, pixels: Array) -> float:
-    """Of a circle in the image, px, by the area that the marks cover."""
+    """Return the diameter of a circle in the image, px, by the area that the marks cover."""
     hull = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32)))
     outline = cv2.contourArea(cv2.convexHull(board.points[:, :2].astype(np.float32)))
     return board.diameter * float(np.sqrt(hull / outline))
 
 
 def _ordered(board: CircleGrid, pixels: Array) -> Array:
-    """The order of the marks in which they are the image of the board's front.
+    """Return the order of the marks in which they are the image of the board's front.
 
     The grid finder may start at either end. A mirrored order fits a plane as well; its chirality differs.
     """
@@ -209,7 +209,7 @@ def _ordered(board: CircleGrid, pixels: Array) -> Array:
 
 
 def _refined(board: CircleGrid, image: Grey, rough: Array) -> tuple[NDArray[np.int64], Array, float]:
-    """Marks by their grey values: which, where, and their residual, px rms.
+    """Return marks by their grey values: which, where, and their residual, px rms.
 
     A blob next to a circle is moved to where the others predict it; a mark that still is off is left out, and so is one
     that something else comes near to.
@@ -253,7 +253,7 @@ def _corners(board: Charuco, image: Grey) -> BoardDetection:
 
 
 def _robust_homography(plane: Array, pixels: Array) -> Array:
-    """As `homography`, with up to half of the marks in wrong places."""
+    """Return the homography as `homography` does, with up to half of the marks in wrong places."""
     H, _ = cv2.findHomography(plane, pixels, cv2.LMEDS)
     if H is None:  # pyright: ignore[reportUnnecessaryComparison] - None for marks in a heap
         return homography(plane, pixels)
@@ -261,7 +261,7 @@ def _robust_homography(plane: Array, pixels: Array) -> Array:
 
 
 def homography(plane: Array, pixels: Array) -> Array:
-    """Homography (3, 3) from plane points (n, 2) to pixels (n, 2), by normalised least squares."""
+    """Return the homography (3, 3) from plane points (n, 2) to pixels (n, 2), by normalised least squares."""
     A, b = _normaliser(plane), _normaliser(pixels)
     x, u = mapped(A, plane), mapped(b, pixels)
     one, zero = np.ones((len(x), 1)), np.zeros((len(x), 3))
@@ -284,7 +284,7 @@ def _homography_residual(H: Array, plane: Array, pixels: Array) -> float:
 
 
 def guess_pose(points: Array, pixels: Array, radius: float, intrinsics: Intrinsics) -> tuple[Array, float]:
-    """Pose of a flat board and the rms residual, px.
+    """Return the pose of a flat board and the rms residual, px.
 
     Args:
         points: (n, 3) marks in the board frame, m, z = 0.

@@ -104,10 +104,15 @@ def _robot_world(name: str, B: Array, C: Array) -> Mounts:
 
 
 def kronecker(setup: Setup, A: Array, C: Array) -> Mounts:
-    """Both mounts by the Kronecker product (Shah's way); quick enough for hundreds of subsets.
+    """Return both mounts by the Kronecker product (Shah's way); quick enough for hundreds of subsets.
 
     From `R_X R_C = R_B R_Z` both rotations are the leading singular vectors of the summed Kronecker products; the
     translations then follow linearly.
+
+    Args:
+        setup: in_hand or to_hand.
+        A: (n, 4, 4) T_base_gripper.
+        C: (n, 4, 4) T_camera_board.
 
     Raises:
         OpenArmError: DEGENERATE, when there is no finite answer.
@@ -134,13 +139,13 @@ def kronecker(setup: Setup, A: Array, C: Array) -> Mounts:
 
 
 def nearest_rotation(M: Array) -> Array:
-    """Rotation (3, 3) nearest to a matrix."""
+    """Return the rotation (3, 3) nearest to a matrix."""
     U, _, Vt = np.linalg.svd(M)
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
 
 
 def mean_pose(T: Array) -> Array:
-    """Mean rotation and median translation of poses (n, 4, 4)."""
+    """Return the mean rotation and median translation of poses (n, 4, 4)."""
     return se3.make(nearest_rotation(T[:, :3, :3].sum(axis=0)), np.median(T[:, :3, 3], axis=0))
 
 
@@ -149,7 +154,12 @@ def _is_rigid(T: Array) -> bool:
 
 
 def initial(problem: Problem, camera: int, board: int) -> Mounts:
-    """Quick closed form of one camera and board of a problem.
+    """Return the quick closed form of one camera and board of a problem.
+
+    Args:
+        problem: The views.
+        camera: Index of the camera.
+        board: Index of the board.
 
     Raises:
         OpenArmError: DEGENERATE, from `kronecker`.

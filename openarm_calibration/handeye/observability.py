@@ -157,12 +157,12 @@ def require_accuracy(problem: Problem, estimate: Estimate, most_translation: flo
 
 
 def condition(values: Array) -> float:
-    """Condition number of eigenvalues in ascending order; infinite when singular."""
+    """Return the condition number of eigenvalues in ascending order; infinite when singular."""
     return float(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
 
 def condition_number(problem: Problem, information: Array) -> float:
-    """Condition number of the information on the mounts, in units of 1 mm and 0.1°."""
+    """Return the condition number of the information on the mounts, in units of 1 mm and 0.1°."""
     mounts = problem.cameras + problem.boards
     units = np.tile(UNITS, mounts)
     scaled = information[: 6 * mounts, : 6 * mounts] * np.outer(units, units)
@@ -198,7 +198,7 @@ def _advice(seen: Motion, estimate: Estimate) -> str:
 
 
 def _contradicting(estimate: Estimate) -> bool:
-    """Whether the robot's errors, as estimated, are larger than those of any arm in order."""
+    """Return whether the robot's errors, as estimated, are larger than those of any arm in order."""
     return estimate.noise.translation > _BAD_ARM[0] or estimate.noise.rotation > _BAD_ARM[1]
 
 

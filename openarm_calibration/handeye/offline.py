@@ -52,7 +52,7 @@ class Result:
     calibration: StoredCalibration
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`, services and reports."""
+        """Return the result for `--json`, services and reports."""
         return {
             "grade": self.verdict.grade,
             "reasons": list(self.verdict.reasons),
@@ -107,7 +107,7 @@ def calibrate(
 
 
 def _with_found_intrinsics(solution: Solution) -> Solution:
-    """The same answer with the intrinsics that were found in place of those that were stated."""
+    """Return the same answer with the intrinsics that were found in place of those that were stated."""
     estimate, problem = solution.estimate, solution.problem
     if estimate.intrinsics is None:
         return solution
@@ -165,7 +165,7 @@ def without_named(samples: SampleSet, names: Sequence[str]) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Of what computed the result."""
+    """Return the versions of what computed the result."""
     out = {"opencv": cv2.__version__, "numpy": np.__version__}
     try:
         out["openarm-vision"] = version("openarm-vision")
@@ -176,7 +176,7 @@ def versions() -> dict[str, str]:
 
 # --- several cameras
 def join(sessions: Sequence[SampleSet], *, one_board: bool = True) -> tuple[Problem, tuple[Problem, ...]]:
-    """The problem of all sessions, and those of each.
+    """Return the problem of all sessions, and those of each.
 
     Args:
         sessions: Of different cameras.
@@ -208,7 +208,7 @@ def join(sessions: Sequence[SampleSet], *, one_board: bool = True) -> tuple[Prob
 
 
 def _links(samples: SampleSet) -> tuple[str, str]:
-    """What the arm's pose is measured from, and the link that moves."""
+    """Return what the arm's pose is measured from, and the link that moves."""
     head = samples.head
     return (head.base, head.parent) if head.setup == "in_hand" else (head.parent, head.carrier)
 

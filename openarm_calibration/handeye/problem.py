@@ -45,7 +45,7 @@ _NEAR = 1e-3
 def _mark(
     p: Array, radius: float, T: Array, intrinsics: Array, scale: float, rows: Array, pixel: Array
 ) -> bool:  # pragma: no cover - compiled
-    """Pixel (2,) and derivative rows (2, 11) of one mark; False behind the camera."""
+    """Return the pixel (2,) and derivative rows (2, 11) of one mark; False behind the camera."""
     o = np.empty(3)
     arm = np.empty(3)
     for k in range(3):
@@ -96,7 +96,7 @@ def normal_equations(
     intrinsics: Array,
     scale: float,
 ) -> tuple[Array, Array, Array]:  # pragma: no cover - compiled
-    """Normal equations of each view, in px².
+    """Return the normal equations of each view, in px².
 
     Args:
         points: (marks, 3) of all views, board frame, m.
@@ -138,7 +138,15 @@ def normal_equations(
 def project(
     points: Array, radius: float, pose: Array, intrinsics: Array, scale: float = 1.0
 ) -> Array:  # pragma: no cover - compiled
-    """Pixels (n, 2) of marks (n, 3); NaN behind the camera."""
+    """Return pixels (n, 2) of marks (n, 3); NaN behind the camera.
+
+    Args:
+        points: (n, 3) marks in the board frame, m.
+        radius: Of the circles, m; 0 for points.
+        pose: (4, 4).
+        intrinsics: (4,) fx, fy, cx, cy.
+        scale: Of the board.
+    """
     out = np.full((len(points), 2), np.nan)
     rows = np.zeros((2, COLUMNS))
     pixel = np.zeros(2)
@@ -150,7 +158,7 @@ def project(
 
 @njit(cache=True, nogil=True)
 def turned(R: Array, w: Array) -> Array:  # pragma: no cover - compiled
-    """`exp(w) R` for a rotation vector w (3,)."""
+    """Return `exp(w) R` for a rotation vector w (3,)."""
     angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     K = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
     if angle < 1e-9:
@@ -170,7 +178,7 @@ def fit_poses(
     intrinsics: Array,
     iterations: int = 12,
 ) -> tuple[Array, Array]:  # pragma: no cover - compiled
-    """Least-squares pose of the board in each view by itself.
+    """Return the least-squares pose of the board in each view by itself.
 
     Args:
         points: (marks, 3).
@@ -278,7 +286,7 @@ class Problem:
     rate: Array
 
     def __len__(self) -> int:
-        """Views."""
+        """Return the number of views."""
         return len(self.views)
 
     @property
@@ -297,22 +305,22 @@ class Problem:
         return np.diff(self.offsets)
 
     def camera_rows(self) -> Array:
-        """(n, 4) fx, fy, cx, cy of each view's camera."""
+        """Return (n, 4) fx, fy, cx, cy of each view's camera."""
         rows = np.array([[k.fx, k.fy, k.cx, k.cy] for k in self.intrinsics])
         return rows[self.camera]
 
     def subset(self, keep: Sequence[int] | Indices | NDArray[np.bool_]) -> Problem:
-        """The problem with some of its views (indices or a mask); the per-view fits are kept."""
+        """Return the problem with some of its views (indices or a mask); the per-view fits are kept."""
         chosen = np.arange(len(self))[np.asarray(keep)]
         views = tuple(self.views[i] for i in chosen)
         return _pack(views, self.intrinsics, self.free[chosen], self.free_cost[chosen])
 
     def with_intrinsics(self, intrinsics: Sequence[Intrinsics]) -> Problem:
-        """The same views by cameras of other intrinsics."""
+        """Return the same views by cameras of other intrinsics."""
         return assemble(self.views, intrinsics, list(self.free))
 
     def with_poses(self, A: Array) -> Problem:
-        """The same views with other robot poses (n, 4, 4)."""
+        """Return the same views with other robot poses (n, 4, 4)."""
         views = tuple(replace(view, A=a) for view, a in zip(self.views, A, strict=True))
         return _pack(views, self.intrinsics, self.free, self.free_cost)
 
@@ -352,7 +360,7 @@ def _pack(views: tuple[View, ...], intrinsics: tuple[Intrinsics, ...], free: Arr
 
 # --- transforms, batched over (..., 4, 4)
 def inverses(T: Array) -> Array:
-    """Inverse of rigid transforms."""
+    """Return the inverse of rigid transforms."""
     R = T[..., :3, :3].swapaxes(-1, -2)
     out = np.zeros_like(T)
     out[..., :3, :3] = R
@@ -362,7 +370,7 @@ def inverses(T: Array) -> Array:
 
 
 def exps(w: Array) -> Array:
-    """Rotations (n, 3, 3) of rotation vectors (n, 3)."""
+    """Return rotations (n, 3, 3) of rotation vectors (n, 3)."""
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
     K = skews(w)
     small = angle < 1e-8
@@ -373,7 +381,7 @@ def exps(w: Array) -> Array:
 
 
 def skews(v: Array) -> Array:
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    """Return cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
@@ -381,7 +389,7 @@ def skews(v: Array) -> Array:
 
 
 def moved(T: Array, change: Array) -> Array:
-    """Transforms (..., 4, 4) changed by six numbers (..., 6) each: `(p + d, R exp(w))`."""
+    """Return transforms (..., 4, 4) changed by six numbers (..., 6) each: `(p + d, R exp(w))`."""
     out = T.copy()
     out[..., :3, :3] = T[..., :3, :3] @ exps(change[..., 3:])
     out[..., :3, 3] = T[..., :3, 3] + change[..., :3]
@@ -389,7 +397,7 @@ def moved(T: Array, change: Array) -> Array:
 
 
 def difference(T_from: Array, T_to: Array) -> Array:
-    """The six numbers (6,) that change `T_from` into `T_to`."""
+    """Return the six numbers (6,) that change `T_from` into `T_to`."""
     w = se3.log_so3(T_from[:3, :3].T @ T_to[:3, :3])
     return np.concatenate([T_to[:3, 3] - T_from[:3, 3], w])
 
@@ -413,7 +421,15 @@ def chain(problem: Problem, X: Array, Z: Array, correction: Array) -> tuple[Arra
 
 
 def sensitivity(problem: Problem, X: Array, Z: Array, T: Array, B: Array) -> tuple[Array, Array, Array]:
-    """How the view (camera-frame twist) moves with its camera's mount, its board's mount and A; each (n, 6, 6)."""
+    """How the view (camera-frame twist) moves with its camera's mount, its board's mount and A; each (n, 6, 6).
+
+    Args:
+        problem: The views.
+        X: (cameras, 4, 4).
+        Z: (boards, 4, 4).
+        T: (n, 4, 4) T_camera_board, from `chain`.
+        B: (n, 4, 4), from `chain`.
+    """
     RX = X[problem.camera][:, :3, :3]
     RXt = RX.swapaxes(1, 2)
     n = len(problem)
@@ -437,7 +453,7 @@ def sensitivity(problem: Problem, X: Array, Z: Array, T: Array, B: Array) -> tup
 
 
 def parameter_count(problem: Problem, extras: Sequence[Extra]) -> int:
-    """Columns of `design`."""
+    """Return the number of columns of `design`."""
     return 6 * (problem.cameras + problem.boards) + sum(_width(problem, extra) for extra in extras)
 
 
@@ -446,9 +462,17 @@ def _width(problem: Problem, extra: Extra) -> int:
 
 
 def design(problem: Problem, X: Array, Z: Array, T: Array, B: Array, extras: Sequence[Extra]) -> tuple[Array, Array]:
-    """How the unknowns move each view.
+    """Return how the unknowns move each view.
 
     Columns: six for each camera's X, six for each board's Z, then the extras in their order.
+
+    Args:
+        problem: The views.
+        X: (cameras, 4, 4).
+        Z: (boards, 4, 4).
+        T: (n, 4, 4) T_camera_board, from `chain`.
+        B: (n, 4, 4), from `chain`.
+        extras: More unknowns.
 
     Returns:
         (n, COLUMNS, parameters) and, for the corrections of A, (n, 6, 6).

@@ -57,7 +57,7 @@ def _cholesky(S: Array, L: Array) -> bool:  # pragma: no cover - compiled
 def criterion(
     full: Array, KMK: Array, both: Array, translation: float, rotation: float
 ) -> float:  # pragma: no cover - compiled
-    """Minus twice the log restricted likelihood, up to a constant; infinite where it does not exist.
+    """Return minus twice the log restricted likelihood, up to a constant; infinite where it does not exist.
 
     Args:
         full: (p + 1, p + 1) [[GMG, GMy], [GMyᵀ, yMy]].
@@ -145,7 +145,7 @@ def _search(
 def robot_spread(
     full: Array, KMK: Array, both: Array, start: tuple[float, float], *, whole: bool
 ) -> tuple[float, float]:
-    """Spread (m, rad) of the largest restricted likelihood.
+    """Return the spread (m, rad) of the largest restricted likelihood.
 
     Args:
         full: See `criterion`.
@@ -188,7 +188,7 @@ def _answers(
 
 
 def averaged(full: Array, KMK: Array, both: Array, typical: tuple[float, float]) -> Array:
-    """Covariance (p, p) about the present answer, averaged over the spreads that the data allow.
+    """Return the covariance (p, p) about the present answer, averaged over the spreads that the data allow.
 
     With few poses the spread itself is uncertain, and an answer that takes its best value for true is too sure of
     itself. The weight is the restricted likelihood times a prior: either the robot is exact, as in a simulation, or
@@ -312,7 +312,14 @@ class State:
 
 
 def linearise(problem: Problem, state: State, px: float, extras: Sequence[Extra]) -> tuple[Linear, Array]:
-    """Normal equations at a state; also the (n, 6, 6) effect of corrections on each view."""
+    """Return the normal equations at a state; also the (n, 6, 6) effect of corrections on each view.
+
+    Args:
+        problem: The views.
+        state: The unknowns.
+        px: Spread of a mark, px.
+        extras: More unknowns.
+    """
     correction = state.correction[problem.pose]
     shifted = correction - state.delay * problem.rate if state.delay else correction
     T, B = chain(problem, state.X, state.Z, shifted)
@@ -342,7 +349,7 @@ def linearise(problem: Problem, state: State, px: float, extras: Sequence[Extra]
 
 
 def eliminate(linear: Linear, prior: Array) -> tuple[Array, Array, Array]:
-    """Information (p, p), right-hand side (p,), and (poses, 6, 6) inverse of the corrections' block."""
+    """Return the information (p, p), right-hand side (p,), and (poses, 6, 6) inverse of the corrections' block."""
     V: Array = np.linalg.inv(linear.KMK + prior).astype(np.float64)
     VG = V @ linear.KMG
     information = linear.GMG - np.einsum("gip,giq->pq", linear.KMG, VG)
@@ -421,7 +428,14 @@ def refine(
 
 
 def information_at(problem: Problem, X: Array, Z: Array, noise: Noise) -> Array:
-    """Information (parameters, parameters) on the mounts at given mounts: its inverse is the Cramér-Rao bound."""
+    """Information (parameters, parameters) on the mounts at given mounts: its inverse is the Cramér-Rao bound.
+
+    Args:
+        problem: The views.
+        X: (cameras, 4, 4).
+        Z: (boards, 4, 4).
+        noise: Standard deviations.
+    """
     state = State(X, Z, np.zeros((int(problem.pose.max()) + 1, 6)), 1.0, 0.0, np.zeros((problem.cameras, 4)))
     return eliminate(linearise(problem, state, noise.px, ())[0], noise.prior)[0]
 
@@ -458,7 +472,13 @@ def _near(a: Noise, b: Noise) -> bool:
 
 
 def restricted_likelihood(linear: Linear, noise: Noise, *, whole: bool) -> Noise:
-    """The robot's spread of the largest restricted likelihood; near `noise`, or in the whole range."""
+    """Return the robot's spread of the largest restricted likelihood; near `noise`, or in the whole range.
+
+    Args:
+        linear: The linearised problem.
+        noise: Where to begin.
+        whole: Whether the whole range is searched first.
+    """
     full, both = _joined(linear)
     found = robot_spread(full, linear.KMK, both, (noise.translation, noise.rotation), whole=whole)
     return Noise(noise.px, *found)
@@ -470,7 +490,7 @@ def _joined(linear: Linear) -> tuple[Array, Array]:
 
 
 def pixel_noise(problem: Problem) -> float:
-    """Spread of the marks, px by axis: from fits of each view by itself, so that no robot error enters.
+    """Return the spread of the marks, px by axis: from fits of each view by itself, so that no robot error enters.
 
     Views whose own fit is far worse than the usual one are left out.
     """
@@ -485,7 +505,7 @@ def pixel_noise(problem: Problem) -> float:
 
 
 def invert_scaled(information: Array) -> Array:
-    """Inverse of a symmetric positive matrix whose columns differ in unit.
+    """Return the inverse of a symmetric positive matrix whose columns differ in unit.
 
     Raises:
         OpenArmError: DEGENERATE, when it is singular.
@@ -501,6 +521,6 @@ def invert_scaled(information: Array) -> Array:
 
 
 def mount_error(T_estimated: Array, T_true: Array) -> tuple[float, float]:
-    """Distance of the origins, m, and angle, rad, between two mounts."""
+    """Return the distance of the origins, m, and angle, rad, between two mounts."""
     offset = float(np.linalg.norm(T_estimated[:3, 3] - T_true[:3, 3]))
     return offset, se3.angle_between(T_true[:3, :3], T_estimated[:3, :3])

@@ -120,7 +120,7 @@ def pose_tests(
 
 
 def _twist(T_from: Array, T_to: Array) -> Array:
-    """Camera-frame twist (6,) that takes one pose of the board to another, to first order in the translation."""
+    """Return the camera-frame twist (6,) from one pose of the board to another, to first order in the translation."""
     w = se3.log_so3(T_to[:3, :3] @ T_from[:3, :3].T)
     half = T_from[:3, 3] + (T_to[:3, 3] - T_from[:3, 3]) / 2.0
     return np.concatenate([T_to[:3, 3] - T_from[:3, 3] - np.cross(w, half), w])
@@ -214,7 +214,7 @@ def solve(problem: Problem, config: SolveConfig | None = None) -> Solution:
 
 
 def _sharp(problem: Problem, px: float) -> tuple[Mask, list[Outlier]]:
-    """Views whose marks fit a board by themselves."""
+    """Return views whose marks fit a board by themselves."""
     freedom = np.maximum(2.0 * problem.marks - 6.0, 1.0)
     rms = np.sqrt(problem.free_cost / freedom)
     usable = np.isfinite(rms) & (rms < 4.0 * max(px, float(np.median(rms))) + 0.05)
@@ -272,7 +272,7 @@ def _refine(problem: Problem, used: Mask, px: float, config: SolveConfig, start:
 
 
 def _limit(problem: Problem, used: Mask, config: SolveConfig) -> float:
-    """Largest squared distance by number that a clean pose of this set has."""
+    """Return the largest squared distance by number that a clean pose of this set has."""
     poses = _poses(problem, used)
     chance = 1.0 - config.false_alarm / max(poses, 1)
     if config.robot_translation is not None and config.robot_rotation is not None:
@@ -286,13 +286,13 @@ def _poses(problem: Problem, used: Mask) -> int:
 
 
 def _spoiled(problem: Problem, used: Mask, estimate: Estimate) -> bool:
-    """Whether a few views carry most of the residual that the robot's estimated spread explains away."""
+    """Return whether a few views carry most of the residual that the robot's estimated spread explains away."""
     rms = _reprojection(problem, estimate.X, estimate.Z)[used]
     return bool(rms.max() > 4.0 * np.median(rms) and rms.max() > 3.0 * estimate.noise.px)
 
 
 def _reprojection(problem: Problem, X: Array, Z: Array) -> Array:
-    """(n,) rms of each view without corrections, px."""
+    """Return (n,) rms of each view without corrections, px."""
     T, _ = chain(problem, X, Z, np.zeros((len(problem), 6)))
     _, _, cost = normal_equations(
         problem.points, problem.pixels, problem.offsets, problem.radii, T, problem.camera_rows(), 1.0
@@ -301,7 +301,7 @@ def _reprojection(problem: Problem, X: Array, Z: Array) -> Array:
 
 
 def starting_mounts(problem: Problem) -> tuple[Array, Array]:
-    """Closed-form mounts of all cameras and boards, (cameras, 4, 4) and (boards, 4, 4).
+    """Return the closed-form mounts of all cameras and boards, (cameras, 4, 4) and (boards, 4, 4).
 
     Raises:
         OpenArmError: DEGENERATE, when a camera or board is tied to nothing, or the closed form has no answer.
@@ -332,7 +332,7 @@ def starting_mounts(problem: Problem) -> tuple[Array, Array]:
 
 
 def _consensus(problem: Problem, usable: Mask, config: SolveConfig) -> Mask:
-    """Views that agree with the best of many small subsets, for each camera and board."""
+    """Return views that agree with the best of many small subsets, for each camera and board."""
     rng = np.random.default_rng(config.seed)
     keep = usable.copy()
     moving = usable & (problem.kind < 2)

@@ -75,6 +75,11 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
     """Leave poses out in turn (`folds` groups; as many as poses is leave-one-out) and predict them.
 
     Poses whose absence leaves too few to solve are not counted.
+
+    Args:
+        problem: All views.
+        solution: Of them.
+        folds: Number of groups.
     """
     used = np.flatnonzero(solution.used)
     poses = np.unique(problem.pose[used])
@@ -130,9 +135,14 @@ def _rms(problem: Problem, X: Array, Z: Array) -> float:
 
 
 def estimate_delay(samples: SampleSet, config: SolveConfig | None = None, rounds: int = 4) -> tuple[float, float]:
-    """How old the images are at their stamps, with its standard deviation, s; needs samples of a moving robot.
+    """Return how old the images are at their stamps, with its standard deviation, s; needs samples of a moving robot.
 
     The deviation is infinite when the robot stood in all samples.
+
+    Args:
+        samples: Of a moving robot.
+        config: Of the solver.
+        rounds: At most.
     """
     config = config or SolveConfig(most_translation=0.1, most_rotation=0.2, reject_outliers=False)
     delay, sigma = 0.0, math.inf
@@ -208,7 +218,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
 
 
 def _focal(solution: Solution) -> tuple[float, float]:
-    """Focal length over the one that the camera states, when the intrinsics are free, and its deviation.
+    """Return the focal length over the one that the camera states, when the intrinsics are free, and its deviation.
 
     The larger distance of fx and fy; of several cameras the first.
     """
@@ -231,7 +241,7 @@ def _focal(solution: Solution) -> tuple[float, float]:
 
 
 def _scale(solution: Solution) -> tuple[float, float]:
-    """Scale of the board when it is free, and its deviation."""
+    """Return the scale of the board when it is free, and its deviation."""
     part = solution.problem.subset(solution.used)
     now = solution.estimate
     estimate = refine(part, now.X, now.Z, now.noise, extras=("scale",))

@@ -274,7 +274,7 @@ class _Run:
             result.message += f"; stored in {result.path}"
 
     async def _delay(self) -> tuple[float, float]:
-        """Age of the images at their stamps, s, and its predicted error: from a slow motion to a far pose.
+        """Return the age of the images at their stamps, s, and its predicted error: from a slow motion to a far pose.
 
         Raises:
             OpenArmError: NOTHING_DETECTED, when the moving arm was seen too rarely.

@@ -129,7 +129,7 @@ class CalibrationClient(BackgroundNode):
         return self.call(RemoveSample, "/calibration/remove_sample", RemoveSample.Request(sample=sample))
 
     def samples(self) -> GetSampleList.Response:
-        """The samples, and what to do next in words."""
+        """Return the samples, and what to do next in words."""
         return self.call(GetSampleList, "/calibration/get_sample_list", GetSampleList.Request())
 
     def save_samples(self, path: str) -> SampleFile.Response:

@@ -101,7 +101,13 @@ class ImageCapture:
 
 
 async def wait_until(node: BaseNode[Any], condition: Callable[[], bool], timeout: float) -> bool:
-    """Wait, in a coroutine of the node, until a condition holds (True) or the time is over (False); s of wall clock."""
+    """Wait, in a coroutine of the node, until a condition holds (True) or the time is over (False); s of wall clock.
+
+    Args:
+        node: Whose executor runs the coroutine.
+        condition: Checked every 20 ms.
+        timeout: s.
+    """
     future = Future(executor=node.executor)
     left = round(timeout / _POLL)
 
@@ -119,7 +125,7 @@ async def wait_until(node: BaseNode[Any], condition: Callable[[], bool], timeout
 
 
 def grey(message: Image) -> NDArray[np.uint8]:
-    """Grey picture (h, w) of an image message.
+    """Return the grey picture (h, w) of an image message.
 
     Raises:
         OpenArmError: BAD_IMAGE, for an encoding that is no colour or grey picture of 8 bits.

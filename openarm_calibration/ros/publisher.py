@@ -72,7 +72,7 @@ class PublisherNode(BaseNode[PublisherConfig]):
         self.diagnose(not faults, "; ".join(faults) or f"mounts: {text}", **sources)
 
     def _mount(self, camera: CameraConfig, faults: list[str]) -> tuple[Array, str]:
-        """The mount of a camera and where it is from; a stored one that can't be used is a fault."""
+        """Return the mount of a camera and where it is from; a stored one that can't be used is a fault."""
         if self.config.nominal:
             return camera.T_parent_link, "nominal, as asked"
         seed = self.config.seed if camera.mount_error else None

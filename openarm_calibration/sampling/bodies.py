@@ -22,7 +22,13 @@ _CYLINDER = 0.85
 
 
 def chain_poses(description: RobotDescription, link: str, q: Array) -> Array:
-    """Poses (n, 4, 4) of a link for the movable joints of its chain (n, joints), rad or m."""
+    """Return poses (n, 4, 4) of a link for the movable joints of its chain (n, joints), rad or m.
+
+    Args:
+        description: The robot.
+        link: End of the chain.
+        q: (n, joints).
+    """
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     column = 0
     for joint in description.chain(link):
@@ -74,11 +80,11 @@ class Bodies:
         self._one, self._other = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
 
     def place(self, links: Mapping[str, Array]) -> Array:
-        """(n, 4, 4) poses of the shapes for poses (4, 4) of the links."""
+        """Return (n, 4, 4) poses of the shapes for poses (4, 4) of the links."""
         return np.array([links[name] for name in self._links]).reshape(-1, 4, 4) @ self._T_link_shape
 
     def touching(self, shapes: Array) -> bool:
-        """Whether two shapes of different links overlap that may not; `shapes` from `place`."""
+        """Return whether two shapes of different links overlap that may not; `shapes` from `place`."""
         a, b = shapes[self._one], shapes[self._other]
         h, k = self._small[self._one], self._small[self._other]
         Ra, Rb = a[:, :3, :3], b[:, :3, :3]
@@ -95,7 +101,13 @@ class Bodies:
         return bool((~separated.any(axis=(1, 2))).any())
 
     def hidden(self, shapes: Array, eye: Array, points: Array) -> bool:
-        """Whether a shape lies between the eye (3,) and any of the points (n, 3); `shapes` from `place`."""
+        """Return whether a shape lies between the eye (3,) and any of the points (n, 3); `shapes` from `place`.
+
+        Args:
+            shapes: (n, 4, 4), from `place`.
+            eye: (3,), m.
+            points: (n, 3), m.
+        """
         inverse = shapes[:, :3, :3].swapaxes(1, 2)
         start = (inverse @ (eye - shapes[:, :3, 3])[:, :, None])[:, None, :, 0]
         ends = (points[None] - shapes[:, None, :3, 3]) @ shapes[:, :3, :3]

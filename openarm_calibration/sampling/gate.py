@@ -85,7 +85,7 @@ def match(
 
 
 def _speed(states: list[tuple[int, dict[str, float]]], names: tuple[str, ...]) -> tuple[float, str]:
-    """Largest range of a joint over the states by their duration, and the joint."""
+    """Return the largest range of a joint over the states by their duration, and the joint."""
     times = [t for t, _ in states]
     span = (max(times) - min(times)) * 1e-9
     if span <= 0.0 or not names:

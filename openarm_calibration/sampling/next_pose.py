@@ -39,7 +39,14 @@ ENOUGH = 12
 
 
 def visible(board: Board, T_camera_board: Array, row: Array, size: tuple[int, int]) -> bool:
-    """Whether all marks would be in the image (width, height), not tilted too far, and seen from the front."""
+    """Return whether all marks would be in the image (width, height), not tilted too far, and seen from the front.
+
+    Args:
+        board: The board.
+        T_camera_board: (4, 4).
+        row: (4,) fx, fy, cx, cy.
+        size: Width and height of the image, px.
+    """
     direction = T_camera_board[:3, 3] / max(float(np.linalg.norm(T_camera_board[:3, 3])), 1e-9)
     if float(T_camera_board[:3, 2] @ direction) < math.cos(MOST_TILT):
         return False
@@ -72,7 +79,7 @@ def advice(A: Sequence[Array] | Array) -> str:
 
 
 def _least_turned(poses: Array) -> str:
-    """Axis of the gripper about which the poses turned least."""
+    """Return the axis of the gripper about which the poses turned least."""
     n = len(poses)
     logs = [se3.log_so3(poses[i, :3, :3].T @ poses[j, :3, :3]) for i in range(n) for j in range(i + 1, n)]
     spread = np.sum(np.square(logs), axis=0) if logs else np.zeros(3)
@@ -200,7 +207,7 @@ class PoseSearch:
         self._refused.append(proposal.q)
 
     def propose(self, samples: SampleSet, state: Mapping[str, float], most: int = 12) -> list[Proposal]:
-        """The next poses, best first.
+        """Return the next poses, best first.
 
         Args:
             samples: So far.
@@ -238,7 +245,7 @@ class PoseSearch:
     def _showing(
         self, samples: SampleSet, Z: Array, state: Mapping[str, float]
     ) -> tuple[list[tuple[Array, Array]], int]:
-        """Postures that show the board, with T_camera_board (4, 4); and in how many the robot hides it.
+        """Return postures that show the board, with T_camera_board (4, 4); and in how many the robot hides it.
 
         Until one is found they are drawn from the whole range, then around those that are known.
         """
@@ -284,7 +291,7 @@ class PoseSearch:
         return out, shadowed
 
     def _views(self, samples: SampleSet, q: Array, Z: Array) -> Array:
-        """T_camera_board (n, 4, 4) at postures (n, joints)."""
+        """Return T_camera_board (n, 4, 4) at postures (n, joints)."""
         head = samples.head
         in_hand = head.setup == "in_hand"
         moving = chain_poses(self._description, head.parent if in_hand else head.carrier, q)
@@ -301,14 +308,14 @@ class PoseSearch:
         return inside & large
 
     def _seen(self, samples: SampleSet, T: Array, margin: float) -> bool:
-        """Whether all marks are in the image, so far from its edge."""
+        """Return whether all marks are in the image, so far from its edge."""
         optics = samples.head.optics
         row = np.array([optics.fx, optics.fy, optics.cx - margin, optics.cy - margin])
         size = (round(optics.width - 2 * margin), round(optics.height - 2 * margin))
         return visible(samples.board, T, row, size)
 
     def _ranked(self, samples: SampleSet, Z: Array, found: list[tuple[Array, Array]]) -> list[tuple[float, Proposal]]:
-        """What each posture leaves of the error: a score, smaller is better."""
+        """Return what each posture leaves of the error: a score, smaller is better."""
         config, optics, board = self._config, samples.head.optics, samples.board
         noise = Noise(config.px, config.robot_translation, config.robot_rotation)
         row = np.array([optics.fx, optics.fy, optics.cx, optics.cy])

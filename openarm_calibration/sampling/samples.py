@@ -76,7 +76,7 @@ def _require_archive(path: Path) -> None:
 
 
 def _sample(entry: dict[str, Any], arrays: Mapping[str, NDArray[Any]], samples: SampleSet) -> Sample:
-    """A sample of a session file.
+    """Read a sample of a session file.
 
     Raises:
         KeyError, TypeError, ValueError: When something is missing or has no sense.
@@ -118,7 +118,7 @@ def _joints(state: Mapping[str, Any]) -> dict[str, float]:
 
 
 def session_path(text: str) -> Path:
-    """Path of a session file that was asked for.
+    """Return the path of a session file that was asked for.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when it is empty.
@@ -205,7 +205,7 @@ class SampleSet:
         self._taken = 0
 
     def __len__(self) -> int:
-        """Samples."""
+        """Return the number of samples."""
         return len(self._samples)
 
     @property
@@ -266,14 +266,14 @@ class SampleSet:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"no sample {name!r}; samples: {names}")
 
     def pose(self, joints: Mapping[str, float]) -> Array:
-        """A (4, 4): T_base_parent when the arm carries the camera, else T_parent_carrier."""
+        """Return A (4, 4): T_base_parent when the arm carries the camera, else T_parent_carrier."""
         link = self._description.link_pose
         if self.head.setup == "in_hand":
             return se3.inverse(link(self.head.base, joints)) @ link(self.head.parent, joints)
         return se3.inverse(link(self.head.parent, joints)) @ link(self.head.carrier, joints)
 
     def pose_at(self, sample: Sample, t_ns: int) -> Array:
-        """A (4, 4) at a stamp near a sample's, by its track; at the sample's own joints without one."""
+        """Return A (4, 4) at a stamp near a sample's, by its track; at the sample's own joints without one."""
         times = [t for t, _ in sample.track]
         if len(times) < 2 or not times[0] <= t_ns <= times[-1]:
             return self.pose(sample.joints)
@@ -283,7 +283,7 @@ class SampleSet:
         return self.pose(dict(zip(names, at, strict=True)))
 
     def problem(self, delay_s: float = 0.0) -> Problem:
-        """The hand-eye problem of all samples, whose images are assumed to be `delay_s` old at their stamps.
+        """Return the hand-eye problem of all samples, whose images are assumed to be `delay_s` old at their stamps.
 
         Raises:
             OpenArmError: DEGENERATE, without samples.
@@ -302,12 +302,12 @@ class SampleSet:
         return assemble(views, [self.head.optics], [sample.T_camera_board for sample in self._samples])
 
     def mount(self, X: Array) -> Array:
-        """T_parent_link of the camera for a solved X (4, 4) of its optical frame."""
+        """Return T_parent_link of the camera for a solved X (4, 4) of its optical frame."""
         return X @ se3.inverse(T_LINK_OPTICAL)
 
     # --- session file
     def _text(self) -> str:
-        """All but marks and images, as JSON."""
+        """Return all but marks and images, as JSON."""
         listed = [
             {
                 "name": sample.name, "t_image_ns": sample.t_image_ns, "t_joints_ns": sample.t_joints_ns,
@@ -319,7 +319,7 @@ class SampleSet:
         return json.dumps({"format": 1, "head": self.head.model_dump(mode="json"), "samples": listed})
 
     def digest(self) -> str:
-        """Hash of the session as it is now, as `save` returns it."""
+        """Return the hash of the session as it is now, as `save` returns it."""
         return hashlib.sha256(self._text().encode()).hexdigest()
 
     def save(self, path: Path) -> str:
@@ -345,19 +345,25 @@ class SampleSet:
 
 
 def moving_joints(head: SessionHead, description: RobotDescription) -> tuple[str, ...]:
-    """Names of the joints between the base and what the arm carries."""
+    """Return the names of the joints between the base and what the arm carries."""
     link = head.parent if head.setup == "in_hand" else head.carrier
     return tuple(joint.name for joint in description.chain(link) if joint.type != "fixed")
 
 
 def setup_of(description: RobotDescription, parent: str) -> Literal["in_hand", "to_hand"]:
-    """Whether a camera on a link moves with the arm, or is fixed and observes a board that the arm carries."""
+    """Return whether a camera on a link moves with the arm, or is fixed and observes a board that the arm carries."""
     moves = any(joint.type != "fixed" for joint in description.chain(parent))
     return "in_hand" if moves else "to_hand"
 
 
 def without(samples: SampleSet, names: Sequence[str], description: RobotDescription) -> SampleSet:
-    """A copy without some samples."""
+    """Return a copy without some samples.
+
+    Args:
+        samples: All.
+        names: Of those that are left out.
+        description: The robot.
+    """
     out = SampleSet(samples.head, description)
     for sample in samples.samples:
         if sample.name not in names:

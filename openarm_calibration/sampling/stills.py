@@ -111,11 +111,17 @@ class Picker:
         self._open = {t: (stretch, matched) for stretch in found for t, matched in stretch.tries.items()}
 
     def wants(self, t_ns: int) -> bool:
-        """Whether the image of this stamp is to be examined."""
+        """Return whether the image of this stamp is to be examined."""
         return t_ns in self._open and not self._open[t_ns][0].sample
 
     def offer(self, t_ns: int, image: NDArray[np.uint8], optics: Intrinsics) -> None:
-        """Look at an image (h, w), grey, and take it if it shows the board."""
+        """Look at an image (h, w), grey, and take it if it shows the board.
+
+        Args:
+            t_ns: Stamp.
+            image: (h, w), grey.
+            optics: Intrinsics of the image.
+        """
         stretch, matched = self._open[t_ns]
         try:
             if optics != self.samples.head.optics:
@@ -128,7 +134,7 @@ class Picker:
 
 
 def rows(found: Sequence[Stretch]) -> list[dict[str, Any]]:
-    """What `--json` writes of a recording; seconds from its first image."""
+    """Return what `--json` writes of a recording; seconds from its first image."""
     if not found:
         return []
     first = found[0].stamps[0]
@@ -146,7 +152,7 @@ def rows(found: Sequence[Stretch]) -> list[dict[str, Any]]:
 
 
 def summary(found: Sequence[Stretch]) -> str:
-    """Lines for a terminal: each standstill, and the images between them together."""
+    """Return lines for a terminal: each standstill, and the images between them together."""
     lines: list[str] = []
     between: Counter[Code] = Counter()
     why: dict[Code, str] = {}

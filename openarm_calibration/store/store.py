@@ -101,14 +101,21 @@ class StoredCalibration(Config):
 
     @classmethod
     def of_mount(cls, camera: str, parent: str, T_parent_link: Array, **provenance: Any) -> StoredCalibration:
-        """Make one of a mount (4, 4)."""
+        """Make one of a mount (4, 4).
+
+        Args:
+            camera: Its name.
+            parent: Link that carries it.
+            T_parent_link: (4, 4).
+            provenance: Other fields.
+        """
         x, y, z = (float(v) for v in T_parent_link[:3, 3])
         qx, qy, qz, qw = (float(v) for v in se3.quat_xyzw_from_matrix(T_parent_link[:3, :3]))
         data = {"camera": camera, "parent": parent, "position": (x, y, z), "quaternion_xyzw": (qx, qy, qz, qw)}
         return validate(cls, {**data, **provenance}, f"calibration of {camera!r}")
 
     def digest(self) -> str:
-        """Hash of all fields."""
+        """Return the hash of all fields."""
         text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -132,7 +139,7 @@ class CalibrationStore:
         self.folder = folder
 
     def path(self, camera: str) -> Path:
-        """File of a camera.
+        """Return the file of a camera.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, for a name that could lead elsewhere.
@@ -140,7 +147,7 @@ class CalibrationStore:
         return self.folder / f"{checked_name(camera)}.yaml"
 
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras that have a file, damaged or not."""
+        """Return the names of the cameras that have a file, damaged or not."""
         if not self.folder.is_dir():
             return ()
         return tuple(sorted(p.stem for p in self.folder.glob("*.yaml") if _NAME.fullmatch(p.stem)))
@@ -175,7 +182,7 @@ class CalibrationStore:
         return read(path)
 
     def find(self, camera: str) -> Found | None:
-        """The camera's calibration, or the newest good one before it; None when nothing was ever stored.
+        """Return the camera's calibration, or the newest good one before it; None when nothing was ever stored.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the file is damaged and the history has no good one.
@@ -194,7 +201,7 @@ class CalibrationStore:
             return Found(calibration, f"{error.message}; the last good one, {older.name}, is used")
 
     def history(self, camera: str) -> tuple[StoredCalibration, ...]:
-        """All good calibrations of a camera, oldest first."""
+        """Return all good calibrations of a camera, oldest first."""
         return tuple(calibration for _, calibration in self._good(camera))
 
     def rollback(self, camera: str) -> StoredCalibration:
@@ -216,7 +223,7 @@ class CalibrationStore:
         return before
 
     def state(self) -> tuple[tuple[str, int, int], ...]:
-        """What changes when a file does: names, sizes and times of the files."""
+        """Return what changes when a file does: names, sizes and times of the files."""
         out: list[tuple[str, int, int]] = []
         for camera in self.cameras():
             try:
@@ -304,7 +311,7 @@ def places(folder: Path, mount_seed: int | None) -> tuple[CalibrationStore, ...]
 def of_these_mounts(
     stores: Sequence[CalibrationStore], camera: str, parent: str, mount_seed: int | None
 ) -> tuple[Found | None, tuple[str, ...]]:
-    """The first calibration of a camera as it is mounted now, and why others that were met are not used.
+    """Return the first calibration of a camera as it is mounted now, and why others that were met are not used.
 
     Args:
         stores: As `places` lists them.

@@ -34,13 +34,13 @@ class Truth:
     A: Array
 
     def bound(self, noise: Noise) -> Array:
-        """(12, 12) Cramér-Rao bound on the covariance of X and Z."""
+        """Return (12, 12) Cramér-Rao bound on the covariance of X and Z."""
         information = information_at(self.problem.with_poses(self.A), self.X[None], self.Z[None], noise)
         return np.linalg.inv(information).astype(np.float64)
 
 
 def mounts(setup: Setup) -> tuple[Array, Array]:
-    """The true X and Z."""
+    """Return the true X and Z."""
     if setup == "in_hand":
         return (
             se3.make(se3.exp_so3((0.05, -0.1, 1.5)), (0.03, -0.05, 0.06)),
@@ -53,7 +53,13 @@ def mounts(setup: Setup) -> tuple[Array, Array]:
 
 
 def views(setup: Setup, count: int, rng: np.random.Generator) -> Array:
-    """(count, 4, 4) T_camera_board with all marks in the image."""
+    """Return (count, 4, 4) T_camera_board with all marks in the image.
+
+    Args:
+        setup: in_hand or to_hand.
+        count: How many.
+        rng: Of everything random.
+    """
     near, far = (0.30, 0.55) if setup == "in_hand" else (0.45, 0.75)
     out: list[Array] = []
     while len(out) < count:
@@ -71,7 +77,14 @@ def views(setup: Setup, count: int, rng: np.random.Generator) -> Array:
 
 
 def make(setup: Setup, C: Array, noise: Noise, rng: np.random.Generator) -> Truth:
-    """Problem of given views C (n, 4, 4) T_camera_board, with noise."""
+    """Return the problem of given views C (n, 4, 4) T_camera_board, with noise.
+
+    Args:
+        setup: in_hand or to_hand.
+        C: (n, 4, 4).
+        noise: Standard deviations.
+        rng: Of everything random.
+    """
     X, Z = mounts(setup)
     B = X @ C @ inverses(Z)
     A = inverses(B) if setup == "in_hand" else B
@@ -86,7 +99,14 @@ def make(setup: Setup, C: Array, noise: Noise, rng: np.random.Generator) -> Trut
 
 
 def trial(setup: Setup, count: int, noise: Noise, rng: np.random.Generator) -> Truth:
-    """A random problem of `count` poses."""
+    """Return a random problem of `count` poses.
+
+    Args:
+        setup: in_hand or to_hand.
+        count: Poses.
+        noise: Standard deviations.
+        rng: Of everything random.
+    """
     return make(setup, views(setup, count, rng), noise, rng)
 
 
@@ -94,7 +114,7 @@ DEGENERATE = ("translation", "axis", "turntable", "identical")
 
 
 def degenerate(kind: str, setup: Setup, rng: np.random.Generator, amount: float = 0.0, count: int = 10) -> Truth:
-    """A problem whose robot poses move in one way only.
+    """Return a problem whose robot poses move in one way only.
 
     Args:
         kind: translation, axis (one rotation axis and translations), turntable (one axis), identical.

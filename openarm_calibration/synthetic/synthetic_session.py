@@ -31,7 +31,14 @@ class Known:
 
 
 def photograph(board: Board, T_camera_board: Array, optics: Intrinsics, *, mirrored: bool = False) -> Array:
-    """Grey picture (h, w) of a board alone, 16 samples a pixel; 0 to 255."""
+    """Return the grey picture (h, w) of a board alone, 16 samples a pixel; 0 to 255.
+
+    Args:
+        board: The board.
+        T_camera_board: (4, 4).
+        optics: Of the camera.
+        mirrored: Whether the picture is mirrored.
+    """
     scale, zoom = 4000.0, 4
     w, h = board.size
     to_board = np.array([[1 / scale, 0, 0.5 / scale - w / 2], [0, 1 / scale, 0.5 / scale - h / 2], [0, 0, 1]])
@@ -54,7 +61,7 @@ def make_session(
     spread: float = 0.35,
     seed: int = 0,
 ) -> Known:
-    """Samples at random joints around a view of the board; with `speed` (rad/s) the arm moves at every image."""
+    """Return samples at random joints around a view of the board; with `speed` (rad/s) the arm moves at every image."""
     rng = np.random.default_rng(seed)
     description = RobotDescription.load()
     cameras = load_cameras()

@@ -72,7 +72,13 @@ def detections_from_msg(message: Detection3DArray) -> tuple[Detection, ...]:
 
 
 def hypothesis(name: str, score: float, pose: PoseWithCovariance | None = None) -> ObjectHypothesisWithPose:
-    """Return a class with its score, and the pose where there is one."""
+    """Return a class with its score, and the pose where there is one.
+
+    Args:
+        name: The class.
+        score: 0 to 1.
+        pose: With its covariance.
+    """
     return ObjectHypothesisWithPose(
         hypothesis=ObjectHypothesis(class_id=name, score=score), pose=pose or PoseWithCovariance()
     )

@@ -25,12 +25,18 @@ _BOTTOM, _TOP = np.array([0.12, 0.35, 0.75]), np.array([0.95, 0.65, 0.20])
 
 
 def header(t_ns: int) -> Header:
-    """Header in the base frame."""
+    """Return the header in the base frame."""
     return Header(frame_id=BASE_FRAME, stamp=ns_to_stamp(t_ns))
 
 
 def octomap_msg(payload: Payload, resolution: float, t_ns: int) -> Octomap:
-    """An octree as octomap_server publishes it."""
+    """Return an octree as octomap_server publishes it.
+
+    Args:
+        payload: The octree.
+        resolution: Edge of a cell, m.
+        t_ns: Stamp.
+    """
     message = Octomap(header=header(t_ns), binary=payload.binary, id=TREE_ID, resolution=resolution)
     # an array of the field's own type is taken as it is; a list costs a thousand times more
     message.data = array.array("b", payload.data.tobytes())
@@ -38,13 +44,26 @@ def octomap_msg(payload: Payload, resolution: float, t_ns: int) -> Octomap:
 
 
 def centres_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> PointCloud2:
-    """Centres of the occupied cells."""
+    """Return centres of the occupied cells.
+
+    Args:
+        lattice: Which cells.
+        states: (nx, ny, nz).
+        t_ns: Stamp.
+    """
     points = lattice.centres(np.argwhere(states == OCCUPIED)).astype(np.float32)
     return cloud_from_points(points, BASE_FRAME, t_ns)
 
 
 def changes_msg(lattice: Lattice, states: NDArray[np.uint8], changed: NDArray[np.int32], t_ns: int) -> PointCloud2:
-    """Cells whose state changed, with a field `state`: 0 unknown, 1 free, 2 occupied."""
+    """Return cells whose state changed, with a field `state`: 0 unknown, 1 free, 2 occupied.
+
+    Args:
+        lattice: Which cells.
+        states: (nx, ny, nz).
+        changed: Flat indices.
+        t_ns: Stamp.
+    """
     index = np.stack(np.unravel_index(changed, lattice.shape), axis=-1)
     rows = np.empty((changed.size, 4), np.float32)
     rows[:, :3] = lattice.centres(index)
@@ -60,7 +79,13 @@ def changes_msg(lattice: Lattice, states: NDArray[np.uint8], changed: NDArray[np
 
 
 def markers_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> MarkerArray:
-    """The occupied cells as cubes, coloured by height."""
+    """Return the occupied cells as cubes, coloured by height.
+
+    Args:
+        lattice: Which cells.
+        states: (nx, ny, nz).
+        t_ns: Stamp.
+    """
     marker = Marker(header=header(t_ns), ns="occupied", type=Marker.CUBE_LIST, action=Marker.ADD)
     marker.pose.orientation.w = 1.0
     marker.scale.x = marker.scale.y = marker.scale.z = lattice.resolution
@@ -78,7 +103,13 @@ def markers_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> Marke
 
 
 def projected_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> OccupancyGridMsg:
-    """The map seen from above: 100 where a column has an occupied cell, 0 where it has a free one only, else -1."""
+    """The map seen from above: 100 where a column has an occupied cell, 0 where it has a free one only, else -1.
+
+    Args:
+        lattice: Which cells.
+        states: (nx, ny, nz).
+        t_ns: Stamp.
+    """
     occupied, free = (states == OCCUPIED).any(axis=2), (states == FREE).any(axis=2)
     cells = np.where(occupied, 100, np.where(free, 0, -1)).astype(np.int8)
     message = OccupancyGridMsg(header=header(t_ns))

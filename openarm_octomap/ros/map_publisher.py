@@ -44,7 +44,13 @@ class MapPublisher:
         return wanted | ({"full"} if self._full_wanted else set())
 
     def publish(self, snapshot: Snapshot, t_ns: int, changed: NDArray[np.int32] | None = None) -> None:
-        """Publish a snapshot; without `changed` it is a new map, which all topics show at once."""
+        """Publish a snapshot; without `changed` it is a new map, which all topics show at once.
+
+        Args:
+            snapshot: The map.
+            t_ns: Stamp.
+            changed: Flat indices of the cells whose state changed.
+        """
         resolution = snapshot.lattice.resolution
         self._binary.publish(convert.octomap_msg(snapshot.binary, resolution, t_ns))
         if snapshot.full is not None:

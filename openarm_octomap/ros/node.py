@@ -123,7 +123,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
             self._show()
 
     def _update(self, frames: list[Frame], held: tuple[HeldBox, ...], wanted: set[str]) -> Report:
-        """One update, in a worker thread."""
+        """Do one update, in a worker thread."""
         begin = time.thread_time()
         slot = self._field.begin() if self._field is not None else None
         report = self._mapper.update(frames, held, slot, wanted)

@@ -43,14 +43,14 @@ class Letterbox:
 
     @classmethod
     def fit(cls, image: tuple[int, int], size: tuple[int, int]) -> Letterbox:
-        """Of an image (width, height) in an input (width, height)."""
+        """Fit an image (width, height) in an input (width, height)."""
         scale = min(size[0] / image[0], size[1] / image[1])
         inner = (max(1, round(image[0] * scale)), max(1, round(image[1] * scale)))
         exact = (inner[0] / image[0], inner[1] / image[1])
         return cls(*size, (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2, inner, exact)
 
     def place(self, rgb: Image) -> Image:
-        """The input (height, width, 3) of an image (h, w, 3)."""
+        """Return the input (height, width, 3) of an image (h, w, 3)."""
         if rgb.shape[1::-1] != self.inner:
             kind = cv2.INTER_AREA if self.scale[0] < 1.0 else cv2.INTER_LINEAR
             rgb = cast(Image, cv2.resize(rgb, self.inner, interpolation=kind))
@@ -61,18 +61,18 @@ class Letterbox:
         return out
 
     def into(self, boxes: Array) -> Array:
-        """Boxes (n, 4) of the image in the input."""
+        """Return boxes (n, 4) of the image in the input."""
         return boxes * (*self.scale, *self.scale) + (self.left, self.top, self.left, self.top)
 
     def back(self, boxes: Array) -> Array:
-        """Boxes (n, 4) of the input in the image, cut where the image ends."""
+        """Return boxes (n, 4) of the input in the image, cut where the image ends."""
         size = self.inner[0] / self.scale[0], self.inner[1] / self.scale[1]
         out = (boxes - (self.left, self.top, self.left, self.top)) / (*self.scale, *self.scale)
         return out.clip(0.0, (*size, *size))
 
 
 def blob(rgb: Image) -> NDArray[np.float32]:
-    """What a network takes, (1, 3, h, w) 0 to 1, of an image (h, w, 3)."""
+    """Return what a network takes, (1, 3, h, w) 0 to 1, of an image (h, w, 3)."""
     out = np.empty((1, 3, *rgb.shape[:2]), np.float32)
     np.multiply(rgb.transpose(2, 0, 1), np.float32(1.0 / 255.0), out=out[0])
     return out
@@ -88,7 +88,7 @@ class Candidates:
 
 
 def decode(output: NDArray[np.float32], threshold: float, max_overlap: float, limit: int = 100) -> Candidates:
-    """Boxes of a network's output without the weaker ones of the same object.
+    """Return boxes of a network's output without the weaker ones of the same object.
 
     Args:
         output: (4 + classes, n): cx, cy, width, height in pixels, then a score per class.
@@ -117,7 +117,7 @@ def decode(output: NDArray[np.float32], threshold: float, max_overlap: float, li
 
 
 def overlap(box: Array, others: Array) -> Array:
-    """Intersection over union (n,) of a box (4,) with others (n, 4)."""
+    """Return the intersection over union (n,) of a box (4,) with others (n, 4)."""
     size = (np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])).clip(0.0)
     common = size[:, 0] * size[:, 1]
     total = np.prod(box[2:] - box[:2]) + np.prod(others[:, 2:] - others[:, :2], axis=1) - common

@@ -67,7 +67,7 @@ class Detector(Protocol):
     """Finds objects in a colour image."""
 
     def detect(self, rgb: Image) -> tuple[Detection2D, ...]:
-        """Objects of an image (h, w, 3) uint8, largest first; empty when there is none."""
+        """Return objects of an image (h, w, 3) uint8, largest first; empty when there is none."""
         ...
 
 
@@ -202,7 +202,7 @@ class ColorDetector:
 def rank(
     detections: Sequence[Detection2D], policy: Policy, image_size: tuple[int, int], label: str = ""
 ) -> tuple[Detection2D, ...]:
-    """Detections in the order in which they should be taken.
+    """Return detections in the order in which they should be taken.
 
     Args:
         detections: In any order.
@@ -221,7 +221,7 @@ def rank(
 
 
 def _hsv_bounds(color: ColorClass) -> list[tuple[Image, Image]]:
-    """OpenCV's 8-bit HSV (hue 0..179 at two degrees a count) of a colour; two ranges where the hue wraps."""
+    """Return OpenCV's 8-bit HSV (hue 0..179 at two degrees a count) of a colour; two ranges where the hue wraps."""
     low, high = color.hue_deg
     hues = [(low, high)] if low <= high else [(low, 360.0), (0.0, high)]
     s, v = color.saturation, color.value

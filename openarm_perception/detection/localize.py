@@ -61,7 +61,7 @@ class LocalizerConfig(Config):
         return self
 
     def known_heights(self) -> dict[str, float]:
-        """The known heights by label, m."""
+        """Return the known heights by label, m."""
         return metres_by_name(self.heights, "heights", "red=0.05", 0.005, 0.5)
 
 
@@ -113,7 +113,7 @@ class Localizer:
         return cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
 
     def coarse(self, patch: Patch) -> Array:
-        """Point on the visible surface: the median pixel of the mask at the median of its valid depths.
+        """Return the point on the visible surface: the median pixel of the mask at the median of its valid depths.
 
         A single pixel carries the whole noise of the sensor; the median of hundreds carries next to none of it.
 
@@ -128,7 +128,7 @@ class Localizer:
         return patch.T_base_camera[:3, 3] + ray * float(np.median(patch.z[v, u]))
 
     def locate(self, patch: Patch) -> LocatedObject:
-        """The object of a detection.
+        """Locate the object of a detection.
 
         Raises:
             OpenArmError: BAD_IMAGE, when the image border cuts the object or depths are missing; NOTHING_DETECTED, when
@@ -177,7 +177,7 @@ class Localizer:
     def locate_on_plane(
         self, found: Detection2D, height: float, intrinsics: Intrinsics, T_base_camera: Array
     ) -> LocatedObject:
-        """The object of a detection without depth: an upright convex prism of known height on the table.
+        """Locate the object of a detection without depth: an upright convex prism of known height on the table.
 
         Args:
             found: In the colour image.
@@ -223,7 +223,7 @@ class Localizer:
         return valid & gate
 
     def _solid(self, patch: Patch) -> Mask:
-        """Points of the object above the table."""
+        """Return points of the object above the table."""
         found = patch.found
         share = float(np.count_nonzero(patch.robot & patch.coloured)) / found.area
         if share > _MOSTLY:
@@ -251,14 +251,14 @@ class Localizer:
 
     @staticmethod
     def _top_face(patch: Patch, top: float) -> Mask:
-        """The largest patch at the height of the top; it is bounded by depth, not colour."""
+        """Return the largest patch at the height of the top; it is bounded by depth, not colour."""
         grown = cv2.dilate(patch.mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
         level = grown & ~patch.robot & (np.abs(patch.points[..., 2] - top) <= patch.band)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(level.astype(np.uint8), connectivity=4)
         return labels == 1 + int(np.argmax(stats[1:count, cv2.CC_STAT_AREA]))
 
     def _edges(self, patch: Patch, face: Mask, flank: Mask, top: float) -> tuple[Array, float]:
-        """Points (n, 2) on the edges of the top, base frame, m, and the share of its outline that is in view.
+        """Return points (n, 2) on the edges of the top, base frame, m, and the share of its outline that is in view.
 
         An edge lies between the face and what is far from it, or what belongs to the `flank`.
         """

@@ -115,7 +115,7 @@ class NetworkDetector:
         self._wanted = frozenset(self.names.index(name) for name in (names or self.names))
 
     def detect(self, rgb: Image) -> tuple[Detection2D, ...]:
-        """Objects of an image (h, w, 3) uint8, largest first.
+        """Return objects of an image (h, w, 3) uint8, largest first.
 
         Raises:
             OpenArmError: BAD_IMAGE, for another shape or type.
@@ -135,7 +135,7 @@ class NetworkDetector:
         return tuple(sorted(out, key=lambda d: -d.area))
 
     def candidates(self, rgb: Image, threshold: float) -> Candidates:
-        """Everything from a score on, boxes in pixels of the image."""
+        """Return everything from a score on, boxes in pixels of the image."""
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
             raise OpenArmError(
                 Code.BAD_IMAGE, f"colour image has shape {rgb.shape} and type {rgb.dtype}; expected (h, w, 3) of uint8"
@@ -146,7 +146,7 @@ class NetworkDetector:
         return Candidates(found.classes, found.scores, letterbox.back(found.boxes))
 
     def run(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The network alone: (4 + classes, n) of an input (1, 3, h, w)."""
+        """Run the network alone: (4 + classes, n) of an input (1, 3, h, w)."""
         return cast(NDArray[np.float32], self._session.run(None, {self._input: image})[0])[0]
 
     # --- contents of the file
@@ -165,7 +165,7 @@ class NetworkDetector:
         return inputs[0].name, (width, height)
 
     def _check_output(self) -> int:
-        """Classes, by the shape of what a grey image gives."""
+        """Return the number of classes, by the shape of what a grey image gives."""
         image = np.full((1, 3, self.size[1], self.size[0]), 0.5, np.float32)
         try:
             outputs = self._session.run(None, {self._input: image})
@@ -205,7 +205,7 @@ class NetworkDetector:
 
 
 def model_path(model: str) -> Path:
-    """The file of a model: a path, or a name in `models/detector`.
+    """Return the file of a model: a path, or a name in `models/detector`.
 
     Raises:
         OpenArmError: CONFIG_INVALID, listing the models that there are.
@@ -221,7 +221,7 @@ def model_path(model: str) -> Path:
 
 
 def _open(path: Path) -> Any:
-    """A session of onnxruntime, imported here alone: detection by colour does not need it."""
+    """Return a session of onnxruntime, imported here alone: detection by colour does not need it."""
     try:
         import onnxruntime
     except ImportError as error:

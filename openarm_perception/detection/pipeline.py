@@ -45,7 +45,7 @@ class View:
     robot: Mask | None = None
 
     def heights(self, limits: DepthLimits, window: tuple[slice, slice] | None = None) -> NDArray[np.float32]:
-        """Heights (h, w) of the pixels in the base frame, m; NaN without a depth that counts.
+        """Return the heights (h, w) of the pixels in the base frame, m; NaN without a depth that counts.
 
         Args:
             limits: Depths that count.
@@ -312,6 +312,11 @@ def make_pipeline(
 def cut_out(box: Detection2D, view: View, localizer: Localizer) -> Detection2D | None:
     """Cut out the object in a box: what rises above the table there and has the colour of its middle.
 
+    Args:
+        box: Of the network.
+        view: The frame.
+        localizer: Has the height of the table.
+
     Returns:
         The detection with mask and box of those pixels, its class as `kind`; None when hardly any are left.
     """
@@ -367,7 +372,7 @@ def clusters(view: View, localizer: Localizer) -> tuple[Detection2D, ...]:
 
 
 def same(a: Detection2D, b: Detection2D) -> bool:
-    """Whether two detections are of one object."""
+    """Return whether two detections are of one object."""
     (ua, va), (ub, vb) = a.origin, b.origin
     left, top = max(ua, ub), max(va, vb)
     right, bottom = min(ua + a.size[0], ub + b.size[0]), min(va + a.size[1], vb + b.size[1])
@@ -379,7 +384,7 @@ def same(a: Detection2D, b: Detection2D) -> bool:
 
 
 def _alike(rgb: Image, core: Mask) -> Mask:
-    """Pixels (h, w) of the colour that most of the core has; how light they are does not matter."""
+    """Return pixels (h, w) of the colour that most of the core has; how light they are does not matter."""
     lab = cv2.cvtColor(cv2.medianBlur(np.ascontiguousarray(rgb), 3), cv2.COLOR_RGB2LAB)
     ab = lab[..., 1:].astype(np.float32) - 128.0
     middle = np.median(ab[core], axis=0)
@@ -393,7 +398,7 @@ def _alike(rgb: Image, core: Mask) -> Mask:
 
 
 def _largest(mask: Mask) -> Mask:
-    """The largest connected part, specks and bridges cut, holes healed."""
+    """Return the largest connected part, specks and bridges cut, holes healed."""
     clean = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(clean, connectivity=4)
     if count < 2:

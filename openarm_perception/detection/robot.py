@@ -43,7 +43,7 @@ class RobotFinder:
     def find(
         self, view: DepthView, joints: Mapping[str, float], held: Sequence[HeldBox] = ()
     ) -> tuple[Mask, dict[str, int]]:
-        """The robot in an image.
+        """Find the robot in an image.
 
         Args:
             view: The image, and the pose of its camera at its stamp.

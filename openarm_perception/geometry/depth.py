@@ -76,7 +76,7 @@ def _filter(
 
 
 def unit_scale(depth: DepthImage) -> float:
-    """Metres of one count of a depth image.
+    """Return metres of one count of a depth image.
 
     Raises:
         OpenArmError: BAD_IMAGE, when the image is neither 16UC1 nor 32FC1.
@@ -94,6 +94,11 @@ def unit_scale(depth: DepthImage) -> float:
 
 def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> None:
     """Refuse an image that does not belong to the intrinsics.
+
+    Args:
+        what: Name of the image.
+        shape: Of the image.
+        intrinsics: Of its CameraInfo.
 
     Raises:
         OpenArmError: BAD_IMAGE, naming the image and both sizes.
@@ -127,7 +132,7 @@ class Deprojector:
         self._ray_y: Points = np.empty(0, np.float32)
 
     def organised(self, depth: DepthImage, intrinsics: Intrinsics, out: Points | None = None) -> Points:
-        """Points of every pixel.
+        """Return points of every pixel.
 
         Args:
             depth: (h, w), uint16 millimetres or float32 metres.

@@ -57,7 +57,7 @@ class FilterConfig(Config):
 
 
 def median_depth(depth: DepthImage, size: int) -> DepthImage:
-    """Median over `size` × `size` pixels; pixels that were invalid stay so, those at holes keep their value.
+    """Return the median over `size` × `size` pixels; pixels that were invalid stay so, those at holes keep their value.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, unless size is 3 or 5; BAD_IMAGE, for another type of image.
@@ -95,7 +95,7 @@ def drop_flying(depth: DepthImage, tolerance: float) -> DepthImage:
 
 
 def voxel_filter(points: Points, edge: float) -> Points:
-    """One point a cell: the mean of those in it, in the order in which cells are first met.
+    """Return one point per cell: the mean of those in it, in the order in which cells are first met.
 
     Cells lie on the absolute lattice ``floor(p / edge)``, so that they stay where they are from image to image.
 
@@ -141,7 +141,7 @@ def _collect(points: Points, inverse: float, table: Ints, cells: Ints, sums: NDA
 
 
 def statistical_inliers(points: Points, neighbours: int = 20, deviations: float = 2.0) -> NDArray[np.bool_]:
-    """Which points are not outliers: those whose mean distance to their nearest ones is not unusually large.
+    """Return which points are not outliers: those whose mean distance to their nearest ones is not unusually large.
 
     The same rule as open3d's `remove_statistical_outlier`: a point is one of its own nearest; a point is kept when its
     mean is below the mean of all plus `deviations` standard deviations, and above zero.
@@ -166,7 +166,12 @@ def statistical_inliers(points: Points, neighbours: int = 20, deviations: float 
 
 
 def open3d_inliers(points: Points, neighbours: int = 20, deviations: float = 2.0) -> NDArray[np.bool_]:
-    """`statistical_inliers` as open3d computes them.
+    """Return `statistical_inliers` as open3d computes them.
+
+    Args:
+        points: (n, 3), finite.
+        neighbours: How many nearest points count.
+        deviations: How unusual is too much.
 
     Raises:
         OpenArmError: ENVIRONMENT, without open3d.
@@ -181,7 +186,7 @@ def open3d_inliers(points: Points, neighbours: int = 20, deviations: float = 2.0
 
 
 def _open3d() -> tuple[Any, Any]:
-    """The modules `geometry` and `utility` of open3d."""
+    """Return the modules `geometry` and `utility` of open3d."""
     try:
         open3d = importlib.import_module("open3d")
     except ImportError as error:
@@ -210,13 +215,13 @@ class CloudFilter:
             _open3d()
 
     def depth(self, depth: DepthImage) -> DepthImage:
-        """The filters that work on the image."""
+        """Apply the filters that work on the image."""
         if self._config.median:
             depth = median_depth(depth, self._config.median)
         return drop_flying(depth, self._config.flying) if self._config.flying > 0.0 else depth
 
     def points(self, points: Points) -> Points:
-        """The filters that work on points."""
+        """Apply the filters that work on points."""
         if self._config.voxel > 0.0:
             points = voxel_filter(points, self._config.voxel)
         if self._config.outliers:

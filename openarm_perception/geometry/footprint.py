@@ -47,7 +47,7 @@ ANY_YAW_STD = math.pi / math.sqrt(12.0)
 
 
 def fit(outline: Array, spacing: float) -> Footprint:
-    """The rectangle or the circle through an outline, whichever lies nearer to it.
+    """Return the rectangle or the circle through an outline, whichever lies nearer to it.
 
     Args:
         outline: (n, 2) points on the edges, m.
@@ -69,7 +69,7 @@ def fit(outline: Array, spacing: float) -> Footprint:
 
 
 def bound(points: Array, spacing: float) -> Footprint:
-    """The smallest rectangle around points (n, 2), m: for what is neither rectangle nor circle."""
+    """Return the smallest rectangle around points (n, 2), m: for what is neither rectangle nor circle."""
     (cx, cy), (width, height), angle_deg = cv2.minAreaRect((points * 1e3).astype(np.float32))
     yaw = math.radians(angle_deg) + (math.pi / 2.0 if width > height else 0.0)
     # half a pixel is missing on every side that faces away from the camera
@@ -81,7 +81,7 @@ def bound(points: Array, spacing: float) -> Footprint:
 
 
 def _half_turn(yaw: float) -> float:
-    """The direction in (-pi/2, pi/2]."""
+    """Return the direction in (-pi/2, pi/2]."""
     return math.pi / 2.0 - (math.pi / 2.0 - yaw) % math.pi
 
 

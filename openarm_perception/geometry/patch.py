@@ -52,7 +52,7 @@ def cut(
     top_band: float,
     robot: Mask | None = None,
 ) -> Patch:
-    """The patch of a detection.
+    """Return the patch of a detection.
 
     Args:
         found: In the colour image that the depth is aligned with.

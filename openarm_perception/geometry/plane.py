@@ -23,7 +23,7 @@ _GRAZING = 0.02
 def intersect(
     pixels: ArrayLike, intrinsics: Intrinsics, T_base_camera: Array, normal: ArrayLike, offset: float
 ) -> Array:
-    """Points (..., 3) of a plane in the base frame that pixels (..., 2) show.
+    """Return points (..., 3) of a plane in the base frame that pixels (..., 2) show.
 
     Args:
         pixels: (u, v).
@@ -51,7 +51,7 @@ def intersect(
 def outline(
     found: Detection2D, intrinsics: Intrinsics, T_base_camera: Array, bottom: float, top: float, spacing: float
 ) -> Array:
-    """Outline of an upright convex prism from its silhouette alone, when its bottom and top heights are known.
+    """Return the outline of an upright convex prism from its silhouette alone; its bottom and top heights are known.
 
     Cut with the plane of the bottom, the rays of the silhouette enclose the footprint and the shadow that the prism
     throws away from the camera; cut with that of the top, the footprint and what leans towards the camera. The two

@@ -88,7 +88,7 @@ def measure_table(
 
 
 def of_block(place: LocatedObject, block_height: float) -> TableMeasurement:
-    """The table under a block of known height: its measured top less that height.
+    """Return the table under a block of known height: its measured top less that height.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for a height that no block has.

@@ -25,12 +25,18 @@ MARKER_LIFETIME = 2.0
 
 
 def header(frame_id: str, t_ns: int) -> Header:
-    """Header of a frame and a stamp."""
+    """Return the header of a frame and a stamp."""
     return Header(frame_id=frame_id, stamp=ns_to_stamp(t_ns))
 
 
 def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Detection2DArray:
-    """Boxes by their centre, pixels: the label, and what a network calls its shape; a box in an image has no pose."""
+    """Boxes by their centre, pixels: the label, and what a network calls its shape; a box in an image has no pose.
+
+    Args:
+        found: In the image.
+        frame_id: Of the image.
+        t_ns: Stamp.
+    """
     message = Detection2DArray(header=header(frame_id, t_ns))
     for name, detection in zip(numbered([d.label for d in found]), found, strict=True):
         box = BoundingBox2D(size_x=float(detection.size[0]), size_y=float(detection.size[1]))
@@ -42,7 +48,7 @@ def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Det
 
 
 def mask_image(perceived: Perceived, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Which pixel (h, w) belongs to which object.
+    """Return which pixel (h, w) belongs to which object.
 
     Returns:
         0: to none, also where the robot is; i: to the i-th of `perceived.found`, which is the i-th of /detections_2d,
@@ -58,7 +64,13 @@ def mask_image(perceived: Perceived, shape: tuple[int, int]) -> NDArray[np.uint8
 
 
 def markers(located: Sequence[LocatedObject], frame_id: str, t_ns: int) -> MarkerArray:
-    """A transparent body and a text for each object."""
+    """Return a transparent body and a text for each object.
+
+    Args:
+        located: In the frame.
+        frame_id: Of the poses.
+        t_ns: Stamp.
+    """
     message = MarkerArray(markers=[Marker(header=header(frame_id, t_ns), action=Marker.DELETEALL)])
     lifetime = Duration(seconds=MARKER_LIFETIME).to_msg()
     for i, detection in enumerate(located):

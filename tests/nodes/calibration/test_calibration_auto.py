@@ -176,5 +176,5 @@ def test_says_why_it_can_not(ros, posed_robot, tmp_path: Path) -> None:
     bench.planner.refuse = lambda k: "IN_COLLISION"
     refused = bench.run(poses=5)
     assert refused.code == "NO_PLAN"
-    assert "gets to none of" in refused.message
+    assert "reaches none of" in refused.message
     assert "IN_COLLISION by the test" in refused.message
