@@ -22,11 +22,11 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.lattice import Lattice
-from openarm_common.types import Floats
+from openarm_common.types import Array, Floats
 
 _MAGIC = b"OADIST01"
 _MAX_CAMERAS = 8
@@ -96,7 +96,7 @@ class DistanceField:
         out[inside] = self.distances[tuple(index[inside].T)]
         return out
 
-    def clearance(self, centres: NDArray[np.float64], radii: NDArray[np.float64]) -> float:
+    def clearance(self, centres: Array, radii: Array) -> float:
         """Smallest clearance between spheres and occupied cells, m; too small by a cell's diagonal at most.
 
         Args:
@@ -307,9 +307,7 @@ def _slots(memory: mmap.mmap, lattice: Lattice) -> list[Floats]:
 
 
 @njit(cache=True, nogil=True)
-def sphere_clearance(
-    distances: Floats, lower: NDArray[np.float64], edge: float, centres: NDArray[np.float64], radii: NDArray[np.float64]
-) -> float:
+def sphere_clearance(distances: Floats, lower: Array, edge: float, centres: Array, radii: Array) -> float:
     """Smallest clearance between spheres and occupied cells, m; see `DistanceField.clearance`."""
     nx, ny, nz = distances.shape
     # a sphere's centre is up to half a diagonal from that of its cell, and a surface as far from that of its own

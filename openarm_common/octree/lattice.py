@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array, Ints, Mask
 
 #: Levels below the root; a key has as many bits.
 DEPTH = 16
@@ -69,12 +70,12 @@ class Lattice:
         return cls(resolution, (first[0], first[1], first[2]), (shape[0], shape[1], shape[2]))
 
     @property
-    def lower(self) -> NDArray[np.float64]:
+    def lower(self) -> Array:
         """Lower corner (3,), m."""
         return np.asarray((np.array(self.key_min) - KEY_ZERO) * self.resolution, np.float64)
 
     @property
-    def upper(self) -> NDArray[np.float64]:
+    def upper(self) -> Array:
         """Upper corner (3,), m."""
         return self.lower + np.array(self.shape) * self.resolution
 
@@ -83,17 +84,17 @@ class Lattice:
         """How many cells there are."""
         return math.prod(self.shape)
 
-    def centres(self, indices: ArrayLike) -> NDArray[np.float64]:
+    def centres(self, indices: ArrayLike) -> Array:
         """Centres (..., 3), m, of cell indices (..., 3)."""
         keys = np.asarray(indices, dtype=np.int64) + np.array(self.key_min)
         return np.asarray((keys - KEY_ZERO + 0.5) * self.resolution, np.float64)
 
-    def indices(self, points: ArrayLike) -> NDArray[np.int64]:
+    def indices(self, points: ArrayLike) -> Ints:
         """Indices (..., 3) of the cells that contain points (..., 3), m; may lie outside of the box."""
         p = np.asarray(points, dtype=np.float64)
         return np.floor(p * (1.0 / self.resolution)).astype(np.int64) + (KEY_ZERO - np.array(self.key_min))
 
-    def contains(self, indices: ArrayLike) -> NDArray[np.bool_]:
+    def contains(self, indices: ArrayLike) -> Mask:
         """Whether indices (..., 3) lie in the box."""
         i = np.asarray(indices)
         return np.asarray(((i >= 0) & (i < np.array(self.shape))).all(axis=-1))

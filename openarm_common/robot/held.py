@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
+from openarm_common.types import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,5 +21,5 @@ class HeldBox:
 
     name: str
     link: str
-    T_link_box: NDArray[np.float64]
+    T_link_box: Array
     size: tuple[float, float, float]

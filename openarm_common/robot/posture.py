@@ -11,13 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.types import Array
 
 #: Whether a posture needs the joints: only where the frame moves with them, if they can be had, or always.
 JointNeed = Literal["none", "optional", "required"]
@@ -37,7 +35,7 @@ class Posture:
         lack: Why the joints are not known, where they are optional.
     """
 
-    T_base_frame: NDArray[np.float64]
+    T_base_frame: Array
     joints: Mapping[str, float]
     held: tuple[HeldBox, ...] = ()
     lack: str = ""

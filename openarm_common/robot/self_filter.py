@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from openarm_common.camera.depth_view import DepthView
@@ -21,7 +20,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot import filter_kernels as kernels
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
-from openarm_common.types import Array, Bytes, Ints
+from openarm_common.types import Array, Bytes, Floats, Ints
 
 
 class SelfFilterConfig(Config):
@@ -147,7 +146,7 @@ class SelfFilter:
         )  # fmt: skip
         return label, _named(shapes, counts)
 
-    def label_points(self, points: NDArray[np.float32], shapes: Shapes) -> tuple[Bytes, dict[str, int]]:
+    def label_points(self, points: Floats, shapes: Shapes) -> tuple[Bytes, dict[str, int]]:
         """Find the robot in points (n, 3) of the base frame: labels (n,), and the points that each link took."""
         label = np.zeros(points.shape[0], np.uint8)
         counts = np.zeros(len(shapes.names), np.int64)

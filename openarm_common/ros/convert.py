@@ -24,7 +24,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.held import HeldBox
-from openarm_common.types import Array
+from openarm_common.types import Array, Bytes, Floats
 
 #: encoding: (dtype, channels)
 ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
@@ -166,7 +166,7 @@ def byte_array(data: NDArray[np.generic]) -> array.array[int]:
     return out
 
 
-def rgb_image(message: Image) -> NDArray[np.uint8]:
+def rgb_image(message: Image) -> Bytes:
     """Return a colour image as (height, width, 3), red first; a view where the message has that order.
 
     Raises:
@@ -178,7 +178,7 @@ def rgb_image(message: Image) -> NDArray[np.uint8]:
     return pixels if message.encoding == "rgb8" else np.ascontiguousarray(pixels[..., ::-1])
 
 
-def depth_image(message: Image) -> NDArray[np.uint16] | NDArray[np.float32]:
+def depth_image(message: Image) -> NDArray[np.uint16] | Floats:
     """Return a depth image as (height, width) in counts of its encoding: uint16 mm or float32 m; a view.
 
     Raises:
@@ -223,9 +223,7 @@ def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int) -> Ca
 
 
 # --- clouds
-def cloud_from_points(
-    points: NDArray[np.float32], frame_id: str, t_ns: int, rgb: NDArray[np.uint8] | None = None
-) -> PointCloud2:
+def cloud_from_points(points: Floats, frame_id: str, t_ns: int, rgb: Bytes | None = None) -> PointCloud2:
     """PointCloud2 of points (n, 3) or, organised, (height, width, 3), m; NaN marks an invalid point.
 
     Args:
@@ -254,7 +252,7 @@ def cloud_from_points(
     return message
 
 
-def points_from_cloud(message: PointCloud2) -> NDArray[np.float32]:
+def points_from_cloud(message: PointCloud2) -> Floats:
     """Points (n, 3) or (height, width, 3) of a cloud whose first fields are float32 x, y, z.
 
     Raises:

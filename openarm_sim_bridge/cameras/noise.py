@@ -10,10 +10,10 @@ Depth is planar, m, NaN where invalid.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from openarm_common.config import Config
+from openarm_common.types import Bytes, Floats, Mask
 
 
 class DepthNoiseConfig(Config):
@@ -36,9 +36,7 @@ class ColourNoiseConfig(Config):
     exposure: float = Field(default=1.0, gt=0.0, le=8.0, description="factor of all values; above 255 they clip")
 
 
-def add_depth_noise(
-    z: NDArray[np.float32], focal: float, config: DepthNoiseConfig, rng: np.random.Generator
-) -> NDArray[np.float32]:
+def add_depth_noise(z: Floats, focal: float, config: DepthNoiseConfig, rng: np.random.Generator) -> Floats:
     """Return the depth (height, width) that a camera of this focal length (pixels) would measure."""
     edge, low, high = _edges(z, config.jump)
     out = z.copy()
@@ -57,7 +55,7 @@ def add_depth_noise(
     return out
 
 
-def _edges(z: NDArray[np.float32], jump: float) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
+def _edges(z: Floats, jump: float) -> tuple[Mask, Floats, Floats]:
     """Which pixels have a jump to a neighbour in the row or column; the nearest and the farthest of those around."""
     padded = np.pad(z, 1, mode="edge")
     near = (padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1])
@@ -67,7 +65,7 @@ def _edges(z: NDArray[np.float32], jump: float) -> tuple[NDArray[np.bool_], NDAr
     return np.asarray(high - low > np.float32(jump)), low, high
 
 
-def add_colour_noise(pixels: NDArray[np.uint8], config: ColourNoiseConfig, rng: np.random.Generator) -> None:
+def add_colour_noise(pixels: Bytes, config: ColourNoiseConfig, rng: np.random.Generator) -> None:
     """Make a colour image (height, width, 3) brighter or darker and noisy, in place."""
     if config.sigma == 0.0 and config.exposure == 1.0:
         return

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Floats
 from openarm_sim_bridge.world.world import Snapshot
 
 Colour = NDArray[np.uint8]
@@ -146,7 +147,7 @@ class SnapshotRenderer:
         self._gl.free()
 
 
-def planar_metres(raw: NDArray[np.float32], near: float, far: float) -> NDArray[np.float32]:
+def planar_metres(raw: Floats, near: float, far: float) -> Floats:
     """Distance along the optical axis, m, of a reversed depth buffer; in place.
 
     Args:
@@ -160,7 +161,7 @@ def planar_metres(raw: NDArray[np.float32], near: float, far: float) -> NDArray[
     return np.divide(np.float32(far * near), raw, out=raw)
 
 
-def millimetres(z: NDArray[np.float32]) -> NDArray[np.uint16]:
+def millimetres(z: Floats) -> NDArray[np.uint16]:
     """Whole millimetres, 0 for NaN, of metres below 65; `z` is overwritten."""
     np.multiply(z, np.float32(1000.0), out=z)
     np.add(z, np.float32(0.5), out=z)

@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.types import Array
+from openarm_common.types import Array, Ints
 from openarm_sim_bridge.control.arm import TrajectoryConfig, TrajectoryFollower
 from openarm_sim_bridge.control.follower import Follower
 from openarm_sim_bridge.control.gripper import GripperConfig, GripperFollower
@@ -68,7 +67,7 @@ class RobotController:
             side: GripperFollower(group, gripper, self._targets[at[group]], float(limits[at[group]][0]))
             for side, group in grippers.items()
         }
-        self._followers: list[tuple[Follower, NDArray[np.int64]]] = [
+        self._followers: list[tuple[Follower, Ints]] = [
             (follower, at[follower.group]) for follower in (*self.arms.values(), *self.grippers.values())
         ]
         self._limits = {

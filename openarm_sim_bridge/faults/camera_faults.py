@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.types import Array
 from openarm_sim_bridge.faults.faults import (
     CameraDelay,
     CameraDrop,
@@ -42,7 +43,7 @@ class CameraFaults:
         self._faults: dict[str, Fault] = {}
         self._rngs: dict[str, np.random.Generator] = {}
         self._model: mujoco.MjModel | None = None
-        self._base: dict[str, NDArray[np.float64]] = {}
+        self._base: dict[str, Array] = {}
         self._changed = False
 
     def set(self, faults: Iterable[Fault]) -> None:
@@ -72,7 +73,7 @@ class CameraFaults:
         for i in range(model.ncam):
             model.cam_pos[i], model.cam_quat[i] = self._mount(model.camera(i).name, i)
 
-    def _mount(self, name: str, i: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _mount(self, name: str, i: int) -> tuple[Array, Array]:
         position, quaternion = self._base["cam_pos"][i], self._base["cam_quat"][i]
         knock = self._of(MountKnocked, name)
         if knock is None:

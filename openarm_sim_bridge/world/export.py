@@ -9,13 +9,12 @@ from typing import Any, Literal
 
 import cv2
 import mujoco
-import numpy as np
-from numpy.typing import NDArray
 
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES, RobotDescription
 from openarm_common.scene.scene import load_scene
+from openarm_common.types import Bytes
 from openarm_sim_bridge.world.compiled import start_qpos
 from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, robot_spec
 
@@ -68,7 +67,7 @@ def render(
     view: str = "three_quarter",
     seed: int = 0,
     opening: float = 0.03,
-) -> NDArray[np.uint8]:
+) -> Bytes:
     """Draw robot and scene.
 
     Args:
