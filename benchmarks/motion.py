@@ -199,7 +199,7 @@ def main() -> None:
             arm = arms[problem.arm]
             seen = problem.known.map
             known = Environment(map=None if seen is None else replace(seen))  # nothing of it is worked out yet
-            scene = arm.scene(problem.state, problem.boxes, known=known)
+            scene = arm.scene(problem.state, problem.boxes, environment=known)
             return arm.query(scene, StartState(problem.state, problem.start), problem.goals, 5.0)
 
         return plan_rows(name, problems, query, targets)

@@ -100,7 +100,7 @@ def table_problems(arms: Sequence[Arm], home: Mapping[str, float], count: int, s
         known = rendered(arms[0], home, boxes, int(rng.integers(2**31)))
         for _ in range(min(_A_MAP, count - len(out))):
             arm = arms[len(out) % len(arms)]
-            collides = arm.scene(home, known=known).collides
+            collides = arm.scene(home, environment=known).collides
             goals = around_box(arm, boxes[int(rng.integers(len(boxes)))], rng, collides)
             if goals:
                 out.append(Problem(arm.name, (), home, random_free(arm, rng, collides), np.array(goals), known))

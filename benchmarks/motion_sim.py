@@ -177,7 +177,8 @@ def run_beside(
                 later = {**state, **held.motion.joints_at(held.motion.duration)}
             goals = middle_goals(arm, later, boxes, rng)
             now = replace(
-                arm.start_state(later, scale=float(rng.choice([0.3, 0.5, 1.0]))), known=Environment(apart=_BESIDE)
+                arm.start_state(later, scale=float(rng.choice([0.3, 0.5, 1.0]))),
+                environment=Environment(arm_clearance=_BESIDE),
             )
             try:
                 scene = moves.free_scene(arm, now, moves.RequestBoxes(boxes))

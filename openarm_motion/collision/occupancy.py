@@ -125,13 +125,13 @@ class Environment:
 
     Attributes:
         solids: Bodies of the planning scene.
-        map: What the cameras see.
-        apart: The arms keep at least this distance from each other, m.
+        map: What the cameras observed.
+        arm_clearance: The arms keep at least this distance from each other, m.
     """
 
     solids: tuple[Solid, ...] = ()
     map: OccupancyMap | None = None
-    apart: float = 0.0
+    arm_clearance: float = 0.0
 
 
 #: An empty scene, and no map.

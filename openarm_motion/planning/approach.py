@@ -230,7 +230,9 @@ class _Checks:
         # hands grasp open; a hand that holds something keeps its opening until it lets go
         opened = arm.config.planning.gripper_open
         before = None if request.attached else opened
-        self.free = arm.scene(now.state, request.obstacles, request.attached, gripper=before, known=now.known)
+        self.free = arm.scene(
+            now.state, request.obstacles, request.attached, gripper=before, environment=now.environment
+        )
         arm.relax(self.free, now.start)
         self._approach = arm.scene(
             now.state,
@@ -239,18 +241,20 @@ class _Checks:
             request.touchable,
             straight=True,
             gripper=before,
-            known=now.known,
+            environment=now.environment,
         )
         self._margins = np.full(len(request.targets), np.nan)
         self._carried = [box for box in request.obstacles if box.id in request.touchable]
         if request.attached_after:
             rest = [box for box in request.obstacles if box.id not in request.touchable]
             held = [*request.attached, *self._carried]
-            self._retreat = arm.scene(now.state, rest, held, straight=True, known=now.known)
+            self._retreat = arm.scene(now.state, rest, held, straight=True, environment=now.environment)
         elif request.detached_after:
             boxes = [*request.obstacles, *request.attached]
             ids = request.touchable | {box.id for box in request.attached}
-            self._retreat = arm.scene(now.state, boxes, (), ids, straight=True, gripper=opened, known=now.known)
+            self._retreat = arm.scene(
+                now.state, boxes, (), ids, straight=True, gripper=opened, environment=now.environment
+            )
         else:
             self._retreat = self._approach
 

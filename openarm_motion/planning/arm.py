@@ -57,14 +57,14 @@ class StartState:
         start: (n,) where the arm starts; usually its part of `state`.
         scale: Velocity scale; 0 means the default.
         stopped: Whether the request was cancelled; asked often.
-        known: Bodies of the planning scene and the map.
+        environment: Bodies of the planning scene and the map.
     """
 
     state: Mapping[str, float]
     start: Array
     scale: float = 0.0
     stopped: Callable[[], bool] = never
-    known: Environment = NOTHING
+    environment: Environment = NOTHING
 
 
 class Arm:
@@ -121,7 +121,7 @@ class Arm:
         start: Sequence[float] | Array = (),
         scale: float = 0.0,
         stopped: Callable[[], bool] = never,
-        known: Environment = NOTHING,
+        environment: Environment = NOTHING,
     ) -> StartState:
         """Check and complete what a request starts from; an empty `start` is the present configuration.
 
@@ -134,7 +134,7 @@ class Arm:
             raise OpenArmError(Code.NOT_READY, f"/joint_states lacks {', '.join(missing)}")
         q = self.configuration(start if len(start) else [state[name] for name in self.names], "start", _SAG)
         self.scale(scale)
-        return StartState(dict(state), q, scale, stopped, known)
+        return StartState(dict(state), q, scale, stopped, environment)
 
     def configuration(self, values: Sequence[float] | Array, what: str, tolerance: float = 1e-4) -> Array:
         """Check joint positions and move them into the limits where they are out by no more than `tolerance`.
@@ -183,7 +183,7 @@ class Arm:
         *,
         straight: bool = False,
         gripper: float | None = None,
-        known: Environment = NOTHING,
+        environment: Environment = NOTHING,
     ) -> CollisionScene:
         """Surroundings of the arm with the table in them.
 
@@ -194,12 +194,12 @@ class Arm:
             touchable: Ids of boxes that the fingers may touch.
             straight: Clearance of straight parts instead of free paths.
             gripper: Position of the finger joints instead of the present one, m.
-            known: Bodies of the planning scene, as certain as the table, the map, and the distance of the arms.
+            environment: Bodies of the planning scene, as certain as the table, the map, and the distance of the arms.
         """
         clearance = self.config.straight if straight else self.config.clearance
-        if known.apart > clearance.arms:
-            clearance = clearance.model_copy(update={"arms": known.apart})
-        certain = (*self.static, *known.solids)
+        if environment.arm_clearance > clearance.arms:
+            clearance = clearance.model_copy(update={"arms": environment.arm_clearance})
+        certain = (*self.static, *environment.solids)
         fixed = frozenset(body.id for body in certain)
         return CollisionScene(
             self.robot,
@@ -211,7 +211,7 @@ class Arm:
                 supports=fixed | touchable,
                 fixed=fixed,
                 clearance=clearance,
-                map=known.map,
+                map=environment.map,
             ),
         )
 

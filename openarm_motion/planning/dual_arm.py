@@ -113,7 +113,7 @@ class DualArm:
         boxes: Sequence[Box] = (),
         separation: float = SEPARATION,
         held: tuple[Sequence[Box], Sequence[Box]] = ((), ()),
-        known: Environment = NOTHING,
+        environment: Environment = NOTHING,
     ) -> DualArmScene:
         """Surroundings of both arms with the table in them.
 
@@ -122,9 +122,9 @@ class DualArm:
             boxes: Obstacles, base frame.
             separation: Distance that the arms keep from each other, m.
             held: Boxes held by each arm, its tool frame.
-            known: Bodies of the planning scene and the map.
+            environment: Bodies of the planning scene and the map.
         """
-        scenes = [self.scene_of(i, state, boxes, separation, held, known) for i in range(2)]
+        scenes = [self.scene_of(i, state, boxes, separation, held, environment) for i in range(2)]
         return DualArmScene(scenes[0], scenes[1], self.split)
 
     def scene_of(
@@ -134,12 +134,12 @@ class DualArm:
         boxes: Sequence[Box] = (),
         separation: float = SEPARATION,
         held: tuple[Sequence[Box], Sequence[Box]] = ((), ()),
-        known: Environment = NOTHING,
+        environment: Environment = NOTHING,
     ) -> CollisionScene:
         """Surroundings of one of the arms, the other one in them where `state` says; arguments as `scene`."""
         arm = self.arms[index]
         keep = arm.config.clearance.model_copy(update={"arms": separation})
-        certain = (*arm.static, *known.solids)
+        certain = (*arm.static, *environment.solids)
         fixed = frozenset(body.id for body in certain)
         around = CollisionContext(
             state,
@@ -149,7 +149,7 @@ class DualArm:
             supports=fixed,
             fixed=fixed,
             clearance=keep,
-            map=known.map,
+            map=environment.map,
         )
         return CollisionScene(arm.robot, around)
 
@@ -237,7 +237,7 @@ def plan_together(both: DualArm, now: StartState, wanted: DualArmGoals, time_lim
             CANCELLED.
     """
     end = time.monotonic() + time_limit
-    scene = both.scene(now.state, wanted.obstacles, held=wanted.held, known=now.known)
+    scene = both.scene(now.state, wanted.obstacles, held=wanted.held, environment=now.environment)
     for arm, part, start in zip(both.arms, scene.placed(now.start), both.parts(now.start), strict=True):
         arm.relax(part, start)
     goals = _pairs(scene, wanted.goals)
@@ -364,13 +364,13 @@ def _alone(
 ) -> Trajectory:
     """The path of one arm with the other one where `state` says."""
     arm, start = both.arms[index], both.parts(now.start)[index]
-    scene = both.scene_of(index, state, wanted.obstacles, held=wanted.held, known=now.known)
+    scene = both.scene_of(index, state, wanted.obstacles, held=wanted.held, environment=now.environment)
     arm.relax(scene, start)
     goals = [q for q in wanted.goals[index] if not scene.collides(q)][:_GOALS]
     if not goals:
         contact = scene.contacts(wanted.goals[index][0])[0]
         raise PlanFailedError(Code.IN_COLLISION, f"goal of the {arm.name} arm: {contact}", "goal", contact)
-    mine = StartState(state, start, now.scale, now.stopped, now.known)
+    mine = StartState(state, start, now.scale, now.stopped, now.environment)
     return arm.plan_validated(scene, mine, np.array(goals), time_limit).trajectory
 
 

@@ -87,7 +87,7 @@ def to_pose_on_line(arm: Arm, now: StartState, pose: Array, around: RequestBoxes
     T_start = arm.kinematics.fk(now.start)
     # a start nearer to a limit than the margin may go on as near
     margin = max(0.0, min(arm.config.planning.joint_margin, arm.kinematics.margin(now.start)))
-    scene = arm.scene(now.state, around.obstacles, around.attached, straight=True, known=now.known)
+    scene = arm.scene(now.state, around.obstacles, around.attached, straight=True, environment=now.environment)
     arm.relax(scene, now.start)
     faults: list[PlanFailedError] = []
     for drift in _DRIFTS if not np.isnan(start.swivel) else (0.0,):
@@ -129,7 +129,7 @@ def free_scene(arm: Arm, now: StartState, around: RequestBoxes) -> CollisionScen
     Raises:
         PlanFailedError: IN_COLLISION, when the arm starts in collision.
     """
-    scene = arm.scene(now.state, around.obstacles, around.attached, known=now.known)
+    scene = arm.scene(now.state, around.obstacles, around.attached, environment=now.environment)
     arm.relax(scene, now.start)
     return scene
 

@@ -152,7 +152,7 @@ class PlanningContext:
             occupied = view.occupied
             if occupied is not None:
                 occupied = unexplained(occupied, config, robot, now.state, certain, estimates)
-            return replace(now, state=later, known=Environment(solids, occupied, apart))
+            return replace(now, state=later, environment=Environment(solids, occupied, apart))
 
         # a graph without a map is as it should be; one with an old map is not
         note = f" without the map: {view.why}" if view.why and view.version else ""

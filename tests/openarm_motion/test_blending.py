@@ -15,7 +15,7 @@ from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.planner import PlannedPath
 from openarm_motion.timing import blending
 from openarm_motion.timing.blending import time_blended, time_quintic
-from openarm_motion.timing.trajectory import JointLimits, Trajectory, time_polyline
+from openarm_motion.timing.trajectory import SPACING, JointLimits, Trajectory, time_polyline
 from openarm_motion.timing.validation import validate_trajectory
 
 NAMES = tuple(f"j{i}" for i in range(3))
@@ -37,7 +37,10 @@ def excess(trajectory: Trajectory, limits: JointLimits) -> list[float]:
 def test_blends_hold_limits_and_stay_in_the_corners_triangles(points: list[list[float]]) -> None:
     waypoints = np.array(points)
     trajectory = time_blended(NAMES, waypoints, LIMITS)
-    assert max(excess(trajectory, LIMITS)) <= 1.0 + 2e-3
+    velocity, acceleration, jerk = excess(trajectory, LIMITS)
+    assert max(velocity, jerk) <= 1.0 + 2e-3
+    # borders of pieces nearer to each other than 1 ms are one sample: between samples that is 1 ms of jerk
+    assert acceleration <= 1.0 + SPACING * float(np.max(LIMITS.jerk / LIMITS.acceleration))
     np.testing.assert_allclose(trajectory.q[[0, -1]], waypoints[[0, -1]], atol=1e-9)
     assert not np.any(trajectory.v[[0, -1]])
     assert not np.any(trajectory.a[[0, -1]])

@@ -49,7 +49,7 @@ def test_cells_are_those_at_no_distance(tmp_path: Path) -> None:
 def test_map_is_met_by_both_layers_alike(right: Arm, home: dict[str, float]) -> None:
     rng = np.random.default_rng(4)
     cells = seen(*rng.uniform([0.2, -0.8, 0.4], [0.7, 0.3, 1.0], (40, 3)))
-    exact = right.scene(home, known=Environment(map=cells))
+    exact = right.scene(home, environment=Environment(map=cells))
     boxes = [box_from(f"cell{k}", c, (0.02,) * 3) for k, c in enumerate(cells.centres)]
     as_boxes = right.scene(home, boxes)
     states = rng.uniform(right.kinematics.lower, right.kinematics.upper, (600, 7))
@@ -65,11 +65,11 @@ def test_map_is_met_by_both_layers_alike(right: Arm, home: dict[str, float]) -> 
 def test_plans_go_around_the_map_at_its_own_resolution(right: Arm, home: dict[str, float]) -> None:
     wall_map = wall(-0.21)
     known = Environment(map=wall_map)
-    walled = right.scene(home, known=known)
+    walled = right.scene(home, environment=known)
     poses = [se3.make(DOWN, (0.32, y, 0.62)) for y in (-0.34, -0.08)]
     start, goal = (next(s.q for s in right.inverse.solutions(p, 0.05) if not walled.collides(s.q)) for p in poses)
     free = moves.to_joints(right, right.start_state(home, start.tolist(), 1.0), goal.tolist(), moves.RequestBoxes())
-    now = right.start_state(home, start.tolist(), 1.0, known=known)
+    now = right.start_state(home, start.tolist(), 1.0, environment=known)
     blocked = moves.to_joints(right, now, goal.tolist(), moves.RequestBoxes())
     scene = right.scene(home, [box_from(f"c{k}", c, (0.02,) * 3) for k, c in enumerate(wall_map.centres)])
     with scene.lenient(0.0):
@@ -80,7 +80,7 @@ def test_plans_go_around_the_map_at_its_own_resolution(right: Arm, home: dict[st
 
 def test_a_refusal_says_where_the_map_is_in_the_way(right: Arm, home: dict[str, float]) -> None:
     goal = next(s.q for s in right.inverse.solutions(se3.make(DOWN, (0.32, -0.20, 0.62)), 0.05))
-    now = right.start_state(home, known=Environment(map=seen((0.325, -0.205, 0.605))))
+    now = right.start_state(home, environment=Environment(map=seen((0.325, -0.205, 0.605))))
     with pytest.raises(OpenArmError, match=r"the map at \(0\.33, -0\.21, 0\.61\)") as caught:
         moves.to_joints(right, now, goal.tolist(), moves.RequestBoxes())
     assert caught.value.code == Code.IN_COLLISION
@@ -95,11 +95,11 @@ def test_octree_cell_at_the_gripper_does_not_hold_the_arm(right: Arm, home: dict
         point
         for d in np.arange(0.0, 0.2, 0.002)
         for point in [tip[:3, 3] + tip[:3, 0] * d]
-        if right.scene(home, known=Environment(map=seen(point))).collides(q)
-        and right.scene(home, known=Environment(map=seen(point))).contacts(q)[0].distance > -0.02
+        if right.scene(home, environment=Environment(map=seen(point))).collides(q)
+        and right.scene(home, environment=Environment(map=seen(point))).contacts(q)[0].distance > -0.02
     )
     assert not pad.collides(q)
-    now = right.start_state(home, scale=1.0, known=Environment(map=seen(near)))
+    now = right.start_state(home, scale=1.0, environment=Environment(map=seen(near)))
     goal = right.description.group_state("right_arm", "official_home")
     plan = moves.to_joints(right, now, [goal[name] for name in right.names], moves.RequestBoxes())
     assert plan.duration > 0.5
@@ -130,7 +130,7 @@ def test_bodies_of_every_shape_are_met_by_both_layers(kind: str, right: Arm, hom
         "sphere": Sphere("ball", T, 0.15),
         "mesh": Mesh("rock", T, rng.uniform(-0.15, 0.2, (30, 3))),
     }[kind]
-    exact, empty = right.scene(home, known=Environment((solid,))), right.scene(home)
+    exact, empty = right.scene(home, environment=Environment((solid,))), right.scene(home)
     states = rng.uniform(right.kinematics.lower, right.kinematics.upper, (400, 7))
     truth, alone = (np.array([scene.collides(q) for q in states]) for scene in (exact, empty))
     assert int((truth & ~alone).sum()) > 10
