@@ -93,7 +93,9 @@ class Tab:
         x, y = await self._middle(selector)
         for kind, share in (("mousePressed", 0.0), ("mouseMoved", 0.5), ("mouseMoved", 1.0), ("mouseReleased", 1.0)):
             where = {"x": x + share * right, "y": y + share * down}
-            await self.do("Input.dispatchMouseEvent", type=kind, **where, button="left", buttons=1, clickCount=1)
+            await self.do(
+                "Input.dispatchMouseEvent", type=kind, **where, button="left", buttons=int(share < 1.0), clickCount=1
+            )
 
     async def _middle(self, selector: str) -> tuple[float, float]:
         box = await self.box(selector)
