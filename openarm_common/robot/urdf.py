@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read URDF text into frozen data.
 
-Lengths are metres, angles radians, masses kilograms. ``T_parent_joint`` is the pose of a joint frame in its parent
-link, ``T_link_primitive`` the pose of a shape in its link; a cylinder's axis is its local z.
+Lengths are metres, angles radians; masses, inertias and friction are left to the simulator. ``T_parent_joint`` is the
+pose of a joint frame in its parent link, ``T_link_primitive`` the pose of a shape in its link; a cylinder's axis is its local z.
 """
 
 from __future__ import annotations
@@ -44,12 +44,9 @@ class Primitive:
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A link; centre of mass and inertia (about it) are in link axes. `meshes` names shapes that are not primitives."""
+    """A link; `meshes` names shapes that are not primitives."""
 
     name: str
-    mass: float
-    com: Array
-    inertia: Array
     collision: tuple[Primitive, ...]
     visual: tuple[Primitive, ...]
     meshes: tuple[str, ...] = ()
@@ -75,8 +72,6 @@ class Joint:
     mimic: str | None = None
     multiplier: float = 1.0
     offset: float = 0.0
-    damping: float = 0.0
-    friction: float = 0.0
 
     def motion(self, position: float) -> Array:
         """Pose of the child link in the joint frame, (4, 4)."""
@@ -168,19 +163,6 @@ def _primitive(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Primit
 
 
 def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
-    mass, com, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
-    inertial = element.find("inertial")
-    if inertial is not None:
-        mass_element, tensor = inertial.find("mass"), inertial.find("inertia")
-        if mass_element is None or tensor is None:
-            raise fault(f"link {element.get('name')!r}: <inertial> needs <mass> and <inertia>")
-        mass = floats(attribute(mass_element, "value"), 1, mass_element)[0]
-        xx, xy, xz, yy, yz, zz = (
-            floats(tensor.get(key, "0"), 1, tensor)[0] for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-        )
-        T = _origin(inertial)
-        com = T[:3, 3]
-        inertia = T[:3, :3] @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ T[:3, :3].T
     shapes: dict[str, list[Primitive]] = {"visual": [], "collision": []}
     meshes: list[str] = []
     for tag, found in shapes.items():
@@ -192,9 +174,6 @@ def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
                 found.append(primitive)
     return Link(
         name=attribute(element, "name"),
-        mass=mass,
-        com=com,
-        inertia=inertia,
         collision=tuple(shapes["collision"]),
         visual=tuple(shapes["visual"]),
         meshes=tuple(meshes),
@@ -214,7 +193,6 @@ def _joint(element: ET.Element) -> Joint:
     if kind not in get_args(JointType):
         raise fault(f"joint {name!r} has type {kind!r}; supported: {', '.join(get_args(JointType))}")
     axis_element, limit, mimic = element.find("axis"), element.find("limit"), element.find("mimic")
-    dynamics = element.find("dynamics")
     axis = np.array(
         floats(axis_element.get("xyz", "1 0 0"), 3, axis_element) if axis_element is not None else (1.0, 0.0, 0.0)
     )
@@ -247,6 +225,4 @@ def _joint(element: ET.Element) -> Joint:
         mimic=mimic.get("joint") if mimic is not None else None,
         multiplier=number(mimic, "multiplier", 1.0),
         offset=number(mimic, "offset", 0.0),
-        damping=number(dynamics, "damping", 0.0),
-        friction=number(dynamics, "friction", 0.0),
     )
