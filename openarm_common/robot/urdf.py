@@ -2,7 +2,8 @@
 """Read URDF text into frozen data.
 
 Lengths are metres, angles radians; masses, inertias and friction are left to the simulator. ``T_parent_joint`` is the
-pose of a joint frame in its parent link, ``T_link_primitive`` the pose of a shape in its link; a cylinder's axis is its local z.
+pose of a joint frame in its parent link, ``T_link_primitive`` the pose of a shape in its
+link; a cylinder's axis is its local z.
 """
 
 from __future__ import annotations
