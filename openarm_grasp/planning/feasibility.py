@@ -7,7 +7,7 @@ rad.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Awaitable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,13 +15,75 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
+from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, held_box, obstacle_boxes, propose, target_box
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import other_grasps, place_targets
-from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
+from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace, Trajectory
 from openarm_grasp.robot.skills import Skills
+
+
+def grasp_request(
+    arm: str,
+    offered: Sequence[GraspCandidate],
+    target: Detection,
+    others: Sequence[Detection],
+    config: GraspConfig,
+    now: Detection | None = None,
+) -> PlanGrasp:
+    """What the planner is asked for a grasp.
+
+    Args:
+        arm: Whose.
+        offered: The candidates.
+        target: The object.
+        others: What else stands on the table.
+        config: Parameters.
+        now: The object where it stands until then, when that is elsewhere: the map shows it there.
+    """
+    gone = () if now is None else (target_box(now, config),)
+    return PlanGrasp(arm, tuple(offered), obstacle_boxes(others, config), target_box(target, config), gone)
+
+
+def place_request(
+    arm: str,
+    ways: Sequence[PlaceTarget],
+    target: Detection,
+    others: Sequence[Detection],
+    candidate: GraspCandidate,
+    config: GraspConfig,
+    after: Trajectory | None = None,
+) -> PlanPlace:
+    """What the planner is asked for a place; the map may still show the object where it was.
+
+    Args:
+        arm: Whose.
+        ways: To put the object down.
+        target: The object before the grasp.
+        others: What else stands on the table.
+        candidate: How the hand holds it.
+        config: Parameters.
+        after: Trajectory whose end is the start; None starts at the present joints.
+    """
+    held, stood = held_box(target, candidate, config), (target_box(target, config),)
+    return PlanPlace(arm, tuple(ways), obstacle_boxes(others, config), held, after, stood)
+
+
+async def refusal_of(work: Awaitable[object]) -> OpenArmError | None:
+    """Await a plan; return why it cannot be done, None when it can.
+
+    Raises:
+        OpenArmError: When it was not found out.
+    """
+    try:
+        await work
+    except OpenArmError as error:
+        if error.code not in NO_WAY:
+            raise
+        return error
+    return None
 
 
 class FeasibilityCheck:
@@ -60,9 +122,7 @@ class FeasibilityCheck:
         """
         config = self._context.config
         offered = self._offered(arm, target, others) if offered is None else tuple(offered)
-        gone = () if now is None else (target_box(now, config),)
-        effect = PlanGrasp(arm, offered, obstacle_boxes(others, config), target_box(target, config), gone)
-        plan = await self._robot.plan(effect)
+        plan = await self._robot.plan(grasp_request(arm, offered, target, others, config, now))
         return offered[plan.chosen], plan
 
     def _offered(self, arm: str, target: Detection, others: Sequence[Detection]) -> tuple[GraspCandidate, ...]:
@@ -106,9 +166,8 @@ class FeasibilityCheck:
             try:
                 if not ways:
                     raise OpenArmError(Code.UNREACHABLE, "no other way to put it down is left")
-                held, stood = held_box(target, candidate, config), (target_box(target, config),)
-                obstacles = obstacle_boxes(others, config)
-                end = await self._robot.plan(PlanPlace(arm, tuple(ways), obstacles, held, plan.retreat, stood))
+                request = place_request(arm, ways, target, others, candidate, config, plan.retreat)
+                end = await self._robot.plan(request)
                 return ways[end.chosen]
             except OpenArmError as error:
                 left = other_grasps(left, candidate, error.code, target, yaw)

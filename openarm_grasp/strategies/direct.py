@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from openarm_common.errors import OpenArmError
 from openarm_grasp.planning.arms import ARMS
-from openarm_grasp.planning.feasibility import FeasibilityCheck
-from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.feasibility import FeasibilityCheck, refusal_of
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import GraspOutcome
 from openarm_grasp.strategies.task import Task
@@ -28,11 +26,7 @@ async def direct(task: Task) -> GraspOutcome:
     for arm in ARMS:
         if arm in task.findings.refusals:
             continue
-        try:
-            await feasible.pick_and_place(arm, found.target, found.others, (place,), yaw=asked.place_yaw)
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
+        if await refusal_of(feasible.pick_and_place(arm, found.target, found.others, (place,), yaw=asked.place_yaw)):
             continue
         why = f"the {arm} arm does it alone, from the other side"
         return await pick_and_place(task, replace(asked, arm=arm, why=why))

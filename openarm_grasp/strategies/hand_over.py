@@ -21,7 +21,7 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Detection, Sighting
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import PlaceTarget
-from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
+from openarm_grasp.planning.feasibility import FeasibilityCheck, refusal_of, standing_at
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import clear_spots, grid
 from openarm_grasp.strategies.pick_and_place import pick_and_place
@@ -166,20 +166,18 @@ async def _between(
             break
         found = HandOver(giver, taker, way.position[:2], seen.target.yaw + way.yaw_offset)
         there = standing_at(seen.target, way.position, way.yaw_offset)
-        copes = 0
-        try:
-            for stands in (there, *_around(there, config)):
-                await feasible.pick_and_place(taker, stands, seen.others, (place,), yaw=place_yaw)
-                copes += 1
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
-            fault = error.message
-            useless.append(way)
-            if copes and (best is None or copes > best[0]):
-                best = (copes, found)
-            continue
-        return found
+        refusal, copes = None, -1
+        for stands in (there, *_around(there, config)):
+            copes += 1
+            refusal = await refusal_of(feasible.pick_and_place(taker, stands, seen.others, (place,), yaw=place_yaw))
+            if refusal is not None:
+                break
+        if refusal is None:
+            return found
+        fault = refusal.message
+        useless.append(way)
+        if copes and (best is None or copes > best[0]):
+            best = (copes, found)
     if best is not None:
         return best[1]
     raise OpenArmError(Code.NO_PLAN, f"the {taker} arm could not go on from {len(useless)} places: {fault}")

@@ -18,34 +18,17 @@ import numpy as np
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.verdicts import (
-    GripVerdict,
-    PlaceVerdict,
-    SightVerdict,
-    Verdict,
-    judge_grip,
-    judge_lift,
-    judge_place,
-    judge_sight,
-    judge_still,
-)
+from openarm_grasp.evidence import verdicts
+from openarm_grasp.evidence.verdicts import GripVerdict, PlaceVerdict, SightVerdict, Verdict
 from openarm_grasp.perception.detections import Detection, Frame, Sighting, apart, labels_in_view
 from openarm_grasp.perception.find import find, on_table
+from openarm_grasp.planning import candidates
 from openarm_grasp.planning.arms import ARMS, arm_order, out_of_reach
-from openarm_grasp.planning.candidates import (
-    UP,
-    Box,
-    GraspCandidate,
-    PlaceTarget,
-    held_box,
-    obstacle_boxes,
-    propose,
-    shifted,
-    target_box,
-)
+from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
+from openarm_grasp.planning.feasibility import grasp_request, place_request
 from openarm_grasp.planning.options import NoWayError, Options, not_placeable, options_of, planned
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, placing_error
-from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace
+from openarm_grasp.robot.interface import Frames, Planned
 from openarm_grasp.robot.skills import reraise_stop
 from openarm_grasp.strategies.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.strategies.states import State, check_transition
@@ -459,7 +442,7 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
     where = "({:.3f}, {:.3f}, {:.3f}) m".format(*target.p_base)
     for run.arm in arms:
         shoulder = run.context.shoulders.get(run.arm, (0.0, 0.0))
-        offered = propose(target, run.config, shoulder_xy=shoulder, used=run.used, others=sighting.others)
+        offered = candidates.propose(target, run.config, shoulder_xy=shoulder, used=run.used, others=sighting.others)
         run.options |= options_of(run.arm, offered, target, run.config.approach)
         first = f"{target.label!r} stands at {where}; {len(offered)} ways to grasp it"
         try:
@@ -486,13 +469,12 @@ async def _plan_with(
     run: Run, sighting: Sighting, offered: tuple[GraspCandidate, ...], why: str
 ) -> tuple[Grasp, Planned, str]:
     """Plan with one arm; a grasp after which the object cannot be placed is replaced by another."""
-    arm, request, config, target = run.arm, run.request, run.config, sighting.target
-    obstacles, box = obstacle_boxes(sighting.others, config), target_box(target, config)
+    arm, request, config, target, others = run.arm, run.request, run.config, sighting.target, sighting.others
     while True:
         run.offered = offered
         run.enter(State.PLAN, why)
         try:
-            found = await run.robot.plan(PlanGrasp(arm, offered, obstacles, box))
+            found = await run.robot.plan(grasp_request(arm, offered, target, others, config))
         except OpenArmError as error:
             reraise_stop(error)
             refusals = error.refusals if isinstance(error, NoWayError) else {}
@@ -506,22 +488,22 @@ async def _plan_with(
         if request.place is None and not request.dry_run:
             return grasp, found, chosen
         run.enter(State.PLAN, f"{chosen}; planning the place")
-        held = held_box(target, candidate, config)
         try:
             # From the end of the lift; PLACE plans from where the arm then is.
-            end = await run.robot.plan(PlanPlace(arm, grasp.places, obstacles, held, found.retreat, (box,)))
+            asked = place_request(arm, grasp.places, target, others, candidate, config, found.retreat)
+            end = await run.robot.plan(asked)
         except OpenArmError as error:
             reraise_stop(error)
             run.findings.place_refused = True
             why = f"it could grasp, but not place: {error.message.removeprefix(f'{arm} arm: ')}"
             # Held by other faces or leaning otherwise, it may come to stand where it is wanted.
-            others = other_grasps(offered, candidate, error.code, target, request.place_yaw)
-            dropped = [c for c in offered if c not in others]
+            left = other_grasps(offered, candidate, error.code, target, request.place_yaw)
+            dropped = [c for c in offered if c not in left]
             run.options = not_placeable(run.options, arm, dropped, candidate, Verdict(error.code, why))
             run.grasp = None
-            if not others:
+            if not left:
                 raise NoGraspError(error.code, why) from error
-            offered, why = others, f"{why}; trying another grasp"
+            offered, why = left, f"{why}; trying another grasp"
             continue
         run.place_target = grasp.places[end.chosen]
         return grasp, found, f"{chosen}, place {run.place_target.id}"
@@ -564,7 +546,7 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
         grasp, plan, why = await _correct(run, grasp, plan)
     run.enter(State.MOVE_TO_GRASP, why)
     target = grasp.sighting.target
-    still, why = judge_still(target, (await robot.observe(1)).frames, config.held)
+    still, why = verdicts.judge_still(target, (await robot.observe(1)).frames, config.held)
     if not still and run.suspected is not None and apart(target, run.suspected) < config.detect.agree_within:
         still, why = True, f"{why}; so it seemed before, and it had not: the hand hides a part of it"
     run.suspected = target
@@ -608,9 +590,8 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned) -> tuple[Grasp, Planne
     run.offered = (candidate,)
     run.enter(State.MOVE_TO_PREGRASP, f"{text}; correcting")
     robot.stop_observing()
-    obstacles, box = obstacle_boxes(before.others, run.config), target_box(target, run.config)
     try:
-        corrected = await robot.plan(PlanGrasp(grasp.arm, run.offered, obstacles, box))
+        corrected = await robot.plan(grasp_request(grasp.arm, run.offered, target, before.others, run.config))
     except OpenArmError as error:
         reraise_stop(error)
         return grasp, plan, f"the correction cannot be planned, going on without: {error.message}"
@@ -634,7 +615,7 @@ def second_look(run: Run, grasp: Grasp, seen: Frames) -> tuple[Detection, GraspC
     target = on_table(find(frames, before.label, config.detect).target, run.context.table.top_z)
     # A box that is observed anew may have its edges swapped.
     R = grasp.candidate.T_base_tcp[:3, :3]
-    return target, min(propose(target, config), key=lambda c: se3.angle_between(c.T_base_tcp[:3, :3], R))
+    return target, min(candidates.propose(target, config), key=lambda c: se3.angle_between(c.T_base_tcp[:3, :3], R))
 
 
 # --- grasp
@@ -653,7 +634,7 @@ async def close(run: Run, grasp: Grasp, why: str) -> str:
         await robot.grip(arm, 0.0, "close", run.config.hand.close_effort)
         await robot.wait(timing.after_close)
         evidence = await robot.measure(arm, c.width, c.T_base_tcp, settle=timing.settle_limit)
-        gripper = judge_grip(evidence, run.config.held)
+        gripper = verdicts.judge_grip(evidence, run.config.held)
         if not gripper.ok:
             raise OpenArmError(gripper.grip.code, gripper.reason)
     except OpenArmError as error:
@@ -682,10 +663,10 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[GripVer
         raise
     evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
     frames = (await robot.observe(_LIFT_FRAMES)).frames
-    gripper = judge_grip(evidence, config.held, was_held=True)
+    gripper = verdicts.judge_grip(evidence, config.held, was_held=True)
     radius = config.detect.match_radius
-    camera = judge_sight(sighting.target, frames, config.held, match_radius=radius, others=sighting.others)
-    verdict = judge_lift(gripper, camera)
+    camera = verdicts.judge_sight(sighting.target, frames, config.held, match_radius=radius, others=sighting.others)
+    verdict = verdicts.judge_lift(gripper, camera)
     if not verdict.ok:
         run.hand = Hand.HOLDING if gripper.ok else Hand.AT_OBJECT
         raise OpenArmError(verdict.code, verdict.reason)
@@ -737,10 +718,8 @@ async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why:
     """Plan from where the arm is how to put the object down in one of these ways."""
     run.enter(State.PLACE, why)
     run.robot.stop_observing()
-    sighting, config = grasp.sighting, run.config
-    obstacles, held = obstacle_boxes(sighting.others, config), held_box(sighting.target, grasp.candidate, config)
-    stood = (target_box(sighting.target, config),)
-    plan = await run.robot.plan(PlanPlace(grasp.arm, ways, obstacles, held, gone=stood))
+    found = grasp.sighting
+    plan = await run.robot.plan(place_request(grasp.arm, ways, found.target, found.others, grasp.candidate, run.config))
     return plan, ways[plan.chosen]
 
 
@@ -754,7 +733,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
     try:
         await robot.follow(arm, plan.transfer, "carry", carrying=True)
         evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
-        gripper = judge_grip(evidence, config.held, was_held=True)
+        gripper = verdicts.judge_grip(evidence, config.held, was_held=True)
         if not gripper.ok:
             raise OpenArmError(Code.GRASP_LOST, f"lost on the way: {gripper.reason}")
         run.enter(State.PLACE, gripper.reason)
@@ -818,26 +797,28 @@ async def _leave(run: Run, grasp: Grasp, placed: Placed | None) -> None:
     arm, robot, config, T_base_tcp = grasp.arm, run.robot, run.config, grasp.candidate.T_base_tcp
     if placed is not None:
         if run.hand is Hand.RELEASED:
-            T_away = shifted(placed.target.T_base_tcp, placed.target.retreat_offset)
+            T_away = candidates.shifted(placed.target.T_base_tcp, placed.target.retreat_offset)
             await robot.move_linear(arm, T_away, "leave")
         return
     at_object = run.hand is not Hand.FREE
     if run.hand is Hand.HOLDING:
-        await robot.move_linear(arm, shifted(T_base_tcp, config.place.release_height * UP), "put back")
+        await robot.move_linear(
+            arm, candidates.shifted(T_base_tcp, config.place.release_height * candidates.UP), "put back"
+        )
         run.hand = Hand.AT_OBJECT
     await robot.grip(arm, config.hand.opening, "open")
     await robot.wait(config.timing.after_release)
     if at_object:
-        await robot.move_linear(arm, shifted(T_base_tcp, grasp.candidate.approach_offset), "back off")
+        await robot.move_linear(arm, candidates.shifted(T_base_tcp, grasp.candidate.approach_offset), "back off")
 
 
-def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[Box, ...]:
+def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[candidates.Box, ...]:
     """What the way home keeps clear of; where a lost object lies is not known."""
-    others = obstacle_boxes(grasp.sighting.others, run.config)
+    others = candidates.obstacle_boxes(grasp.sighting.others, run.config)
     if placed is None:
         return others
-    held = held_box(grasp.sighting.target, grasp.candidate, run.config)
-    return (*others, Box(f"placed/{run.label}", placed.target.T_base_tcp @ held.T_frame_box, held.size))
+    held = candidates.held_box(grasp.sighting.target, grasp.candidate, run.config)
+    return (*others, candidates.Box(f"placed/{run.label}", placed.target.T_base_tcp @ held.T_frame_box, held.size))
 
 
 async def verify(run: Run, placed: Placed) -> PlaceVerdict:
@@ -862,4 +843,4 @@ async def verify(run: Run, placed: Placed) -> PlaceVerdict:
     if error is not None:
         run.task.session.drift.add(config.camera, *error)
     p_target, yaw = placed.target.position, run.request.place_yaw
-    return judge_place(run.label, p_target, frames, config.place.tolerance, yaw, run.height)
+    return verdicts.judge_place(run.label, p_target, frames, config.place.tolerance, yaw, run.height)

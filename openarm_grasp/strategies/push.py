@@ -25,10 +25,10 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Detection, Sighting
 from openarm_grasp.perception.find import find
 from openarm_grasp.planning.arms import ARMS, arm_order
-from openarm_grasp.planning.candidates import UP, GraspCandidate, obstacle_boxes, shifted, target_box
-from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
+from openarm_grasp.planning.candidates import UP, GraspCandidate, shifted
+from openarm_grasp.planning.feasibility import FeasibilityCheck, grasp_request, refusal_of, standing_at
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.robot.interface import PlanGrasp, Planned
+from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import Feasible, GraspOutcome
@@ -116,14 +116,10 @@ async def _taker(task: Task, found: Sighting, end: Array) -> str:
     """The arm that grasps the object there."""
     feasible, fault = FeasibilityCheck(task.robot, task.context), OpenArmError(Code.UNREACHABLE, "no arm")
     for arm in arm_order("auto", float(end[1]), task.context.config.approach.overlap_half_width):
-        try:
-            await feasible.pick(arm, standing_at(found.target, end), found.others, now=found.target)
-        except OpenArmError as error:
-            if error.code not in NO_WAY:
-                raise
-            fault = error
-            continue
-        return arm
+        refusal = await refusal_of(feasible.pick(arm, standing_at(found.target, end), found.others, now=found.target))
+        if refusal is None:
+            return arm
+        fault = refusal
     raise fault
 
 
@@ -135,9 +131,8 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
         if not ways:
             faults.append(f"{arm} hand: {found.target.label!r} would tip over")
             continue
-        request = PlanGrasp(arm, ways, obstacle_boxes(found.others, config), target_box(found.target, config))
         try:
-            plan = await robot.plan(request)
+            plan = await robot.plan(grasp_request(arm, ways, found.target, found.others, config))
         except OpenArmError as error:
             if error.code not in NO_WAY:
                 raise
