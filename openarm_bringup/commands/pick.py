@@ -63,11 +63,17 @@ def pick(
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--phase {phase} is of one object; two are picked and placed")
     join_graph(domain)
     labels, spots = _resolve(labels, spots)
-    from openarm_grasp.ros.answers import Wanted
     from openarm_grasp.ros.client import GraspClient
+    from openarm_grasp.strategies.request import GraspRequest
 
     wanted = [
-        Wanted(name, which or "auto", where, None if turn is None else math.radians(turn), spot)
+        GraspRequest(
+            name,
+            which or "auto",
+            where,
+            place_yaw=None if turn is None else math.radians(turn),
+            object_at=spot,
+        )
         for name, which, where, turn, spot in zip(labels, arms, places, yaws, spots, strict=True)
     ]
     show = _Steps(labels)

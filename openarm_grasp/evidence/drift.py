@@ -2,7 +2,7 @@
 """Watches what grasps say about a camera: a mount that has moved shows as the same bias in grasp after grasp.
 
 A closing hand centres the object between its fingers, wherever the camera thought it was. So along the opening axis
-the hand knows where it puts the object down, and what the camera sees there beside it is the camera's own error in
+the hand knows where it puts the object down, and what the camera sees there next to it is the camera's own error in
 that direction. Across that axis the object keeps the error it was grasped with, and nothing is learned. Each placed
 object measures one direction; turned hands measure the others. Base frame, m.
 """
@@ -24,7 +24,7 @@ class Drift:
 
     Attributes:
         camera: Which.
-        bias: (2,) mean residual, base frame, m: where the camera sees things, less where they are.
+        bias: (2,) mean residual, base frame, m: where the camera sees objects, less where they are.
         error: (2,) its standard error, m.
         grasps: How many.
         alarm: The bias is large and sure.
@@ -72,7 +72,7 @@ class DriftWatch:
     def of(self, camera: str) -> Drift:
         """What is known of a camera.
 
-        The bias is the least-squares solution of all measurements, each of which tells one direction; a little damping
+        The bias is the least-squares solution of all measurements, each of one direction; a little damping
         keeps a direction that no grasp has measured at zero.
         """
         seen = self._seen.get(camera, deque[tuple[Array, float]]())

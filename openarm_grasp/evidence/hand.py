@@ -68,7 +68,7 @@ class HandReader:
             expected: Width of the object between the fingers, m.
             effort: Of the finger joint, N.
             T_base_planned: (4, 4) where the TCP should be; None leaves its error 0.
-            pads: Force on each finger pad, N; empty when no sensor tells it.
+            pads: Force on each finger pad, N; empty without a sensor.
         """
         error = 0.0
         if T_base_planned is not None:
@@ -85,7 +85,7 @@ class Silence:
     """How long the robot has said nothing, by a wall clock that is passed in.
 
     A process that was starved of CPU finds old joint states and a clock that has run on; that is not the robot's
-    silence. So time between two looks counts only up to `largest_step`.
+    silence. So time between two updates counts only up to `largest_step`.
 
     Args:
         largest_step: s.
@@ -98,7 +98,7 @@ class Silence:
         self.seconds = 0.0
         self.went_back = False
 
-    def look(self, now_s: float, newest_ns: int) -> None:
+    def update(self, now_s: float, newest_ns: int) -> None:
         """Note the newest stamp of a joint state (-1: none yet) at a time of the wall clock."""
         step = 0.0 if self._looked_at is None else min(now_s - self._looked_at, self._largest_step)
         self._looked_at = now_s

@@ -25,7 +25,7 @@ YAW_TOLERANCE = float(np.radians(15.0))
 UPRIGHT_WITHIN = 0.006
 #: What is farther from an object is another one, or the hand hides it, m.
 _ELSEWHERE = 0.10
-#: Edges of a footprint that differ by less are taken for equal, m; what is round looks so, too.
+#: Edges of a footprint that differ by less are taken for equal, m; those of what is round are, too.
 SQUARE_WITHIN = 0.006
 
 
@@ -39,7 +39,7 @@ class Evidence:
         effort: Force of the finger actuator, N, any sign.
         speed: Of the gap, m/s, any sign.
         tcp_error: Distance of the TCP from the planned grasp, m.
-        pads: Force on each finger pad, N; empty when no sensor tells it.
+        pads: Force on each finger pad, N; empty without a sensor.
     """
 
     gap: float

@@ -16,7 +16,7 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.types import Array
 
-#: An object that is meant by its position stands no farther from it than this, m.
+#: An object that is chosen by its position is no farther from it than this, m.
 SAME_PLACE = 0.05
 
 
@@ -137,7 +137,7 @@ def average(track: Sequence[Detection]) -> Detection:
         quarter_turns = round((d.yaw - reference.yaw) / (np.pi / 2.0))
         yaws.append(d.yaw - quarter_turns * np.pi / 2.0 - reference.yaw)
         sizes.append(d.size[[1, 0, 2]] if quarter_turns % 2 else d.size)
-    # Round things have no yaw of their own: their frames disagree by up to 45°, and any value is right.
+    # Round objects have no yaw of their own: their frames disagree by up to 45°, and any value is right.
     yaw = reference.yaw + float(np.mean(yaws))
     p = np.mean([d.p_base for d in track], axis=0)
     score = float(np.mean([d.score for d in track]))

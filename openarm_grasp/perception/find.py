@@ -30,10 +30,10 @@ def find(
         label: What to look for; "" takes any.
         limits: How near detections must be to be one object, and how much it may seem to move.
         at: (x, y) where it stands, m; None takes the detection with the highest score.
-        leave: (x, y) of objects that are not meant, m.
+        leave: (x, y) of objects that are excluded, m.
 
     Raises:
-        OpenArmError: NOTHING_DETECTED, when no frame holds anything, or what is meant cannot be measured;
+        OpenArmError: NOTHING_DETECTED, when no frame holds anything, or the chosen one cannot be measured;
             UNKNOWN_OBJECT, naming what is in view; STALE_DATA, when the object was not in the newest frame and two
             thirds of all, or moved between them.
     """
@@ -71,26 +71,26 @@ def find(
 
 
 def _anchor(frame: Frame, label: str, at: Sequence[float] | None, leave: Sequence[Sequence[float]]) -> Detection:
-    """The detection that is meant."""
+    """The detection of the object that is asked for."""
     name = label or "the object"
     fitting = [d for d in frame.detections if not label or d.label == label]
     if not fitting:
         raise OpenArmError(Code.STALE_DATA, f"{name!r} was in view, but not in the newest frame")
-    meant = [d for d in fitting if all(_from(d, p) > SAME_PLACE for p in leave)]
-    if not meant:
+    chosen = [d for d in fitting if all(_from(d, p) > SAME_PLACE for p in leave)]
+    if not chosen:
         raise OpenArmError(
             Code.UNKNOWN_OBJECT, f"no {name!r} in view besides {len(fitting)} that shall stay where they are"
         )
     if at is not None:
-        near = [d for d in meant if _from(d, at) <= SAME_PLACE]
+        near = [d for d in chosen if _from(d, at) <= SAME_PLACE]
         if not near:
-            there = ", ".join(_text(d.p_base) for d in meant)
+            there = ", ".join(_text(d.p_base) for d in chosen)
             limit = f"within {SAME_PLACE * 1e3:.0f} mm of ({at[0]:.3f}, {at[1]:.3f}) m"
             raise OpenArmError(Code.UNKNOWN_OBJECT, f"no {name!r} {limit}; it is seen at {there}")
-        meant = [min(near, key=lambda d: _from(d, at))]
-    measured = [d for d in meant if d.measured]
+        chosen = [min(near, key=lambda d: _from(d, at))]
+    measured = [d for d in chosen if d.measured]
     if not measured:
-        raise _not_measured(meant[0])
+        raise _not_measured(chosen[0])
     return max(measured, key=lambda d: d.score)
 
 

@@ -31,7 +31,7 @@ _TILT_COST_PER_RAD = 2.0
 _WIDTH_WEIGHT = 0.15
 _SIDE_WEIGHT = 0.15
 _ROOM_WEIGHT = 0.15
-#: More room than this beside a finger is as good as this, m.
+#: More clearance of a finger than this is as good as this, m.
 _ROOM = 0.04
 #: Half of a finger's thickness, m.
 _FINGER = 0.010

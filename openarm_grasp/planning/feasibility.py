@@ -177,7 +177,7 @@ class FeasibilityCheck:
 
 
 def standing_at(target: Detection, xy: Sequence[float] | Array, turn: float = 0.0) -> Detection:
-    """The object as it would be seen elsewhere, turned by `turn` about the vertical; what is round looks the same."""
+    """The object as it would be observed elsewhere, turned by `turn` about the vertical unless it is round."""
     p = np.array([xy[0], xy[1], target.p_base[2]])
     turn = 0.0 if target.round else turn
     return replace(target, T_base_object=se3.make(se3.rot_z(turn) @ target.T_base_object[:3, :3], p))

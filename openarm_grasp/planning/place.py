@@ -2,7 +2,7 @@
 """Where to put an object down, and how the hand stands there.
 
 The object keeps its place in the hand: ``T_base_tcp(place) = T_base_object(place) @ inv(T_base_object(grasp)) @
-T_base_tcp(grasp)``. It is let go a hair above touching, and its yaw is free, so that a hand that could not stand one
+T_base_tcp(grasp)``. It is released just above the table, and its yaw is free, so that a hand that could not stand one
 way may stand another.
 """
 

@@ -34,12 +34,12 @@ class ArmCoordination:
 
     Attributes:
         waiting: Arms that wait until the other goes on.
-        looking: The arm that observes; "" when none does.
+        observing: The arm that observes; "" when none does.
         done: Arms whose work has ended.
     """
 
     waiting: set[str] = field(default_factory=set[str])
-    looking: str = ""
+    observing: str = ""
     done: set[str] = field(default_factory=set[str])
 
 
@@ -77,18 +77,20 @@ class CoordinatedRobot:
     async def observe(self, count: int, *, near: bool = False) -> Frames:
         """Frames that are taken from now on.
 
-        An arm that looks from home (at what it is to grasp, or has placed) waits until the other one hides nothing any
+        An arm that observes from home (what it is to grasp, or has placed) waits until the other one hides nothing any
         more; one that is at work does not.
         """
         coordination, limit = self._coordination, self._config.limits.beside_timeout
         if not near and self._is_home(self.arm):
-            await self._robot.until(self._other_is_away, limit, f"looking: the {self._other} arm is in the view")
-        await self._robot.until(lambda: coordination.looking in ("", self.arm), limit, "looking: the other arm's look")
-        coordination.looking = self.arm
+            await self._robot.until(self._other_is_away, limit, f"observing: the {self._other} arm is in the view")
+        await self._robot.until(
+            lambda: coordination.observing in ("", self.arm), limit, "observing: the other arm observes"
+        )
+        coordination.observing = self.arm
         try:
             return await self._robot.observe(count, near=near)
         finally:
-            coordination.looking = ""
+            coordination.observing = ""
             self._robot.stop_observing()
 
     def stop_observing(self) -> None:
@@ -140,7 +142,7 @@ class CoordinatedRobot:
 
         coordination.waiting.add(self.arm)
         try:
-            text = f"{what}: the {self._other} arm stands in the way"
+            text = f"{what}: the {self._other} arm is in the way"
             await self._robot.until(over, self._config.limits.beside_timeout, text)
         finally:
             coordination.waiting.discard(self.arm)

@@ -184,7 +184,7 @@ class Skills:
         """Distance between the fingers, m.
 
         Raises:
-            OpenArmError: NOT_READY, when no joint state tells it.
+            OpenArmError: NOT_READY, without a joint state of it.
         """
         return self._hands[arm].gap()
 

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What users of the client ask for, and what they are told. Base frame, m, rad."""
+"""Answers of the client. Base frame, m, rad."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from openarm_common.errors import Answer
@@ -36,26 +35,6 @@ class GraspResult(Answer):
     duration: float
     route: str = ""
     options: tuple[Option, ...] = ()
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """One of two objects that are picked at once.
-
-    Attributes:
-        label: What to pick.
-        arm: "auto", "left" or "right".
-        place: (x, y) or (x, y, z) of the footprint centre, base frame, m; z is not read. None lets a free spot be
-            chosen.
-        place_yaw: Of the object's x axis about the base z where it is put down, rad; None: as the hand likes.
-        object_at: (x, y) near which the object stands, base frame, m, when there are several alike.
-    """
-
-    label: str
-    arm: str = "auto"
-    place: Sequence[float] | None = None
-    place_yaw: float | None = None
-    object_at: Sequence[float] | None = None
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ from openarm_interfaces.msg import GraspStatus, PickAnswer, PickRequest
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
 from openarm_common.ros.convert import point, xyz
-from openarm_grasp.ros.answers import GraspResult, PairResult, Wanted
+from openarm_grasp.ros.answers import GraspResult, PairResult
 from openarm_grasp.ros.messages import option_from_msg
+from openarm_grasp.strategies.request import GraspRequest
 
 OnFeedback = Callable[[GraspStatus], None]
 
@@ -22,7 +23,7 @@ OnFeedback = Callable[[GraspStatus], None]
 class GraspClient(BackgroundNode):
     """Asks the grasp node; a context manager.
 
-    It brings its own ROS context, node and background thread, so it also works beside an rclpy program.
+    It brings its own ROS context, node and background thread, so it also works next to an rclpy program.
 
     Args:
         timeout: Longest wait for the grasp node to be there and to answer, s of wall clock.
@@ -57,7 +58,7 @@ class GraspClient(BackgroundNode):
             arm: "auto", "left" or "right".
             place: (x, y) or (x, y, z) of the footprint centre, base frame, m; z is not read. None lets a free spot be
                 chosen.
-            place_yaw: Of the object's x axis about the base z where it is put down, rad; None: as the hand likes.
+            place_yaw: Of the object's x axis about the base z where it is put down, rad; None: unconstrained.
             object_at: (x, y) near which the object stands, base frame, m, when there are several alike.
             leave: (x, y) of objects that stay where they are.
             phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
@@ -80,8 +81,8 @@ class GraspClient(BackgroundNode):
 
     def pick_two(
         self,
-        first: str | Wanted,
-        second: str | Wanted,
+        first: str | GraspRequest,
+        second: str | GraspRequest,
         *,
         dry_run: bool = False,
         time_limit: float = 0.0,
@@ -91,7 +92,7 @@ class GraspClient(BackgroundNode):
         """Pick two objects and place them, with both arms at the same time where planning allows that.
 
         Args:
-            first: A label, or more about what is wanted.
+            first: A label, or a request with label, arm, place, place_yaw and object_at.
             second: Another.
             dry_run: Plan and report, do not move.
             time_limit: s of robot time for both; then they end with TIMEOUT, hands keeping what they hold. 0: none.
@@ -107,9 +108,9 @@ class GraspClient(BackgroundNode):
         """
         goal = PickTwo.Goal(dry_run=dry_run, timeout=time_limit)
         for request, wanted in zip(goal.requests, (first, second), strict=True):
-            wish = Wanted(wanted) if isinstance(wanted, str) else wanted
-            request.label, request.arm = wish.label, wish.arm
-            _where(request, wish.place, wish.place_yaw, wish.object_at)
+            asked = GraspRequest(wanted) if isinstance(wanted, str) else wanted
+            request.label, request.arm = asked.label, asked.arm
+            _where(request, asked.place, asked.place_yaw, asked.object_at)
         answer: PickTwo.Result = self._ask(PickTwo, "/grasp/pick_two", goal, timeout, on_feedback)
         return PairResult(
             success=answer.success,

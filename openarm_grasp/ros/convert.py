@@ -49,7 +49,7 @@ def frame_from_msg(message: Detection3DArray) -> Frame:
 
 # --- planning
 def box_to_msg(box: Box) -> CollisionBox:
-    """A collision box; its frame is the user's affair."""
+    """A collision box; its frame is that of its user."""
     return CollisionBox(id=box.id, pose=matrix_to_pose(box.T_frame_box), size=vector(box.size))
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The other nodes while a grasp runs: joint states, detections, action goals, and waits that always end.
 
-A wait ends by its condition, by a deadline of the wall clock, by a cancel, or because the robot went silent; it looks
-40 times a second. Robot time is the stamp of the joint states, so the node needs no /clock. /joint_states is subscribed
-only while a grasp runs, /detections_3d only in states that look.
+A wait ends by its condition, by a deadline of the wall clock, by a cancel, or because the robot went silent; checked 40
+times a second. Robot time is the stamp of the joint states, so the node needs no /clock. /joint_states is subscribed
+only while a grasp runs, /detections_3d only in states that observe.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _TICK_S = 0.025
 #: A longer pause between two ticks is this process being starved, not the robot being silent.
 _STARVED_S = 0.2
 _STOP_LIMIT_S = 2.0
-#: An action server that is not in the graph at so many looks in a row is gone (1.5 s; a lost robot is noticed sooner).
+#: An action server that is not in the graph at so many checks in a row is gone (1.5 s; a lost robot is noticed sooner).
 _GONE = 60
 
 
@@ -55,7 +55,7 @@ class GraphClients:
         self._topic = DETECTIONS
         self._frames: list[Frame] = []
         self._frame_id = BASE_FRAME
-        self._looking_since_ns = 0
+        self._observing_since_ns = 0
         self._next_tick = Future()
         self._timer = node.create_timer(_TICK_S, self._on_tick, clock=node.steady_clock)
         self._timer.cancel()
@@ -99,10 +99,10 @@ class GraphClients:
     @property
     def now_ns(self) -> int:
         """Robot time; 0 before the first joint state."""
-        return self.robot.buffer.latest()[0] if self.hears_joints else 0
+        return self.robot.buffer.latest()[0] if self.has_joint_states else 0
 
     @property
-    def hears_joints(self) -> bool:
+    def has_joint_states(self) -> bool:
         """Whether a joint state has come since `begin`."""
         return self.robot.age_s() < float("inf")
 
@@ -112,7 +112,7 @@ class GraphClients:
 
     # --- waiting
     def _on_tick(self) -> None:
-        self._silence.look(time.monotonic(), self.now_ns if self.hears_joints else -1)
+        self._silence.update(time.monotonic(), self.now_ns if self.has_joint_states else -1)
         done, self._next_tick = self._next_tick, Future()
         done.set_result(None)
 
@@ -199,7 +199,7 @@ class GraphClients:
             raise
         return result.result().result
 
-    # --- looking
+    # --- observing
     async def observe(self, count: int, topic: str, limit: float) -> Frames:
         """Collect frames of detections that are taken from now on; `limit` is s of wall clock.
 
@@ -207,10 +207,10 @@ class GraphClients:
             OpenArmError: STALE_DATA, when they do not come; CANCELLED; ROBOT_LOST.
         """
         self._frames = []
-        self._looking_since_ns = self.now_ns
+        self._observing_since_ns = self.now_ns
         self._look(topic)
         try:
-            await self.until(lambda: len(self._frames) >= count, limit, "looking")
+            await self.until(lambda: len(self._frames) >= count, limit, "observing")
         except OpenArmError as error:
             if error.code is not Code.TIMEOUT:
                 raise
@@ -227,7 +227,7 @@ class GraphClients:
 
     def _on_detections(self, message: Detection3DArray) -> None:
         # What the camera took before this look began shows another state of the world.
-        if stamp_to_ns(message.header.stamp) < self._looking_since_ns:
+        if stamp_to_ns(message.header.stamp) < self._observing_since_ns:
             return
         try:
             self._frames.append(convert.frame_from_msg(message))

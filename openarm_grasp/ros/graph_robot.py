@@ -85,7 +85,7 @@ class GraphRobot:
             "action /motion/execute (motion node)": self._execute.server_is_ready(),
             "action /motion/move (motion node)": self._move.server_is_ready(),
             "publisher of /detections_3d (detector)": self._nodes.sees(DETECTIONS),
-            "/joint_states (bridge or robot driver)": self._nodes.hears_joints,
+            "/joint_states (bridge or robot driver)": self._nodes.has_joint_states,
         }
         if moves:
             for arm, client in self._grippers.items():
@@ -131,7 +131,7 @@ class GraphRobot:
         """Write a warning into the log."""
         self._node.get_logger().warning(text)
 
-    # --- waiting and looking
+    # --- waiting and observing
     async def until(
         self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
     ) -> None:
@@ -147,7 +147,7 @@ class GraphRobot:
         return look
 
     async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
-        """Carry out several things at once."""
+        """Carry out several coroutines at once."""
         executor = self._node.executor
         if executor is None:
             raise OpenArmError(Code.INTERNAL, "the grasp node is not in an executor")

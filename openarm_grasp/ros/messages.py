@@ -29,9 +29,9 @@ _OFFERED = ColorRGBA(r=0.4, g=0.5, b=0.9, a=0.35)
 
 # --- requests and answers
 def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
-    """The user's wish; a service request and an action goal have the same fields."""
+    """The request of a user; a service request and an action goal have the same fields."""
     return replace(
-        _wish(message),
+        _request(message),
         dry_run=message.dry_run,
         phase=message.phase or "all",
         timeout=message.timeout,
@@ -40,13 +40,13 @@ def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
 
 
 def requests_from_msg(goal: PickTwo.Goal) -> tuple[GraspRequest, GraspRequest]:
-    """Two wishes at once."""
-    first, second = (replace(_wish(item), dry_run=goal.dry_run, timeout=goal.timeout) for item in goal.requests)
+    """Two requests at once."""
+    first, second = (replace(_request(item), dry_run=goal.dry_run, timeout=goal.timeout) for item in goal.requests)
     return first, second
 
 
-def _wish(message: Grasp.Request | Pick.Goal | PickRequest) -> GraspRequest:
-    """What all of them say of an object and its place."""
+def _request(message: Grasp.Request | Pick.Goal | PickRequest) -> GraspRequest:
+    """What all of them have in common."""
     p, at = message.place_position, message.object_position
     return GraspRequest(
         label=message.label,
@@ -101,7 +101,7 @@ def option_from_msg(message: GraspOption) -> Option:
 
 
 def pair_result(outcome: PairOutcome) -> PickTwo.Result:
-    """The answer to two wishes."""
+    """The answer to two requests."""
     result = PickTwo.Result(
         success=outcome.success,
         outcome=outcome.kind,

@@ -2,7 +2,7 @@
 """Hand-over through the middle: one arm puts the object down where both reach, the other takes it from there.
 
 It is planned before anything moves: the giver's grasp and a place in the middle, and from that place the taker's
-grasp and the place that was asked for. An object is seldom set down exactly where it was meant, so the taker must be
+grasp and the place that was asked for. An object is seldom put down exactly at its target, so the taker must be
 able to go on from around that place, too. Base frame, m, rad.
 """
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Orders of several objects: which to pick next and where to put it, until nothing is left or nothing can be done.
 
-No ROS: whoever carries requests out (the client, a campaign) asks `Order.next` what to ask for and tells `Order.done`
+No ROS: the client or a campaign takes the next request from `Order.next` and reports to `Order.done`
 what came of it. Bins are rectangles on the table, base frame, m.
 """
 

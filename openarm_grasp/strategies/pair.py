@@ -151,7 +151,7 @@ async def simultaneous(pair: Pair) -> PairOutcome | None:
         OpenArmError: CANCELLED, TIMEOUT or ROBOT_LOST, when they ended before an object was touched.
     """
     first, second = pair.requests
-    pair.note(f"asked for {first.label!r} and {second.label!r} at once: looking at both")
+    pair.note(f"asked for {first.label!r} and {second.label!r} at once: observing both")
     arms, pair.reason = await _arms_for_both(pair)
     pair.note(pair.reason)
     if not arms:

@@ -3,7 +3,7 @@
 
 `_attempts` is the strategy from beginning to end; the functions below it are its steps, in their order. A step that
 does not succeed raises. What fails with the arm ends the attempt: the hand goes home, and the next attempt observes
-anew and prefers another grasp. Success is said in one place, `succeeded`, from what gripper and camera tell.
+anew and prefers another grasp. Success is said in one place, `succeeded`, from the verdicts on gripper and camera.
 Base frame, m.
 """
 
@@ -570,16 +570,16 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned) -> tuple[Grasp, Planne
     Whatever keeps the second observation from helping, the grasp goes on with what is known.
     """
     near, robot, before = run.config.near, run.robot, grasp.sighting
-    run.enter(State.MOVE_TO_PREGRASP, f"the open hand is before the object; looking with the {near.camera} camera")
+    run.enter(State.MOVE_TO_PREGRASP, f"the open hand is before the object; observing with the {near.camera} camera")
     try:
         seen = await robot.observe(near.frames, near=True)
     except OpenArmError as error:
         reraise_stop(error)
-        return grasp, plan, f"no second look: {error.message}"
+        return grasp, plan, f"no second observation: {error.message}"
     try:
         target, candidate = second_look(run, grasp, seen)
     except OpenArmError as error:
-        return grasp, plan, f"the second look does not help: {error.message}"
+        return grasp, plan, f"the second observation does not help: {error.message}"
     dx, dy, _ = target.p_base - before.target.p_base
     size = float(np.hypot(dx, dy))
     text = f"the {near.camera} camera sees it {size * 1e3:.1f} mm off ({dx * 1e3:+.1f}, {dy * 1e3:+.1f})"
@@ -597,7 +597,7 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned) -> tuple[Grasp, Planne
         return grasp, plan, f"the correction cannot be planned, going on without: {error.message}"
     grasp = run.grasp = replace(grasp, candidate=candidate)
     run.enter(State.MOVE_TO_PREGRASP, f"correcting to {candidate.id}")
-    await robot.follow(grasp.arm, corrected.transfer, "move to where it was seen from near")
+    await robot.follow(grasp.arm, corrected.transfer, "correct the pre-grasp")
     return grasp, corrected, "the open hand is before the object"
 
 
@@ -827,7 +827,7 @@ async def verify(run: Run, placed: Placed) -> PlaceVerdict:
     Raises:
         OpenArmError: PLACE_FAILED, when no frame comes.
     """
-    config, robot, text = run.config, run.robot, "home; looking at the place"
+    config, robot, text = run.config, run.robot, "home; observing the place"
     frames: tuple[Frame, ...] = ()
     for _ in range(config.detect.attempts):
         run.enter(State.RESET, text)
@@ -838,7 +838,7 @@ async def verify(run: Run, placed: Placed) -> PlaceVerdict:
             raise OpenArmError(Code.PLACE_FAILED, f"put down, but not seen since: {error.message}") from error
         if run.label in labels_in_view(frames):
             break
-        text = f"{run.label!r} is not in view after the place; looking again"
+        text = f"{run.label!r} is not in view after the place; observing again"
     error = placing_error(run.label, placed.target, frames[-1]) if frames else None
     if error is not None:
         run.task.session.drift.add(config.camera, *error)

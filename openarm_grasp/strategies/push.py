@@ -180,7 +180,7 @@ async def carry_out_push(task: Task, planned: Push, label: str, number: int) -> 
     moved, off = (float(np.hypot(*(p - q))) for q in (planned.start, planned.end))
     text = (
         f"push {number} by the {arm} hand moved it {moved * 1e3:.0f} mm to ({x:.3f}, {y:.3f}) m, {off * 1e3:.0f} mm"
-        " from where it was meant"
+        " from its destination"
     )
     task.note(text)
     return text

@@ -35,7 +35,7 @@ class Kept:
 
 
 class GraspSession:
-    """What outlives a request: the objects that hands keep, and what grasps tell about the camera.
+    """What outlives a request: the objects that hands keep, and what grasps show about the camera.
 
     Args:
         context: Parameters, table and arms.

@@ -42,7 +42,7 @@ def test_an_object_that_no_arm_can_grasp_is_pushed_and_then_grasped() -> None:
     told = [step.reason for step in trials.steps if step.reason.startswith("push 1 by the")]
     assert told
     # what the camera says of the push is what happened: the object was there when it was grasped
-    assert float(told[0].split(" mm from where")[0].split()[-1]) < 20.0
+    assert float(told[0].split(" mm from its destination")[0].split()[-1]) < 20.0
 
 
 @pytest.mark.requirement("A-65")

@@ -66,17 +66,17 @@ def test_a_robot_without_the_finger_is_named(robot):
 def test_no_joint_state_yet_is_not_silence():
     silence = Silence(0.2)
     for i in range(100):
-        silence.look(i * 0.1, -1)
+        silence.update(i * 0.1, -1)
     silence.check(1.0)
 
 
 def test_a_second_without_a_new_stamp_is_a_lost_robot():
     silence = Silence(0.2)
-    silence.look(0.0, 5 * MS)
+    silence.update(0.0, 5 * MS)
     for i in range(1, 11):
-        silence.look(i * 0.1, 5 * MS)
+        silence.update(i * 0.1, 5 * MS)
     silence.check(1.05)
-    silence.look(1.1, 5 * MS)
+    silence.update(1.1, 5 * MS)
     with pytest.raises(OpenArmError, match=r"silent for 1\.1 s") as error:
         silence.check(1.05)
     assert error.value.code is Code.ROBOT_LOST
@@ -85,21 +85,21 @@ def test_a_second_without_a_new_stamp_is_a_lost_robot():
 def test_a_new_stamp_ends_the_silence():
     silence = Silence(0.2)
     for i in range(30):
-        silence.look(i * 0.1, i * MS)
+        silence.update(i * 0.1, i * MS)
         silence.check(0.15)
 
 
 def test_a_starved_process_does_not_take_its_own_pause_for_silence():
     silence = Silence(0.2)
-    silence.look(0.0, MS)
-    silence.look(30.0, MS)
+    silence.update(0.0, MS)
+    silence.update(30.0, MS)
     silence.check(1.0)
 
 
 def test_robot_time_that_goes_back_is_a_robot_started_anew():
     silence = Silence(0.2)
-    silence.look(0.0, 100 * MS)
-    silence.look(0.1, 2 * MS)
-    silence.look(0.2, 3 * MS)
+    silence.update(0.0, 100 * MS)
+    silence.update(0.1, 2 * MS)
+    silence.update(0.2, 3 * MS)
     with pytest.raises(OpenArmError, match="went back"):
         silence.check(1.0)

@@ -85,7 +85,7 @@ def test_a_second_look_that_does_not_help_changes_nothing(what: str, worlds, box
     outcome = world.grasp()
     assert outcome.success, outcome.message
     (reason,) = [status.reason for status in world.status if status.state.value == "MOVE_TO_GRASP"][:1]
-    assert ("going on without" if what == "no plan" else "second look") in reason
+    assert ("going on without" if what == "no plan" else "second observation") in reason
     assert [call.trajectory for call in world.done(Follow)][:2] == ["transfer", "approach"]
 
 

@@ -17,7 +17,8 @@ from rclpy.task import Future
 
 from openarm_bringup import cli
 from openarm_common.errors import Code
-from openarm_grasp.ros.client import GraspClient, PairResult, Wanted
+from openarm_grasp.ros.client import GraspClient, PairResult
+from openarm_grasp.strategies.request import GraspRequest
 
 STATES = "DETECT TRANSFORM PLAN MOVE_TO_PREGRASP MOVE_TO_GRASP CLOSE_GRIPPER LIFT PLACE RESET IDLE"
 
@@ -135,7 +136,7 @@ def test_a_limit_of_time_ends_both_with_their_hands_closed(bench) -> None:
 
 def test_a_cancel_while_both_are_looked_at_moves_nothing(bench) -> None:
     handle, result = bench.ros.send_goal(bench.two, goal("red", "blue"))
-    bench.until(lambda: "looking at both" in bench.status[-1].reason, what="the look")
+    bench.until(lambda: any("observing both" in s.reason for s in bench.status), what="the observation of both")
     assert bench.ros.result(handle.cancel_goal_async()).goals_canceling
     end = bench.ros.result(result, 5.0)
     assert (end.status, end.result.code) == (GoalStatus.STATUS_CANCELED, "CANCELLED")
@@ -191,7 +192,7 @@ def test_the_client_picks_two_from_plain_python(bench) -> None:
 
     def script() -> None:
         with GraspClient() as grasp:
-            wanted = Wanted("blue", arm="left", place=(0.3, 0.3), object_at=(0.26, 0.21))
+            wanted = GraspRequest("blue", arm="left", place=(0.3, 0.3), object_at=(0.26, 0.21))
             results.append(
                 grasp.pick_two("red", wanted, on_feedback=lambda status: heard.append((status.label, status.state)))
             )
