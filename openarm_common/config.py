@@ -42,7 +42,7 @@ def load_yaml(path: Path) -> dict[str, Any]:
 
 
 def metres_by_name(items: Sequence[str], field: str, example: str, low: float, high: float) -> dict[str, float]:
-    """What a field of `name=metres` says: ROS parameters know no mappings.
+    """Parse items of `name=metres`, since ROS parameters know no mappings.
 
     Args:
         items: The field.
@@ -74,6 +74,11 @@ AT_RUN_TIME: dict[str, JsonValue] = {"at_run_time": True}
 def validate(model: type[ConfigT], data: dict[str, Any], where: str) -> ConfigT:
     """Validate a mapping; every wrong key is named at once.
 
+    Args:
+        model: Model of the data.
+        data: The mapping.
+        where: Begins each fault, such as the path of a file.
+
     Raises:
         OpenArmError: CONFIG_INVALID, with `where`:key for each fault.
     """
@@ -84,7 +89,13 @@ def validate(model: type[ConfigT], data: dict[str, Any], where: str) -> ConfigT:
 
 
 def describe_faults(error: ValidationError, where: str, model: type[BaseModel]) -> str:
-    """Turn a pydantic error into `where:key: fault` sentences, with the valid keys for an unknown one."""
+    """Turn a pydantic error into `where:key: fault` sentences, with the valid keys for an unknown one.
+
+    Args:
+        error: What pydantic found.
+        where: Begins each fault.
+        model: Model of the data.
+    """
     faults: list[str] = []
     for item in error.errors():
         key = ".".join(str(part) for part in item["loc"]) or "(top level)"

@@ -54,30 +54,36 @@ def apply(T: Array, points: ArrayLike) -> Array:
 
 
 def rot_x(angle: float) -> Array:
-    """Rotation about x."""
+    """Return the rotation about x."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def rot_y(angle: float) -> Array:
-    """Rotation about y."""
+    """Return the rotation about y."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
 def rot_z(angle: float) -> Array:
-    """Rotation about z."""
+    """Return the rotation about z."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """URDF's fixed-axis roll, pitch, yaw: ``Rz(yaw) Ry(pitch) Rx(roll)``."""
+    """Return URDF's fixed-axis roll, pitch, yaw: ``Rz(yaw) Ry(pitch) Rx(roll)``.
+
+    Args:
+        roll: About x, rad.
+        pitch: About y, rad.
+        yaw: About z, rad.
+    """
     return rot_z(yaw) @ rot_y(pitch) @ rot_x(roll)
 
 
 def rotation_from_z_y(z: ArrayLike, y: ArrayLike) -> Array:
-    """Rotation whose z axis is `z` and whose y axis is `y` made perpendicular to it.
+    """Return the rotation whose z axis is `z` and whose y axis is `y` made perpendicular to it.
 
     For a gripper: z is the approach (out of the fingers), y the opening axis.
 
@@ -99,7 +105,7 @@ def rotation_from_z_y(z: ArrayLike, y: ArrayLike) -> Array:
 
 
 def exp_so3(w: ArrayLike) -> Array:
-    """Rotation of a rotation vector (3,), rad (Rodrigues)."""
+    """Return the rotation of a rotation vector (3,), rad (Rodrigues)."""
     v = np.asarray(w, dtype=np.float64)
     angle = float(np.linalg.norm(v))
     K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
@@ -109,7 +115,7 @@ def exp_so3(w: ArrayLike) -> Array:
 
 
 def log_so3(R: Array) -> Array:
-    """Rotation vector (3,) of a rotation, rad; norm in [0, pi]."""
+    """Return the rotation vector (3,) of a rotation, rad; norm in [0, pi]."""
     q = quat_xyzw_from_matrix(R)
     if q[3] < 0.0:
         q = -q
@@ -120,18 +126,24 @@ def log_so3(R: Array) -> Array:
 
 
 def angle_between(R_a: Array, R_b: Array) -> float:
-    """Angle of the rotation from `R_a` to `R_b`, rad in [0, pi]."""
+    """Return the angle of the rotation from `R_a` to `R_b`, rad in [0, pi]."""
     return float(np.linalg.norm(log_so3(R_a.T @ R_b)))
 
 
 def interpolate(T_a: Array, T_b: Array, u: float) -> Array:
-    """Between two transforms: straight line for the origin, one constant turn for the rotation; `u` in [0, 1]."""
+    """Interpolate between two transforms: straight line, one constant turn; `u` in [0, 1].
+
+    Args:
+        T_a: (4, 4) at u = 0.
+        T_b: (4, 4) at u = 1.
+        u: 0 .. 1.
+    """
     R = T_a[:3, :3] @ exp_so3(u * log_so3(T_a[:3, :3].T @ T_b[:3, :3]))
     return make(R, (1.0 - u) * T_a[:3, 3] + u * T_b[:3, 3])
 
 
 def matrix_from_quat_xyzw(q_xyzw: ArrayLike) -> Array:
-    """Rotation of a quaternion (x, y, z, w); need not be normalised.
+    """Return the rotation of a quaternion (x, y, z, w); need not be normalised.
 
     Raises:
         ValueError: When the quaternion is zero or not finite.
@@ -151,7 +163,7 @@ def matrix_from_quat_xyzw(q_xyzw: ArrayLike) -> Array:
 
 
 def quat_xyzw_from_matrix(R: Array) -> Array:
-    """Unit quaternion (x, y, z, w) of a rotation, by its largest component (Shepperd 1978), with w >= 0."""
+    """Return the unit quaternion (x, y, z, w) of a rotation, by its largest component (Shepperd 1978), with w >= 0."""
     m = R
     trace = float(m[0, 0] + m[1, 1] + m[2, 2])
     candidates = (float(m[0, 0]), float(m[1, 1]), float(m[2, 2]), trace)

@@ -31,7 +31,7 @@ class Pacer:
         self.skipped_ns = 0
 
     def wait_ns(self, now_ns: int) -> int:
-        """How long to wait until the next tick is due; 0 or less: it is."""
+        """Return the time until the next tick is due; 0 or less when it is."""
         if self._due_ns is None:
             self._due_ns = now_ns
         return self._due_ns - now_ns if self._step_ns else 0
@@ -126,7 +126,7 @@ class PeriodMeter:
         self._last_ns = None
 
     def figures(self) -> PeriodFigures:
-        """Percentiles over what is kept; may be called from another thread than `add`."""
+        """Compute percentiles of the kept intervals; may be called from another thread than `add`."""
         intervals = np.array(self._intervals_ms.copy())
         if intervals.size == 0:
             return PeriodFigures()

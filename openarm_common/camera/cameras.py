@@ -42,7 +42,13 @@ class Intrinsics:
 
     @classmethod
     def from_fovy(cls, width: int, height: int, fovy_deg: float) -> Intrinsics:
-        """Square pixels, principal point in the image centre, vertical field of view in degrees."""
+        """Make intrinsics with square pixels and a centred principal point; vertical field of view in degrees.
+
+        Args:
+            width: Pixels.
+            height: Pixels.
+            fovy_deg: Vertical field of view, degrees.
+        """
         f = height / 2.0 / math.tan(math.radians(fovy_deg) / 2.0)
         return cls(width, height, f, f, (width - 1) / 2.0, (height - 1) / 2.0)
 
@@ -52,13 +58,13 @@ class Intrinsics:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points_optical: ArrayLike) -> Array:
-        """Pixels (..., 2) of points (..., 3) in the optical frame; NaN behind the camera."""
+        """Return the pixels (..., 2) of points (..., 3) in the optical frame; NaN behind the camera."""
         p = np.asarray(points_optical, dtype=np.float64)
         z = np.where(p[..., 2] > 0.0, p[..., 2], np.nan)
         return np.stack([p[..., 0] / z * self.fx + self.cx, p[..., 1] / z * self.fy + self.cy], axis=-1)
 
     def deproject(self, pixels: ArrayLike, depth: ArrayLike) -> Array:
-        """Points (..., 3) in the optical frame of pixels (..., 2) at planar depth (...), m."""
+        """Return the points (..., 3) in the optical frame of pixels (..., 2) at planar depth (...), m."""
         uv = np.asarray(pixels, dtype=np.float64)
         z = np.asarray(depth, dtype=np.float64)
         return np.stack([(uv[..., 0] - self.cx) / self.fx * z, (uv[..., 1] - self.cy) / self.fy * z, z], axis=-1)
@@ -145,7 +151,7 @@ def load_cameras(path: Path | None = None) -> dict[str, CameraConfig]:
 
 
 def true_mount(camera: CameraConfig, mount_seed: int | None) -> Array:
-    """Where a simulated camera really is: the nominal mount off by an error of the mount seed.
+    """Return the true mount of a simulated camera: the nominal mount off by an error of the mount seed.
 
     Args:
         camera: The camera with its nominal mount.

@@ -151,7 +151,7 @@ class Leaves:
     nodes: int
 
     def on(self, lattice: Lattice) -> tuple[Floats, int]:
-        """Log-odds of a box, NaN where unknown, and how many leaves lie outside of it, wholly or in part.
+        """Return log-odds of a box, NaN where unknown, and how many leaves lie outside of it, wholly or in part.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, when the resolutions differ.
@@ -201,6 +201,11 @@ def decode(data: Bytes | bytes, resolution: float, *, binary: bool) -> Leaves:
 
 def write_file(path: Path, payload: Payload, resolution: float) -> None:
     """Write a .bt (binary) or .ot (full) file; the file is there whole or not at all.
+
+    Args:
+        path: Ends in .bt or .ot.
+        payload: The tree.
+        resolution: Edge of a cell, m.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the suffix does not fit the payload or the folder can't be written.

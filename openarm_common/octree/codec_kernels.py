@@ -86,7 +86,7 @@ def write_states(flat: Bytes, offset: Ints, shape: Ints, origin: Ints, out: Byte
 
 @njit(cache=True, nogil=True)
 def read_states(data: Bytes, leaves: Ints) -> tuple[int, int, int]:
-    """Leaves of a tree of two bytes an inner node.
+    """Read the leaves of a tree of two bytes per inner node.
 
     Args:
         data: As `write_states` writes it.
@@ -125,7 +125,13 @@ def read_states(data: Bytes, leaves: Ints) -> tuple[int, int, int]:
 
 @njit(cache=True, nogil=True)
 def start_values(log_odds: Floats, states: Bytes, values: Floats) -> None:
-    """Level 0 of the tree with values: cells (nx, ny, nz) with NaN for unknown; state 1 is a leaf."""
+    """Fill level 0 of the tree with values: cells (nx, ny, nz) with NaN for unknown; state 1 is a leaf.
+
+    Args:
+        log_odds: (nx, ny, nz), NaN for unknown.
+        states: (nx, ny, nz), filled.
+        values: (nx, ny, nz), filled.
+    """
     for i in range(log_odds.shape[0]):
         for j in range(log_odds.shape[1]):
             for k in range(log_odds.shape[2]):
@@ -136,7 +142,15 @@ def start_values(log_odds: Floats, states: Bytes, values: Floats) -> None:
 
 @njit(cache=True, nogil=True)
 def merge_values(below: Bytes, values: Floats, above: Bytes, above_values: Floats, shift: Ints) -> None:
-    """As `merge_states`, for leaves (state 1) with a value: equal ones merge, an inner node has the largest one."""
+    """Merge as `merge_states`, for leaves (state 1) with a value; an inner node has the largest one.
+
+    Args:
+        below: (2 nx, 2 ny, 2 nz) states.
+        values: Log-odds of `below`.
+        above: States of the next level, zero outside of what is filled.
+        above_values: Log-odds of `above`.
+        shift: Index (3,) in `above` of the parent of below[0, 0, 0].
+    """
     nx, ny, nz = below.shape[0] // 2, below.shape[1] // 2, below.shape[2] // 2
     for i in range(nx):
         for j in range(ny):
@@ -210,7 +224,7 @@ def write_values(
 
 @njit(cache=True, nogil=True)
 def read_values(data: Bytes, leaves: Ints) -> tuple[int, int, int]:
-    """Leaves of a tree of five bytes a node.
+    """Read the leaves of a tree of five bytes per node.
 
     Args:
         data: As `write_values` writes it.

@@ -89,7 +89,7 @@ class DistanceField:
     cameras: Mapping[str, CameraMoment]
 
     def at(self, points: ArrayLike) -> Floats:
-        """Distances (n,), m, at points (n, 3) of the frame; `reach` outside of the workspace."""
+        """Return the distances (n,), m, at points (n, 3) of the frame; `reach` outside of the workspace."""
         index = self.lattice.indices(np.asarray(points, np.float64).reshape(-1, 3))
         inside = self.lattice.contains(index)
         out = np.full(index.shape[0], self.reach, np.float32)
@@ -97,7 +97,7 @@ class DistanceField:
         return out
 
     def clearance(self, centres: Array, radii: Array) -> float:
-        """Smallest clearance between spheres and occupied cells, m; too small by a cell's diagonal at most.
+        """Return the smallest clearance between spheres and occupied cells, m; too small by a cell's diagonal at most.
 
         Args:
             centres: (n, 3) in the frame, m.
@@ -135,7 +135,7 @@ class DistanceField:
 
 
 def field_path(name: str) -> Path:
-    """Path of the field of a name: in memory where the system has a file system for that."""
+    """Return the path of the field of a name: in memory where the system has a file system for that."""
     shm = Path("/dev/shm")
     return (shm if shm.is_dir() else Path(tempfile.gettempdir())) / f"openarm_field_{name}"
 
@@ -196,13 +196,19 @@ class DistanceFieldWriter:
         return self._version
 
     def begin(self) -> Floats:
-        """The slot to compute into, (nx, ny, nz); readers do not use it before `commit`."""
+        """Return the slot to compute into, (nx, ny, nz); readers do not use it before `commit`."""
         slot = self._next
         self._head["slots"][slot]["version"] = 0
         return self._slots[slot]
 
     def commit(self, t_ns: int, now_ns: int, cameras: Mapping[str, CameraMoment]) -> int:
-        """Make what was computed since `begin` the current version; returns its number."""
+        """Make what was computed since `begin` the current version; returns its number.
+
+        Args:
+            t_ns: Stamp of the newest image.
+            now_ns: Monotonic clock.
+            cameras: When cameras last contributed; those left out keep their moments.
+        """
         slot = self._next
         head = self._head["slots"][slot]
         self._moments |= cameras
@@ -242,7 +248,7 @@ class DistanceFieldReader:
         self._lattice: Lattice | None = None
 
     def latest(self) -> DistanceField:
-        """The current version, in place (no copy).
+        """Return the current version, in place (no copy).
 
         Raises:
             OpenArmError: NOT_READY, when nothing has been published yet.
@@ -308,7 +314,15 @@ def _slots(memory: mmap.mmap, lattice: Lattice) -> list[Floats]:
 
 @njit(cache=True, nogil=True)
 def sphere_clearance(distances: Floats, lower: Array, edge: float, centres: Array, radii: Array) -> float:
-    """Smallest clearance between spheres and occupied cells, m; see `DistanceField.clearance`."""
+    """Return the smallest clearance between spheres and occupied cells, m; see `DistanceField.clearance`.
+
+    Args:
+        distances: (nx, ny, nz), m.
+        lower: (3,) corner of the field, m.
+        edge: Of a cell, m.
+        centres: (n, 3) of the spheres, m.
+        radii: (n,) m.
+    """
     nx, ny, nz = distances.shape
     # a sphere's centre is up to half a diagonal from that of its cell, and a surface as far from that of its own
     slack = np.sqrt(3.0) * edge

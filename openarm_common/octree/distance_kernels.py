@@ -16,7 +16,15 @@ from openarm_common.types import Bytes, Floats
 
 @njit(cache=True, nogil=True)
 def along_z(states: Bytes, lowest: int, highest: int, cap: np.float32, out: Floats) -> None:
-    """Squared distance along z to the nearest cell with lowest <= state <= highest, cut at `cap`; (nx, ny, nz)."""
+    """Compute squared distances along z to the nearest cell with lowest <= state <= highest, cut at `cap`.
+
+    Args:
+        states: (nx, ny, nz).
+        lowest: Least state of an obstacle.
+        highest: Largest state of an obstacle.
+        cap: Squared reach, cells.
+        out: (nx, ny, nz), filled.
+    """
     nx, ny, nz = states.shape
     for i in range(nx):
         for j in range(ny):
@@ -38,7 +46,7 @@ def along_z(states: Bytes, lowest: int, highest: int, cap: np.float32, out: Floa
 
 @njit(cache=True, nogil=True)
 def along_y(squares: Floats, cap: np.float32, reach: int, scratch: Floats) -> None:
-    """Second pass, in place: all z of one row at a time, so that the inner loop runs over neighbours in memory.
+    """Run the second pass in place: all z of one row at a time, so that the inner loop runs over neighbours in memory.
 
     Args:
         squares: (nx, ny, nz) of the pass before, changed.
@@ -70,7 +78,7 @@ def along_y(squares: Floats, cap: np.float32, reach: int, scratch: Floats) -> No
 
 @njit(cache=True, nogil=True)
 def along_x(squares: Floats, cap: np.float32, reach: int, edge: np.float32, scratch: Floats, out: Floats) -> None:
-    """Third pass, and metres.
+    """Run the third pass, and convert to metres.
 
     Args:
         squares: (nx, ny, nz) of the pass before.

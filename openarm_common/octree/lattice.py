@@ -44,7 +44,7 @@ class Lattice:
 
     @classmethod
     def from_bounds(cls, resolution: float, lower: Sequence[float], upper: Sequence[float], align: int = 1) -> Lattice:
-        """The smallest box of whole cells that contains two corners.
+        """Return the smallest box of whole cells that contains two corners.
 
         Args:
             resolution: Edge of a cell, m.
@@ -85,12 +85,12 @@ class Lattice:
         return math.prod(self.shape)
 
     def centres(self, indices: ArrayLike) -> Array:
-        """Centres (..., 3), m, of cell indices (..., 3)."""
+        """Return the centres (..., 3), m, of cell indices (..., 3)."""
         keys = np.asarray(indices, dtype=np.int64) + np.array(self.key_min)
         return np.asarray((keys - KEY_ZERO + 0.5) * self.resolution, np.float64)
 
     def indices(self, points: ArrayLike) -> Ints:
-        """Indices (..., 3) of the cells that contain points (..., 3), m; may lie outside of the box."""
+        """Return the indices (..., 3) of the cells that contain points (..., 3), m; may lie outside of the box."""
         p = np.asarray(points, dtype=np.float64)
         return np.floor(p * (1.0 / self.resolution)).astype(np.int64) + (KEY_ZERO - np.array(self.key_min))
 
@@ -100,14 +100,14 @@ class Lattice:
         return np.asarray(((i >= 0) & (i < np.array(self.shape))).all(axis=-1))
 
     def range_of(self, lower: ArrayLike, upper: ArrayLike) -> tuple[slice, slice, slice]:
-        """Slices of the cells that a box (two corners, m) touches, cut to this box."""
+        """Return the slices of the cells that a box (two corners, m) touches, cut to this box."""
         first = np.clip(self.indices(lower), 0, self.shape)
         last = np.clip(self.indices(upper) + 1, 0, self.shape)
         x, y, z = (slice(int(a), int(b)) for a, b in zip(first, last, strict=True))
         return x, y, z
 
     def coarser(self, levels: int) -> Lattice:
-        """The box of cells 2 ** `levels` as large that covers this one.
+        """Return the box of cells 2 ** `levels` as large that covers this one.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, unless 0 <= levels < 16.

@@ -34,7 +34,7 @@ _MIRROR = np.array([-1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])
 
 
 def mirror(q: Iterable[float]) -> Array:
-    """Joint positions (7,) of one arm that put the other arm in the mirror image (y negated) of the pose."""
+    """Mirror joint positions (7,) of one arm: the other arm takes the pose with y negated."""
     return np.fromiter(q, dtype=np.float64) * _MIRROR
 
 
@@ -104,17 +104,17 @@ class RobotDescription:
 
     @staticmethod
     def arm_joints(side: Side) -> tuple[str, ...]:
-        """Names of the seven joints of an arm, from the shoulder."""
+        """Return the names of the seven joints of an arm, from the shoulder."""
         return tuple(f"openarm_{side}_joint{i}" for i in range(1, 8))
 
     @staticmethod
     def finger_joint(side: Side) -> str:
-        """Name of the joint that drives both fingers of a hand."""
+        """Return the name of the joint that drives both fingers of a hand."""
         return f"openarm_{side}_finger_joint1"
 
     @staticmethod
     def tcp_link(side: Side) -> str:
-        """Name of the tool centre point of an arm: z out of the fingers, y the opening direction."""
+        """Return the name of the tool centre point of an arm: z out of the fingers, y the opening direction."""
         return f"openarm_{side}_hand_tcp"
 
     @property
@@ -123,12 +123,12 @@ class RobotDescription:
         return self.semantics.allowed_collisions
 
     def limits(self, joint_names: Iterable[str]) -> tuple[Array, Array]:
-        """Lower and upper position limits (n,) of joints."""
+        """Return the lower and upper position limits (n,) of joints."""
         found = [self.joint(name) for name in joint_names]
         return np.array([j.lower for j in found]), np.array([j.upper for j in found])
 
     def velocity_limits(self, joint_names: Iterable[str]) -> Array:
-        """Velocity limits (n,) of joints: those of the motors, far above what a plan should use."""
+        """Return the velocity limits (n,) of joints: those of the motors, far above what a plan should use."""
         return np.array([self.joint(name).velocity for name in joint_names])
 
     def joint(self, name: str) -> Joint:
@@ -144,7 +144,7 @@ class RobotDescription:
         return self.joints[name]
 
     def chain(self, link: str) -> tuple[Joint, ...]:
-        """Joints from the root to a link, fixed ones included.
+        """Return the joints from the root to a link, fixed ones included.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, listing the links there are.
@@ -156,7 +156,7 @@ class RobotDescription:
         return self._chains[link]
 
     def link_pose(self, link: str, q: Mapping[str, float]) -> Array:
-        """Pose ``T_root_link`` (4, 4) of one link; only the joints of its chain are evaluated.
+        """Return the pose ``T_root_link`` (4, 4) of one link; only the joints of its chain are evaluated.
 
         Args:
             link: Name of the link.
@@ -171,7 +171,7 @@ class RobotDescription:
         return T
 
     def link_poses(self, q: Mapping[str, float]) -> dict[str, Array]:
-        """Poses ``T_root_link`` (4, 4) of every link.
+        """Return the poses ``T_root_link`` (4, 4) of every link.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, for a joint that is missing in `q`.
@@ -183,7 +183,7 @@ class RobotDescription:
         return {link: poses[link] for link in self.links}
 
     def group_joints(self, group: str) -> tuple[str, ...]:
-        """Movable joints of an SRDF group: those it lists, of its chains and of its subgroups, without passive ones.
+        """Return the movable joints of an SRDF group: listed ones, of chains and of subgroups, without passive ones.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, listing the groups there are.
@@ -201,7 +201,7 @@ class RobotDescription:
         return tuple(n for n in dict.fromkeys(names) if self.joints[n].type != "fixed" and n not in passive)
 
     def group_state(self, group: str, name: str) -> dict[str, float]:
-        """Joint positions of a named posture, for example group "left_arm", state "home".
+        """Return the joint positions of a named posture, for example group "left_arm", state "home".
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, listing the states there are.
@@ -239,7 +239,7 @@ def _chain_of(link: str, parent_joint: Mapping[str, Joint]) -> tuple[Joint, ...]
 
 
 def _known(chain: tuple[Joint, ...], poses: Mapping[str, Array]) -> int:
-    """How many joints of a chain, from the root, have a child whose pose is there already."""
+    """Return how many joints of a chain, from the root, have a child with a known pose."""
     count = len(chain)
     while count and chain[count - 1].child not in poses:
         count -= 1

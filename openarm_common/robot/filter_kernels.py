@@ -38,7 +38,7 @@ def inside(kind: Whole, x: Real, y: Real, z: Real, hx: Real, hy: Real, hz: Real)
 def _window(
     T: Array, half: Array, fx: float, fy: float, cx: float, cy: float, width: int, height: int
 ) -> tuple[int, int, int, int]:
-    """Columns and rows that the box around a shape can appear in: first and end of each; empty when behind."""
+    """Return first and end of the columns and rows in which the box around a shape can appear; empty when behind."""
     corners = np.empty((8, 3))
     for i in range(8):
         # the inverse of a rigid transform: R^T (p - t)
@@ -149,7 +149,17 @@ def _meets(dx: Real, dy: Real, dz: Real, x: Real, y: Real, z: Real, hx: Real, hy
 def label_points(
     points: Floats, kinds: Ints, halves: Array, T_shape_base: Array, owners: Ints, label: Bytes, counts: Ints
 ) -> None:
-    """Label points (n, 3) of the base frame that lie in a shape (1); counts by owner are added to."""
+    """Label points (n, 3) of the base frame that lie in a shape (1); counts by owner are added to.
+
+    Args:
+        points: (n, 3), m.
+        kinds: (m,).
+        halves: (m, 3) half edges with padding, m.
+        T_shape_base: (m, 3, 4).
+        owners: (m,) index in `counts`.
+        label: (n,), 1 is written where a point lies in a shape.
+        counts: Labelled points by owner; added to.
+    """
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         for k in range(kinds.size):

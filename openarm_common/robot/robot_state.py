@@ -37,13 +37,25 @@ class RobotStateBuffer:
         self._static: dict[str, tuple[str, Array]] = {}
 
     def add_joint_state(self, t_ns: int, names: Sequence[str], positions: Sequence[float]) -> None:
-        """Add one joint state; time going back (a restarted simulation) empties the buffer first."""
+        """Add one joint state; time going back (a restarted simulation) empties the buffer first.
+
+        Args:
+            t_ns: Stamp.
+            names: Of the joints.
+            positions: Of each joint, rad or m.
+        """
         if self._states and t_ns < self._states[-1][0]:
             self._states.clear()
         self._states.append((t_ns, dict(zip(names, positions, strict=True))))
 
     def set_static(self, parent: str, child: str, T_parent_child: Array) -> None:
-        """Add or replace a fixed edge; edges of the description itself are ignored."""
+        """Add or replace a fixed edge; edges of the description itself are ignored.
+
+        Args:
+            parent: Frame.
+            child: Frame.
+            T_parent_child: (4, 4), m.
+        """
         if child not in self._description.links:
             self._static[child] = (parent, T_parent_child)
 
@@ -70,7 +82,7 @@ class RobotStateBuffer:
         return bool(self._states) and self._states[-1][0] >= t_ns
 
     def joints_at(self, t_ns: int) -> dict[str, float]:
-        """Joint positions at a stamp, rad or m by joint name.
+        """Return the joint positions at a stamp, rad or m by joint name.
 
         Raises:
             OpenArmError: STALE_DATA, with the gap, when no joint state is near enough and no two bracket the stamp.
@@ -97,9 +109,14 @@ class RobotStateBuffer:
         )
 
     def lookup(self, target: str, source: str, t_ns: int) -> Array:
-        """Pose of `source` in `target` at a stamp: ``p_target = T @ p_source``.
+        """Return the pose of `source` in `target` at a stamp: ``p_target = T @ p_source``.
 
         Joint states are needed only when a moving joint lies between the base and one of the two frames.
+
+        Args:
+            target: Frame of the result.
+            source: Frame whose pose is returned.
+            t_ns: Stamp.
 
         Raises:
             OpenArmError: NO_TRANSFORM, naming the unknown frame and the known ones; STALE_DATA, from `joints_at`.
@@ -123,7 +140,7 @@ class RobotStateBuffer:
         return self._description.link_pose(link, q) @ T_link_frame
 
     def _carrier(self, frame: str) -> tuple[str, Array]:
-        """The link that a frame is fixed to, and T_link_frame."""
+        """Return the link that a frame is fixed to, and T_link_frame."""
         T = np.eye(4)
         name = frame
         for _ in range(len(self._static) + 1):

@@ -37,7 +37,7 @@ class SelfFilterConfig(Config):
         return self
 
     def paddings(self) -> dict[str, float]:
-        """The paddings that differ, by link."""
+        """Return the paddings that differ, by link."""
         return metres_by_name(self.link_padding, "link_padding", "openarm_left_hand=0.03", 0.0, 0.2)
 
 
@@ -62,7 +62,7 @@ class Shapes:
     T_base_shape: Array
 
     def seen_from(self, T_base_frame: Array) -> Array:
-        """T_shape_frame (n, 3, 4) of a frame at (4, 4) in the base."""
+        """Return T_shape_frame (n, 3, 4) of a frame at (4, 4) in the base."""
         R_t = self.T_base_shape[:, :3, :3].transpose(0, 2, 1)
         out = np.empty((len(self.kinds), 3, 4))
         out[:, :, :3] = R_t @ T_base_frame[:3, :3]
@@ -100,7 +100,7 @@ class SelfFilter:
         self._padding = np.array([special.get(self._links[i], config.padding) for i, _ in found])
 
     def shapes(self, joints: Mapping[str, float], held: Sequence[HeldBox] = ()) -> Shapes:
-        """The robot in a posture.
+        """Place the shapes of the robot in a posture.
 
         Args:
             joints: Positions by joint name, rad or m.

@@ -38,24 +38,24 @@ ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
 
 # --- time
 def stamp_to_ns(stamp: Time | Duration) -> int:
-    """Nanoseconds of a stamp or duration."""
+    """Convert a stamp or duration to nanoseconds."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
 def ns_to_stamp(t_ns: int) -> Time:
-    """Stamp of nanoseconds."""
+    """Convert nanoseconds to a stamp."""
     return Time(sec=t_ns // 1_000_000_000, nanosec=t_ns % 1_000_000_000)
 
 
 def seconds_to_duration(seconds: float) -> Duration:
-    """Duration message of seconds."""
+    """Convert seconds to a duration message."""
     t_ns = round(seconds * 1e9)
     return Duration(sec=t_ns // 1_000_000_000, nanosec=t_ns % 1_000_000_000)
 
 
 # --- geometry
 def pose_to_matrix(pose: Pose) -> Array:
-    """(4, 4) of a pose.
+    """Convert a pose to (4, 4).
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when a coordinate is not finite or the quaternion is zero.
@@ -71,36 +71,43 @@ def pose_to_matrix(pose: Pose) -> Array:
 
 
 def matrix_to_pose(T: Array) -> Pose:
-    """Pose of a (4, 4) transform."""
+    """Convert (4, 4) to a pose."""
     x, y, z, w = (float(v) for v in se3.quat_xyzw_from_matrix(T[:3, :3]))
     return Pose(position=point(T[:3, 3]), orientation=Quaternion(x=x, y=y, z=z, w=w))
 
 
 def point(p: ArrayLike) -> Point:
-    """Point message of three numbers."""
+    """Make a point message of three numbers."""
     x, y, z = (float(v) for v in np.asarray(p))
     return Point(x=x, y=y, z=z)
 
 
 def vector(v: ArrayLike) -> Vector3:
-    """Vector3 message of three numbers."""
+    """Make a Vector3 message of three numbers."""
     x, y, z = (float(c) for c in np.asarray(v))
     return Vector3(x=x, y=y, z=z)
 
 
 def xyz(message: Point | Vector3) -> Array:
-    """(3,) of a point or vector message."""
+    """Convert a point or vector message to (3,)."""
     return np.array([message.x, message.y, message.z])
 
 
 def transform_to_matrix(transform: Transform) -> Array:
-    """(4, 4) of a transform message."""
+    """Convert a transform message to (4, 4)."""
     t, q = transform.translation, transform.rotation
     return se3.make(se3.matrix_from_quat_xyzw((q.x, q.y, q.z, q.w)), (t.x, t.y, t.z))
 
 
 def matrix_to_transform(parent: str, child: str, T_parent_child: Array, t_ns: int) -> TransformStamped:
-    """Stamped transform message of an edge."""
+    """Make the stamped transform message of an edge.
+
+    Args:
+        parent: Frame.
+        child: Frame.
+        T_parent_child: (4, 4), m.
+        t_ns: Stamp.
+    """
     message = TransformStamped(child_frame_id=child)
     message.header.frame_id = parent
     message.header.stamp = ns_to_stamp(t_ns)
@@ -112,7 +119,7 @@ def matrix_to_transform(parent: str, child: str, T_parent_child: Array, t_ns: in
 
 # --- images
 def image_to_array(message: Image) -> NDArray[np.generic]:
-    """View of an image: (height, width) or (height, width, 3), dtype by encoding; not a copy.
+    """View an image as an array (height, width) or (height, width, 3), dtype by encoding; not a copy.
 
     Raises:
         OpenArmError: BAD_IMAGE, when the encoding is unknown or the data do not have the size that the header says.
@@ -139,7 +146,13 @@ def image_to_array(message: Image) -> NDArray[np.generic]:
 
 
 def array_to_image(pixels: NDArray[np.generic], encoding: str, frame_id: str, t_ns: int) -> Image:
-    """Image message of an array, dtype and channels as the encoding says.
+    """Make the image message of an array; dtype and channels must be those of the encoding.
+
+    Args:
+        pixels: (height, width) or (height, width, channels).
+        encoding: Of `ENCODINGS`.
+        frame_id: Optical frame.
+        t_ns: Stamp.
 
     Raises:
         OpenArmError: BAD_IMAGE, when they are not.
@@ -159,7 +172,7 @@ def array_to_image(pixels: NDArray[np.generic], encoding: str, frame_id: str, t_
 
 
 def byte_array(data: NDArray[np.generic]) -> array.array[int]:
-    """Bytes of an array as `array.array('B')`, the one form that rclpy takes without a loop."""
+    """Copy an array into `array.array('B')`, the one form that rclpy takes without a loop."""
     out = array.array("B")
     if data.size:  # an empty memoryview can't be cast
         out.frombytes(np.ascontiguousarray(data).data.cast("B"))
@@ -190,7 +203,7 @@ def depth_image(message: Image) -> NDArray[np.uint16] | Floats:
 
 
 def intrinsics_from_info(info: CameraInfo) -> Intrinsics:
-    """Intrinsics of a rectified camera.
+    """Read the intrinsics of a rectified camera.
 
     Raises:
         OpenArmError: BAD_IMAGE, when the camera is not calibrated (K is zero) or has distortion that is not removed.
@@ -210,7 +223,13 @@ def intrinsics_from_info(info: CameraInfo) -> Intrinsics:
 
 
 def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int) -> CameraInfo:
-    """CameraInfo of a camera without distortion."""
+    """Make the CameraInfo of a camera without distortion.
+
+    Args:
+        intrinsics: Of the camera.
+        frame_id: Optical frame.
+        t_ns: Stamp.
+    """
     info = CameraInfo(height=intrinsics.height, width=intrinsics.width, distortion_model="plumb_bob")
     info.header.frame_id = frame_id
     info.header.stamp = ns_to_stamp(t_ns)
@@ -224,7 +243,7 @@ def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int) -> Ca
 
 # --- clouds
 def cloud_from_points(points: Floats, frame_id: str, t_ns: int, rgb: Bytes | None = None) -> PointCloud2:
-    """PointCloud2 of points (n, 3) or, organised, (height, width, 3), m; NaN marks an invalid point.
+    """Make a PointCloud2 of points (n, 3) or, organised, (height, width, 3), m; NaN marks an invalid point.
 
     Args:
         points: float32 coordinates in `frame_id`.
@@ -253,7 +272,7 @@ def cloud_from_points(points: Floats, frame_id: str, t_ns: int, rgb: Bytes | Non
 
 
 def points_from_cloud(message: PointCloud2) -> Floats:
-    """Points (n, 3) or (height, width, 3) of a cloud whose first fields are float32 x, y, z.
+    """Read points (n, 3) or (height, width, 3) of a cloud whose first fields are float32 x, y, z.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for another layout.
@@ -272,7 +291,15 @@ def points_from_cloud(message: PointCloud2) -> Floats:
 def trajectory_to_msg(
     names: Sequence[str], t: Array, q: Array, v: Array | None = None, a: Array | None = None
 ) -> JointTrajectory:
-    """JointTrajectory of samples: times (n,) s from the start, positions, velocities, accelerations (n, k)."""
+    """Make a JointTrajectory of samples: times (n,) s from the start, positions, velocities, accelerations (n, k).
+
+    Args:
+        names: Joints, (k,).
+        t: (n,) s.
+        q: (n, k) rad or m.
+        v: (n, k) rad/s or m/s; None leaves velocities out.
+        a: (n, k) rad/s² or m/s²; None leaves accelerations out.
+    """
     message = JointTrajectory(joint_names=list(names))
     for i, seconds in enumerate(t):
         sample = JointTrajectoryPoint(positions=q[i].tolist(), time_from_start=seconds_to_duration(float(seconds)))
@@ -285,7 +312,7 @@ def trajectory_to_msg(
 
 
 def trajectory_from_msg(message: JointTrajectory) -> tuple[list[str], Array, Array, Array | None, Array | None]:
-    """Joint names, times (n,), positions (n, k), and velocities and accelerations (n, k) where every point has them.
+    """Read joint names, times (n,), positions (n, k); velocities and accelerations where every point has them.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when a point has another number of values than there are joints.
@@ -308,7 +335,7 @@ def trajectory_from_msg(message: JointTrajectory) -> tuple[list[str], Array, Arr
 
 
 def held_from_msg(message: MarkerArray) -> tuple[HeldBox, ...]:
-    """Boxes that hang on links; a message replaces what was held before.
+    """Read boxes that hang on links; a message replaces the earlier one.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for a marker that is no box with edges and a pose.

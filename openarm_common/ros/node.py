@@ -54,7 +54,7 @@ def _profile(depth: int, *, reliable: bool = True, latched: bool = False) -> QoS
 
 
 def reliable(depth: int) -> QoSProfile:
-    """Reliable, volatile, keep last `depth`."""
+    """Return the profile reliable, volatile, keep last `depth`."""
     return _profile(depth)
 
 
@@ -237,7 +237,7 @@ _SYMBOLS = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
 
 
 def run(factory: Callable[[], BaseNode[Any]]) -> None:
-    """Main function of a node: create, spin until SIGINT or SIGTERM, shut down in order, exit.
+    """Run a node: create, spin until SIGINT or SIGTERM, shut down in order, exit.
 
     The process exits with 0 after a signal and with 1 when the node could not be created.
     """

@@ -150,16 +150,16 @@ class SceneObject(Config):
         return self.mass or self.volume * DENSITY
 
     def centre(self, table: Table) -> tuple[float, float, float]:
-        """Position of the centre, m; on the table where the scene gives no z."""
+        """Return the position of the centre, m; on the table where the scene gives no z."""
         z = self.position[2] if len(self.position) == 3 else table.top_z + self.size[2] / 2.0
         return self.position[0], self.position[1], z
 
     def T_world_object(self, table: Table) -> Array:
-        """Pose, (4, 4)."""
+        """Return the pose, (4, 4)."""
         return se3.make(se3.rot_z(self.yaw), self.centre(table))
 
     def outline(self) -> Array:
-        """Convex outline (n, 2) of the footprint in the base frame, m."""
+        """Return the convex outline (n, 2) of the footprint in the base frame, m."""
         if self.shape != "box":
             angles = np.arange(32) * (math.tau / 32.0)
             corners = np.stack([np.cos(angles), np.sin(angles)], axis=1) * (self.size[0] / 2.0)
@@ -240,6 +240,11 @@ def parse_scene(data: Mapping[str, Any], where: str) -> Scene:
 
 def parse_object(data: Mapping[str, Any], table: Table, where: str) -> SceneObject:
     """Validate one object that is to be put on (or above) a table.
+
+    Args:
+        data: Keys of `SceneObject`.
+        table: The table.
+        where: Begins each fault.
 
     Raises:
         OpenArmError: SCENE_INVALID, naming each wrong key, or that it is not on the table.
@@ -362,7 +367,7 @@ def _duplicates(what: str, values: Iterable[str]) -> list[str]:
 
 
 def _overlap(a: SceneObject, b: SceneObject, table: Table) -> float:
-    """How deep two objects are in each other, m; 0 when apart. Separating axes of the outlines, and z."""
+    """Return how deep two objects overlap, m; 0 when apart. Separating axes of the outlines, and z."""
     outlines = (a.outline(), b.outline())
     edges = np.concatenate([np.roll(outline, -1, axis=0) - outline for outline in outlines])
     normals = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1, keepdims=True)

@@ -74,7 +74,7 @@ class SimulatedCameras:
             self.faults.spoil_depth(name, depth)
 
     def intrinsics(self, name: str) -> Intrinsics:
-        """Intrinsics that a camera publishes."""
+        """Return the intrinsics that a camera publishes."""
         return self.faults.intrinsics(name, self._cameras[name].intrinsics)
 
     def _measure(self, name: str, z: Floats) -> Floats:

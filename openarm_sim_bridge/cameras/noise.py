@@ -37,7 +37,14 @@ class ColourNoiseConfig(Config):
 
 
 def add_depth_noise(z: Floats, focal: float, config: DepthNoiseConfig, rng: np.random.Generator) -> Floats:
-    """Return the depth (height, width) that a camera of this focal length (pixels) would measure."""
+    """Return the depth (height, width) that a camera of this focal length (pixels) would measure.
+
+    Args:
+        z: (height, width) true depth, m, NaN where invalid.
+        focal: Focal length, pixels.
+        config: Of the noise.
+        rng: Source of the noise.
+    """
     edge, low, high = _edges(z, config.jump)
     out = z.copy()
     chance = rng.random(z.shape, dtype=np.float32)
@@ -56,7 +63,7 @@ def add_depth_noise(z: Floats, focal: float, config: DepthNoiseConfig, rng: np.r
 
 
 def _edges(z: Floats, jump: float) -> tuple[Mask, Floats, Floats]:
-    """Which pixels have a jump to a neighbour in the row or column; the nearest and the farthest of those around."""
+    """Return which pixels have a jump to a neighbour, and the nearest and the farthest of those around."""
     padded = np.pad(z, 1, mode="edge")
     near = (padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1])
     low, high = z, z
@@ -66,7 +73,13 @@ def _edges(z: Floats, jump: float) -> tuple[Mask, Floats, Floats]:
 
 
 def add_colour_noise(pixels: Bytes, config: ColourNoiseConfig, rng: np.random.Generator) -> None:
-    """Make a colour image (height, width, 3) brighter or darker and noisy, in place."""
+    """Make a colour image (height, width, 3) brighter or darker and noisy, in place.
+
+    Args:
+        pixels: (height, width, 3), changed.
+        config: Of noise and exposure.
+        rng: Source of the noise.
+    """
     if config.sigma == 0.0 and config.exposure == 1.0:
         return
     values = pixels * np.float32(config.exposure)

@@ -148,7 +148,7 @@ class SnapshotRenderer:
 
 
 def planar_metres(raw: Floats, near: float, far: float) -> Floats:
-    """Distance along the optical axis, m, of a reversed depth buffer; in place.
+    """Convert a reversed depth buffer to distances along the optical axis, m, in place.
 
     Args:
         raw: Depth buffer: 1 at the near plane, 0 at the far plane.
@@ -162,7 +162,7 @@ def planar_metres(raw: Floats, near: float, far: float) -> Floats:
 
 
 def millimetres(z: Floats) -> NDArray[np.uint16]:
-    """Whole millimetres, 0 for NaN, of metres below 65; `z` is overwritten."""
+    """Convert metres below 65 to whole millimetres, 0 for NaN; `z` is overwritten."""
     np.multiply(z, np.float32(1000.0), out=z)
     np.add(z, np.float32(0.5), out=z)
     return np.nan_to_num(z, copy=False, nan=0.0).astype(np.uint16)

@@ -293,5 +293,5 @@ class TrajectoryFollower(Follower):
 
 
 def _or_default(value: float, default: float) -> float:
-    """0 stands for the default and a negative value for no bound, as in control_msgs."""
+    """Return the default for 0 and no bound for a negative value, as in control_msgs."""
     return default if value == 0.0 else (np.inf if value < 0.0 else value)

@@ -105,7 +105,7 @@ class RobotController:
         return PositionCommand(known, tuple(name for name in names if name not in self._limits))
 
     def busy(self, command: PositionCommand) -> tuple[str, ...]:
-        """Joints of a command that are ignored because their arm or gripper follows a goal."""
+        """Return the joints of a command that are ignored because their arm or gripper follows a goal."""
         return tuple(name for f, _ in self._followers if f.busy for name in f.group.names if name in command.positions)
 
     def command(self, command: PositionCommand) -> None:
@@ -129,7 +129,7 @@ class RobotController:
             follower.abort(why)
 
     def update(self, state: JointReadout, dt_ns: int) -> Array:
-        """Actuator targets (n,) for the tick of `dt_ns` that begins at `state`; valid until the next call."""
+        """Return the actuator targets (n,) of a tick of `dt_ns` that begins at `state`; valid until the next call."""
         self._now_ns = state.t_ns
         self._hold_where_commands_ceased()
         for follower, at in self._followers:
@@ -139,7 +139,7 @@ class RobotController:
         return self._targets
 
     def effort_limits(self) -> dict[int, float]:
-        """Effort limits of the grippers by joint index, N."""
+        """Return the effort limits of the grippers by joint index, N."""
         return {int(at[0]): f.effort_limit for f, at in self._followers if isinstance(f, GripperFollower)}
 
     def _hold_where_commands_ceased(self) -> None:

@@ -39,12 +39,12 @@ class Tracker:
         self._a_max = np.asarray(acceleration, dtype=np.float64)
 
     def hold(self, position: ArrayLike) -> None:
-        """Be at rest at a position."""
+        """Stop at a position."""
         self.position[:] = position
         self.velocity[:] = 0.0
 
     def stopping_place(self) -> Array:
-        """Position (k,) at which it comes to rest when it begins to brake now."""
+        """Return the position (k,) at which it comes to rest when it begins to brake now."""
         return self.position + self.velocity * np.abs(self.velocity) / (2.0 * self._a_max)
 
     def step(self, target: Array, dt: float, v_max: ArrayLike | None = None) -> None:

@@ -219,7 +219,7 @@ class JointSpline:
         return float(self._t[-1])
 
     def sample(self, t: float) -> tuple[Array, Array]:
-        """Position and velocity (k,) at a time; at rest before the first and after the last point."""
+        """Return the position and velocity (k,) at a time; at rest before the first and after the last point."""
         if t >= self._t[-1]:
             return self._last.copy(), np.zeros_like(self._last)
         i = int(np.searchsorted(self._t, t, side="right")) - 1

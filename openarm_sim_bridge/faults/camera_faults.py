@@ -91,7 +91,7 @@ class CameraFaults:
         return drop is not None and bool(self._rngs["camera_drop"].random() < drop.share)
 
     def delay_s(self, camera: str) -> float:
-        """How late frames are, s."""
+        """Return by how much frames are late, s."""
         delay = self._of(CameraDelay, camera)
         return delay.seconds if delay is not None else 0.0
 
@@ -100,12 +100,12 @@ class CameraFaults:
         return self._of(CameraFreeze, camera) is not None
 
     def stamp_ns(self, camera: str, t_ns: int) -> int:
-        """Stamp that a frame carries; never before zero."""
+        """Return the stamp that a frame carries; never before zero."""
         offset = self._of(StampOffset, camera)
         return max(0, t_ns + round(offset.ms * 1e6)) if offset is not None else t_ns
 
     def intrinsics(self, camera: str, true: Intrinsics) -> Intrinsics:
-        """Intrinsics that are published."""
+        """Return the intrinsics that are published."""
         bias = self._of(IntrinsicsBias, camera)
         if bias is None:
             return true

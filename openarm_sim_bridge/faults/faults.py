@@ -170,6 +170,11 @@ def find(faults: Iterable[Fault], model: type[ParametersT]) -> ParametersT | Non
 def checked_fault(name: str, data: Mapping[str, Any], seed: int = 0) -> Fault:
     """Make a fault.
 
+    Args:
+        name: One of `FAULTS`.
+        data: Its parameters; those left out are the defaults.
+        seed: Of all randomness of the fault.
+
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the faults there are, or the parameter that is wrong.
     """
@@ -187,6 +192,11 @@ def checked_fault(name: str, data: Mapping[str, Any], seed: int = 0) -> Fault:
 
 def parse_fault(name: str, text: str, seed: int = 0) -> Fault:
     """Make a fault from a YAML mapping of its parameters; empty is the defaults.
+
+    Args:
+        name: One of `FAULTS`.
+        text: YAML.
+        seed: Of all randomness of the fault.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, as `checked_fault`, or when the text is no YAML mapping.

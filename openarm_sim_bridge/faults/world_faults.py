@@ -148,6 +148,11 @@ def _side(joint: str) -> str:
 def nudge(world: World, parameters: ObjectNudged, seed: int) -> None:
     """Push an object aside.
 
+    Args:
+        world: The world.
+        parameters: Which object, and how far.
+        seed: Of the direction.
+
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the objects there are; SCENE_INVALID, when it would overlap something.
     """

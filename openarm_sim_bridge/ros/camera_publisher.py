@@ -30,7 +30,7 @@ _STREAMS = ("color", "depth")
 
 
 def topic_names(camera: CameraConfig) -> tuple[str, ...]:
-    """Topics of a camera before any remapping."""
+    """Return the topics of a camera before any remapping."""
     kinds = ("image_raw", "camera_info")
     return tuple(f"/{camera.name}/{stream}/{kind}" for stream in _STREAMS[: 1 + camera.depth] for kind in kinds)
 

@@ -80,7 +80,7 @@ class GripperServer(ControllerServer[GripperOutcome]):
 
 
 def _parallel_goal(request: ParallelGripperCommand.Goal, joint: str) -> GripperGoal:
-    """Goal of a command that names the finger joint, or no joint at all.
+    """Return the goal of a command that names the finger joint, or no joint at all.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for other joints or no position.

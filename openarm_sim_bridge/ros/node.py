@@ -184,7 +184,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             raise OpenArmError(Code.NOT_READY, "there are no cameras: the parameter images is false")
 
     def _on_crash(self, error: Exception) -> None:
-        """The physics ended by a fault of the program: end the process, so that it is started again."""
+        """End the process after an unexpected error of the physics, so that it is restarted."""
         self.get_logger().fatal(f"the physics thread ended: {error!r}\n{''.join(traceback.format_exception(error))}")
         self.context.try_shutdown()
 

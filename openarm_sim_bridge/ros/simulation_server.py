@@ -179,7 +179,7 @@ class SimulationServer:
 
 
 def _pose_of(name: str, pose: PoseStamped, scene: Scene) -> Array:
-    """T_world_object of an object of a scene.
+    """Return T_world_object of an object of a scene.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the objects that exist; as `_pose_in_world`.
@@ -214,7 +214,7 @@ def _pose_in_world(pose: PoseStamped, table_top_z: float) -> tuple[Array, bool]:
 
 
 def _object_of(request: SpawnObject.Request, table_top_z: float) -> dict[str, Any]:
-    """Keys of a `SceneObject`.
+    """Return the keys of a `SceneObject` from a request.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, as `_pose_in_world`.

@@ -96,7 +96,13 @@ class StatePublisher:
         self._tf_static.publish(TFMessage(transforms=[matrix_to_transform(*edge, 0) for edge in edges]))
 
     def publish(self, state: JointReadout, world: World, *, joints: bool = True) -> None:
-        """Publish a tick; `joints` is False in an injected gap of the joint states."""
+        """Publish a tick; `joints` is False in an injected gap of the joint states.
+
+        Args:
+            state: Joints at the end of the tick.
+            world: The world then.
+            joints: Whether the joint state is published.
+        """
         stamp = ns_to_stamp(state.t_ns)
         self._clock_message.clock = stamp
         self._clock.publish(self._clock_message)

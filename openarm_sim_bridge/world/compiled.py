@@ -95,7 +95,7 @@ def compile_world(
 
 
 def joint_slices(model: mujoco.MjModel, joint: int) -> tuple[slice, slice]:
-    """Where a joint of any type lies in qpos and in qvel."""
+    """Return the slices of a joint of any type in qpos and in qvel."""
     width_q, width_v = {0: (7, 6), 1: (4, 3)}.get(int(model.jnt_type[joint]), (1, 1))
     q, v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
     return slice(q, q + width_q), slice(v, v + width_v)
@@ -132,7 +132,7 @@ def _free_joint(model: mujoco.MjModel, body_name: str) -> int:
 
 
 def start_qpos(model: mujoco.MjModel, home: Mapping[str, float]) -> Array:
-    """Configuration (nq,) with joints at given positions by name, those coupled to them too, the rest at its reference.
+    """Return the configuration (nq,) with some joints at given positions, and those coupled to them.
 
     Raises:
         KeyError: When a joint is missing.

@@ -46,7 +46,7 @@ class MovingEdges:
         self._sine = np.hstack([w0 * v1 + np.cross(v0, v1), -np.sum(v0 * v1, axis=1, keepdims=True)])
 
     def poses(self, positions: Array) -> tuple[Array, Array]:
-        """Translations (m, 3) and quaternions (m, 4) of all edges at joint positions (n,)."""
+        """Return the translations (m, 3) and quaternions (m, 4) of all edges at joint positions (n,)."""
         q = self._scale * positions[self._column] + self._offset
         half = np.where(self._slides, 0.0, 0.5 * q)[:, None]
         quaternions = self._cosine * np.cos(half) + self._sine * np.sin(half)

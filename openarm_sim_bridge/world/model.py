@@ -134,7 +134,7 @@ def compile_model(
 
 
 def contact_of(physics: PhysicsConfig) -> dict[str, Any]:
-    """Geom attributes of objects, table and floor."""
+    """Return the geom attributes of objects, table and floor."""
     return {
         "friction": physics.object_friction,
         "solref": physics.contact_solref,
@@ -143,7 +143,7 @@ def contact_of(physics: PhysicsConfig) -> dict[str, Any]:
 
 
 def robot_spec(description: RobotDescription, physics: PhysicsConfig) -> mujoco.MjSpec:
-    """The robot alone, ready to move.
+    """Make the model of the robot alone, with actuators and contact settings.
 
     Raises:
         OpenArmError: CONFIG_INVALID, when MuJoCo does not read the URDF.
@@ -256,7 +256,7 @@ def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: S
 def _add_servo(
     spec: mujoco.MjSpec, description: RobotDescription, name: str, kp: float, kv: float, force: float
 ) -> None:
-    """A position actuator named like its joint, its range the joint's."""
+    """Add a position actuator named like its joint, with the range of the joint."""
     joint = description.joints[name]
     actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     actuator.set_to_position(kp=kp, kv=kv)

@@ -35,7 +35,7 @@ _T_OPTICAL_MUJOCO = se3.make(se3.rot_x(math.pi))
 
 
 def add_environment(spec: mujoco.MjSpec, contact: Mapping[str, Any]) -> None:
-    """Floor, sky and light."""
+    """Add floor, sky and light."""
     visual = spec.visual
     visual.headlight.ambient = (0.38, 0.38, 0.38)
     visual.headlight.diffuse = (0.22, 0.22, 0.22)
@@ -75,7 +75,13 @@ def add_environment(spec: mujoco.MjSpec, contact: Mapping[str, Any]) -> None:
 
 
 def add_table(spec: mujoco.MjSpec, table: Table, contact: Mapping[str, Any]) -> None:
-    """The body `table`, its origin in the middle of the top's surface."""
+    """Add the body `table`, its origin in the middle of the top's surface.
+
+    Args:
+        spec: Model that is extended.
+        table: The table.
+        contact: Geom attributes of its top.
+    """
     x, y = table.centre
     length, width, thickness = table.extents
     spec.add_material(name="table", rgba=_TABLE_RGBA, specular=0.05, shininess=0.1)
@@ -109,7 +115,15 @@ def add_table(spec: mujoco.MjSpec, table: Table, contact: Mapping[str, Any]) -> 
 
 
 def add_object(spec: mujoco.MjSpec, item: SceneObject, table: Table, contact: Mapping[str, Any], condim: int) -> None:
-    """A free body; body and joint carry the object's name."""
+    """Add a free body; body and joint carry the object's name.
+
+    Args:
+        spec: Model that is extended.
+        item: The object.
+        table: On which it is placed where it has no height.
+        contact: Geom attributes.
+        condim: Contact dimensions.
+    """
     body = spec.worldbody.add_body(
         name=item.name, pos=item.centre(table), quat=(math.cos(item.yaw / 2.0), 0.0, 0.0, math.sin(item.yaw / 2.0))
     )
@@ -128,7 +142,7 @@ def add_object(spec: mujoco.MjSpec, item: SceneObject, table: Table, contact: Ma
 
 
 def add_fixture(spec: mujoco.MjSpec, item: Fixture) -> None:
-    """The body of an MJCF file, fixed to a link or to the world; all its names begin with the fixture's.
+    """Add the body of an MJCF file, fixed to a link or to the world; all its names begin with the fixture's.
 
     Raises:
         OpenArmError: CONFIG_INVALID, when the link or the file does not exist, or the file is no MJCF of one body.
@@ -155,7 +169,12 @@ def add_fixture(spec: mujoco.MjSpec, item: Fixture) -> None:
 
 
 def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig], mount_seed: int | None) -> None:
-    """Cameras where they really are, with their housings right behind the lens.
+    """Add cameras at their true mounts, with their housings right behind the lens.
+
+    Args:
+        spec: Model that is extended.
+        cameras: With nominal mounts.
+        mount_seed: Of the mount errors; None is the nominal mounts.
 
     Raises:
         OpenArmError: CONFIG_INVALID, when a parent is not a link of the robot.
@@ -186,7 +205,7 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig], mount_seed
 def _add_housing(
     parent: Any, name: str, housing: tuple[float, float, float], T_parent_link: se3.Array, T_link_housing: se3.Array
 ) -> None:
-    """A box with its front face just behind the lens; it collides like a part of the link that carries it."""
+    """Add a box with its front face just behind the lens; it collides like a part of the link that carries it."""
     depth, width, height = housing
     T_parent_housing = T_parent_link @ T_link_housing
     parent.add_geom(

@@ -48,11 +48,11 @@ class Stage:
             self.home |= description.group_state(f"{side}_arm", "home") | {description.finger_joint(side): 0.0}
 
     def arms(self) -> dict[str, JointGroup]:
-        """Joint group of each arm, by side."""
+        """Return the joint group of each arm, by side."""
         return {side: self._group(self._description.arm_joints(side)) for side in SIDES}
 
     def grippers(self) -> dict[str, JointGroup]:
-        """Joint group (the driving finger joint) of each gripper, by side."""
+        """Return the joint group (the driving finger joint) of each gripper, by side."""
         return {side: self._group((self._description.finger_joint(side),)) for side in SIDES}
 
     def world(self, scene: Scene) -> World:
@@ -72,7 +72,7 @@ class Stage:
         return world.compile(self._spec(scene), tracked(scene))
 
     def posture(self, keyframe: str) -> dict[str, float]:
-        """Joint positions of a keyframe, rad: the SRDF's state of that name of either arm; an arm without one is home.
+        """Return joint positions of a keyframe, rad: a state of that name in the SRDF of either arm, else home.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, naming the keyframes there are.
@@ -94,7 +94,7 @@ class Stage:
 
 
 def tracked(scene: Scene) -> tuple[TrackedObject, ...]:
-    """Objects of a scene whose true poses are reported."""
+    """Return the objects of a scene whose true poses are reported."""
     return tuple(TrackedObject(item.name, item.label, item.size) for item in scene.objects)
 
 

@@ -15,12 +15,12 @@ from openarm_common.types import Array
 
 
 def hand_link(side: str) -> str:
-    """Link that carries the wrist's force-torque sensor."""
+    """Return the link that carries the wrist's force-torque sensor."""
     return f"openarm_{side}_hand"
 
 
 def pad_links(side: str) -> tuple[str, str]:
-    """Finger links of a hand; the pad of each is its collision geom `{link}_pad_collision`."""
+    """Return the finger links of a hand; the pad of each is its collision geom `{link}_pad_collision`."""
     return f"openarm_{side}_left_finger", f"openarm_{side}_right_finger"
 
 
@@ -33,7 +33,13 @@ def add_wrist_sensor(spec: mujoco.MjSpec, body: str) -> None:
 
 
 def wrist_wrench(model: mujoco.MjModel, data: mujoco.MjData, body: str) -> tuple[Array, Array]:
-    """Force and torque (3,) by which the arm holds a body with a wrist sensor and all beyond it, in its own frame."""
+    """Return force and torque (3,) by which the arm holds a body and all beyond it, in the body's frame.
+
+    Args:
+        model: The model.
+        data: Its state after a step.
+        body: With a wrist sensor.
+    """
     out: list[Array] = []
     for what in ("force", "torque"):
         sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, f"{body}_{what}")
@@ -46,6 +52,11 @@ def contact_wrench(model: mujoco.MjModel, data: mujoco.MjData, geoms: Iterable[i
     """Sum of the contact forces on geoms of one body, and their torque about its origin, (3,) in the body's frame.
 
     A contact names its two geoms in an order of MuJoCo's choice; its force is the one on the second.
+
+    Args:
+        model: The model.
+        data: Its state after a step.
+        geoms: Ids of geoms of one body.
     """
     wanted = set(geoms)
     force, torque, result = np.zeros(3), np.zeros(3), np.zeros(6)

@@ -141,23 +141,23 @@ class World:
 
     # --- readings
     def read_joints(self) -> JointReadout:
-        """Positions, velocities and actuator efforts of the actuated joints."""
+        """Return the positions, velocities and actuator efforts of the actuated joints."""
         c, d = self._compiled, self.data
         return JointReadout(self.t_ns, d.qpos[c.qpos], d.qvel[c.dof], d.actuator_force[c.actuator])
 
     def target_lead_s(self) -> Array:
-        """Time (n,) by which each joint lags behind a moving target: all its damping over the stiffness, s."""
+        """Return the time (n,) by which each joint lags behind a moving target: damping over stiffness, s."""
         c, m = self._compiled, self.model
         kp = m.actuator_gainprm[c.actuator, 0]
         damping = m.dof_damping[c.dof] - m.actuator_biasprm[c.actuator, 2]
         return np.divide(damping, kp, out=np.zeros_like(kp), where=kp > 0.0)
 
     def effort_limits(self) -> Array:
-        """Effort limits (n,) of the actuators in the model, N m or N; infinite where there is none."""
+        """Return the effort limits (n,) of the actuators in the model, N m or N; infinite where there is none."""
         return self._compiled.effort_limit.copy()
 
     def body_pose(self, name: str) -> Array:
-        """T_world_body, (4, 4), at the present time. For tests and judges.
+        """Return T_world_body, (4, 4), at the present time. For tests and judges.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, naming the bodies that exist.
@@ -170,7 +170,7 @@ class World:
         return se3.make(self.data.xmat[body].reshape(3, 3), self.data.xpos[body])
 
     def objects(self) -> tuple[ObjectReadout, ...]:
-        """Pose and twist of every tracked object: ground truth, for judges alone, never for what controls the robot."""
+        """Return pose and twist of every tracked object: ground truth, for judges alone, not for controllers."""
         c, d = self._compiled, self.data
         out: list[ObjectReadout] = []
         for tracked, q, v in zip(c.objects, c.object_qpos, c.object_dof, strict=True):
@@ -181,16 +181,16 @@ class World:
         return tuple(out)
 
     def wrist_wrench(self, body: str) -> tuple[Array, Array]:
-        """Force and torque (3,) of the wrist sensor of a body, in its frame; as `touch.wrist_wrench`."""
+        """Return the force and torque (3,) of the wrist sensor of a body, in its frame; as `touch.wrist_wrench`."""
         return wrist_wrench(self.model, self.data, body)
 
     def pad_wrench(self, link: str) -> tuple[Array, Array]:
-        """Contact force and torque (3,) on the pad of a finger link, in its frame. A sensor of the simulated robot."""
+        """Return contact force and torque (3,) on the pad of a finger link, in its frame: a simulated sensor."""
         pad = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_GEOM, f"{link}_pad_collision")
         return contact_wrench(self.model, self.data, (pad,))
 
     def snapshot(self) -> Snapshot:
-        """Copy of the configuration for a renderer."""
+        """Copy the configuration for a renderer."""
         return Snapshot(self.model, self.t_ns, self.data.qpos.copy())
 
     # --- reset and exchange
@@ -306,7 +306,7 @@ class World:
         qpos[address + 3 : address + 7] = np.roll(se3.quat_xyzw_from_matrix(T_world_object[:3, :3]), 1)
 
     def _overlap(self, of: set[int]) -> str:
-        """What is wrong with where some bodies are; empty when they only touch."""
+        """Return a sentence about bodies that overlap others; empty when they only touch."""
         m = self.model
         for contact in self.data.contact:
             bodies = [int(m.geom_bodyid[geom]) for geom in (contact.geom1, contact.geom2)]
