@@ -55,6 +55,9 @@ def test_a_package_is_complete_for_colcon_too(package: str, monkeypatch: pytest.
     runpy.run_path("setup.py", run_name="__main__")
     inside = [".".join([package, *path.parent.relative_to(folder).parts]) for path in folder.rglob("__init__.py")]
     assert sorted(told["packages"]) == sorted(inside)  # setup.py lists sub-packages by hand
+    patterns = told["package_data"][package]
+    brought = {path for pattern in patterns for path in folder.glob(pattern) if path.is_file()}
+    assert {path for path in folder.rglob("*") if path.suffix in (".html", ".js", ".css", ".svg", ".typed")} <= brought
     assert told["version"] == manifest.findtext("version") == _project()["version"]
     for script in told.get("entry_points", {"console_scripts": []})["console_scripts"]:
         module = script.split(" = ")[1].removesuffix(":main").split(".")
