@@ -7,6 +7,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
-from openarm_grasp.strategies.orders import Ask, Order
+from openarm_grasp.strategies.orders import Order
 from openarm_grasp.strategies.pair import Pair
 from openarm_grasp.strategies.registry import carry_out, carry_out_pair
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
@@ -99,7 +100,7 @@ class Trials:
         """Grasp what is asked for; what others hide or block is asked for again when they have been placed."""
         labels, clear = self._task.labels, self._task.clear
         if not clear and len(set(labels)) < len(labels):  # the same object more than once
-            return [self._grasp(Ask(label)) for label in labels]
+            return [self._grasp(GraspRequest(label)) for label in labels]
         order, placed, open_ = Order(labels, each=Counter(labels)), list[Trial](), dict[str, Trial]()
         while ask := order.next():
             trial = self._grasp(ask)
@@ -113,13 +114,13 @@ class Trials:
         missing = Counter(labels) - Counter(trial.label for trial in placed)
         return [*placed, *(open_[label] for label in missing.elements())]
 
-    def _grasp(self, ask: Ask) -> Trial:
+    def _grasp(self, ask: GraspRequest) -> Trial:
         robot, task = self.robot, self._task
         began, first = time.monotonic(), len(self.steps)
         for track in robot.tracks.values():
             track.clear()
         robot.pass_time(0.1)
-        request = GraspRequest(ask.label, task.arm, task.place, leave=ask.leave)
+        request = replace(ask, arm=task.arm, place=task.place)
         result: GraspOutcome | OpenArmError
         try:
             result = self.link.run(carry_out(self.grasp_task(request)))

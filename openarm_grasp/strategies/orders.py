@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self, TypeAlias
+from typing import Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -18,8 +18,7 @@ from pydantic import Field, model_validator
 from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import Interval
-
-Place: TypeAlias = tuple[float, float]
+from openarm_grasp.strategies.request import GraspRequest
 
 #: With these another place in a bin may be had.
 _BLOCKED = (Code.IN_COLLISION, Code.UNREACHABLE, Code.NO_PLAN)
@@ -75,21 +74,6 @@ def load_bins(path: Path) -> Bins:
     return load_config(path, Bins)
 
 
-@dataclass(frozen=True)
-class Ask:
-    """What to ask for next.
-
-    Attributes:
-        label: Of the object.
-        place: (x, y) where it shall stand; None: a free spot.
-        leave: (x, y) of objects of that label that have been placed already.
-    """
-
-    label: str
-    place: Place | None = None
-    leave: tuple[Place, ...] = ()
-
-
 @dataclass
 class Order:
     """Objects to be picked one after the other.
@@ -126,8 +110,8 @@ class Order:
             known = ", ".join(self.bins.classes) or "no label"
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no bin for {', '.join(homeless)}; there are bins for {known}")
 
-    def next(self) -> Ask | None:
-        """What to ask for now; None when the order has ended."""
+    def next(self) -> GraspRequest | None:
+        """The next request; None when the order has ended."""
         for label in dict.fromkeys(self.labels):
             if label in self.failed or self.placed.count(label) >= self._most(label):
                 continue
@@ -135,21 +119,21 @@ class Order:
                 continue  # nothing has been taken away since
             stand = self._stand.get(label, ())
             if self.bins is None:
-                return Ask(label, None, stand)
+                return GraspRequest(label, leave=stand)
             name = self.bins.of(label)
             slots = self.bins.bins[name].slots(self.bins.spacing)
             at = self._used.get(name, 0)
             if at < len(slots):
-                return Ask(label, slots[at], stand)
+                return GraspRequest(label, place=slots[at], leave=stand)
             self.failed[label] = f"bin {name!r} is full: it has {len(slots)} places"
         self.failed |= {label: why for label, (_, why) in self._blocked.items()}
         return None
 
-    def done(self, ask: Ask, code: Code, message: str, where: Sequence[float] = ()) -> None:
+    def done(self, request: GraspRequest, code: Code, message: str, where: Sequence[float] = ()) -> None:
         """Note what came of a request; `where` (x, y) is where the object stands now, when it was placed."""
-        label = ask.label
+        label = request.label
         self._blocked.pop(label, None)
-        next_slot = code is Code.OK or (code in _BLOCKED and ask.place is not None)
+        next_slot = code is Code.OK or (code in _BLOCKED and request.place is not None)
         if self.bins is not None and next_slot:
             name = self.bins.of(label)
             self._used[name] = self._used.get(name, 0) + 1

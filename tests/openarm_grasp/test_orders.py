@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.strategies.orders import Ask, Bin, Bins, Order, load_bins
+from openarm_grasp.strategies.orders import Bin, Bins, Order, load_bins
+from openarm_grasp.strategies.request import GraspRequest
 
 BINS = Bins(
     bins={"left": Bin(x=(0.16, 0.28), y=(0.20, 0.44)), "right": Bin(x=(0.16, 0.28), y=(-0.32, -0.20))},
@@ -15,9 +16,11 @@ BINS = Bins(
 )
 
 
-def carry_out(order: Order, codes: dict[Ask, Code] | None = None, table: dict[str, int] | None = None) -> list[Ask]:
+def carry_out(
+    order: Order, codes: dict[GraspRequest, Code] | None = None, table: dict[str, int] | None = None
+) -> list[GraspRequest]:
     """Answer every request: from `codes`, else OK while there is one on the table."""
-    asked: list[Ask] = []
+    asked: list[GraspRequest] = []
     table = {"red": 9, "blue": 9} if table is None else dict(table)
     while ask := order.next():
         asked.append(ask)
@@ -58,7 +61,7 @@ def test_all_of_a_label_until_none_is_left():
 @pytest.mark.requirement("P-02")
 def test_an_order_done_in_part_says_so():
     order = Order(("red", "blue"))
-    carry_out(order, {Ask("red"): Code.TOO_WIDE})
+    carry_out(order, {GraspRequest("red"): Code.TOO_WIDE})
     assert order.outcome == "PARTIAL"
     assert order.faults() == {"red": "TOO_WIDE: as told"}
     assert order.placed == ["blue"]
@@ -75,7 +78,7 @@ def test_a_label_that_was_never_there_failed():
 def test_a_taken_slot_is_passed_over_and_a_full_bin_named():
     first, second = BINS.bins["left"].slots(BINS.spacing)
     order = Order(("red",), BINS, each=3)
-    asked = carry_out(order, {Ask("red", first): Code.IN_COLLISION})
+    asked = carry_out(order, {GraspRequest("red", place=first): Code.IN_COLLISION})
     assert [ask.place for ask in asked] == [first, second]
     assert order.placed == ["red"]
     assert order.faults() == {"red": "bin 'left' is full: it has 2 places"}
@@ -98,19 +101,19 @@ def test_orders_and_bins_that_make_no_sense_are_refused(tmp_path):
 
 def test_what_others_block_is_asked_for_again_when_they_are_gone():
     order = Order(("red", "blue"))
-    assert order.next() == Ask("red")
-    order.done(Ask("red"), Code.IN_COLLISION, "blue is in the way")
-    assert order.next() == Ask("blue")
-    order.done(Ask("blue"), Code.OK, "")
-    assert order.next() == Ask("red")
-    order.done(Ask("red"), Code.OK, "")
+    assert order.next() == GraspRequest("red")
+    order.done(GraspRequest("red"), Code.IN_COLLISION, "blue is in the way")
+    assert order.next() == GraspRequest("blue")
+    order.done(GraspRequest("blue"), Code.OK, "")
+    assert order.next() == GraspRequest("red")
+    order.done(GraspRequest("red"), Code.OK, "")
     assert order.next() is None
     assert order.outcome == "SUCCESS"
 
 
 def test_what_stays_blocked_failed_with_its_reason():
     order = Order(("red", "blue"))
-    carry_out(order, {Ask("red"): Code.NO_PLAN, Ask("blue"): Code.NO_PLAN})
+    carry_out(order, {GraspRequest("red"): Code.NO_PLAN, GraspRequest("blue"): Code.NO_PLAN})
     assert order.faults() == {"red": "NO_PLAN: as told", "blue": "NO_PLAN: as told"}
     assert order.outcome == "FAILED"
 
@@ -119,7 +122,7 @@ def test_what_stays_blocked_failed_with_its_reason():
 def test_what_an_order_has_placed_it_does_not_pick_again():
     order = Order(("red",), each={"red": 2})
     order.done(order.next(), Code.OK, "", (0.3, -0.2, 0.4))
-    assert order.next() == Ask("red", None, ((0.3, -0.2),))
+    assert order.next() == GraspRequest("red", leave=((0.3, -0.2),))
     order.done(order.next(), Code.OK, "", (0.2, -0.2, 0.4))
     assert order.next() is None
     assert order.outcome == "SUCCESS"
@@ -127,9 +130,9 @@ def test_what_an_order_has_placed_it_does_not_pick_again():
 
 def test_what_others_hide_is_asked_for_again_when_they_are_gone():
     order = Order(("red", "blue"))
-    order.done(Ask("red"), Code.NOTHING_DETECTED, "something hides its outline")
-    order.done(Ask("blue"), Code.OK, "", (0.3, 0.2, 0.4))
-    assert order.next() == Ask("red")
-    order.done(Ask("red"), Code.TOO_WIDE, "for good")
+    order.done(GraspRequest("red"), Code.NOTHING_DETECTED, "something hides its outline")
+    order.done(GraspRequest("blue"), Code.OK, "", (0.3, 0.2, 0.4))
+    assert order.next() == GraspRequest("red")
+    order.done(GraspRequest("red"), Code.TOO_WIDE, "for good")
     assert order.next() is None
     assert order.faults() == {"red": "TOO_WIDE: for good"}
