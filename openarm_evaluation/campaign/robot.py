@@ -32,7 +32,7 @@ from openarm_common.types import Array
 from openarm_evaluation.campaign.map_feed import SimulatedMap
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.judging.judge import Sample
-from openarm_grasp.perception.detections import Detection, Frame
+from openarm_grasp.perception.detections import Frame
 from openarm_motion.planning.arm import Arm
 from openarm_motion.service.motion_service import MotionService, make_arms, table_box
 from openarm_motion.service.robot import Outcome
@@ -293,9 +293,8 @@ class SimRobot:
             )
         except OpenArmError:
             return None  # as the detector: the frame is skipped, the next may do
-        seen = (d for d in perceived.boxes if not self.missed or self._rng.random() >= self.missed)
-        found = (Detection(d.label, d.score, d.T_base_object, np.array(d.size), d.method == "circle") for d in seen)
-        return Frame(stamp_ns, tuple(found))
+        detected = (d for d in perceived.boxes if not self.missed or self._rng.random() >= self.missed)
+        return Frame(stamp_ns, tuple(detected))
 
     def _scan(self, name: str) -> MapFrame | None:
         """What the map takes of a camera now; None when the frame is lost or its posture is not known."""

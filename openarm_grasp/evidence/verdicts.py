@@ -14,10 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from openarm_common.detection import Detection
 from openarm_common.errors import Code
 from openarm_common.types import Array
 from openarm_grasp.config import HeldConfig
-from openarm_grasp.perception.detections import Detection, Frame, apart, sticks_out
+from openarm_grasp.perception.detections import Frame, apart, sticks_out
 
 #: Largest turn of a placed object from the yaw that was asked for, rad.
 YAW_TOLERANCE = float(np.radians(15.0))

@@ -14,55 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.types import Array
 
 #: An object that is chosen by its position is no farther from it than this, m.
 SAME_PLACE = 0.05
-
-
-@dataclass(frozen=True)
-class Detection:
-    """One upright box in one frame.
-
-    Attributes:
-        label: Class, for example "red".
-        score: Confidence, 0 to 1; 0: in view, but not measured. Such a box is around what is seen: in the way, but no
-            target.
-        T_base_object: (4, 4) pose of the box centre, yaw only.
-        size: (3,) full edges, m.
-        round: It is a circle seen from above: its yaw says nothing, and a hand may come from any side.
-    """
-
-    label: str
-    score: float
-    T_base_object: Array
-    size: Array
-    round: bool = False
-
-    @property
-    def p_base(self) -> Array:
-        """Centre, base frame, m."""
-        return self.T_base_object[:3, 3]
-
-    @property
-    def top(self) -> float:
-        """Height of the upper face, base frame, m."""
-        return float(self.T_base_object[2, 3] + self.size[2] / 2.0)
-
-    @property
-    def bottom(self) -> float:
-        """Height of the lower face, base frame, m."""
-        return float(self.T_base_object[2, 3] - self.size[2] / 2.0)
-
-    @property
-    def yaw(self) -> float:
-        """Angle of the object's x axis about the base z, rad."""
-        return float(np.arctan2(self.T_base_object[1, 0], self.T_base_object[0, 0]))
-
-    @property
-    def measured(self) -> bool:
-        """Whether the box is the object's, and not only around what is seen of it."""
-        return self.score > 0.0
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,11 @@ from itertools import pairwise
 
 import numpy as np
 
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import DetectConfig
-from openarm_grasp.perception.detections import SAME_PLACE, Detection, Frame, Sighting, apart, average, labels_in_view
+from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart, average, labels_in_view
 
 
 def find(

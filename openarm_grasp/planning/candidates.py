@@ -18,10 +18,10 @@ from math import cos, hypot, radians, sin
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import ApproachConfig, GraspConfig, HandConfig
-from openarm_grasp.perception.detections import Detection
 
 UP = np.array([0.0, 0.0, 1.0])
 #: Below every difference that a tilt makes: a candidate that has failed is tried after all that have not.

@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, held_box, obstacle_boxes, propose, target_box
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import other_grasps, place_targets

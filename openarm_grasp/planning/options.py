@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import nan
 
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import ApproachConfig
 from openarm_grasp.evidence.verdicts import Verdict
-from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import GraspCandidate, wide_edges
 
 #: A plan that fails with one of these says that it cannot be done; with any other it was not found out.

@@ -15,11 +15,12 @@ from math import hypot, inf
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig, PlaceConfig
 from openarm_grasp.evidence.verdicts import SQUARE_WITHIN
-from openarm_grasp.perception.detections import Detection, Frame
+from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import UP, GraspCandidate, PlaceTarget, hold_of
 
 #: Spots nearer to each other than this are one, m.

@@ -15,17 +15,15 @@ from sensor_msgs.msg import JointState
 from vision_msgs.msg import Detection3DArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix, stamp_to_ns, vector, xyz
+from openarm_common.ros.convert import matrix_to_pose, stamp_to_ns, vector, xyz
+from openarm_common.ros.detections import detections_from_msg
 from openarm_common.ros.node import BASE_FRAME
 from openarm_common.types import Array
 from openarm_grasp.evidence.verdicts import Verdict
-from openarm_grasp.perception.detections import Detection, Frame
+from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NoWayError
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
-
-#: Shapes that are round seen from above when they stand; one that lies is seldom as long as wide.
-_ROUND, _AS_LONG_AS_WIDE = frozenset({"cylinder", "can", "sphere"}), 0.001
 
 
 # --- detections
@@ -35,16 +33,7 @@ def frame_from_msg(message: Detection3DArray) -> Frame:
     Raises:
         OpenArmError: INVALID_ARGUMENT, for a pose that is not one.
     """
-    found: list[Detection] = []
-    for item in message.detections:
-        if not item.results:
-            continue
-        best = max(item.results, key=lambda r: r.hypothesis.score)
-        T, size = pose_to_matrix(item.bbox.center), xyz(item.bbox.size)
-        names = {r.hypothesis.class_id for r in item.results}
-        around = bool(names & _ROUND) and abs(float(size[0] - size[1])) < _AS_LONG_AS_WIDE
-        found.append(Detection(best.hypothesis.class_id, best.hypothesis.score, T, size, around))
-    return Frame(stamp_to_ns(message.header.stamp), tuple(found))
+    return Frame(stamp_to_ns(message.header.stamp), detections_from_msg(message))
 
 
 # --- planning

@@ -14,11 +14,12 @@ from math import radians
 
 import numpy as np
 
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_grasp.config import HandOverConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Detection, Sighting
+from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.feasibility import FeasibilityCheck, refusal_of, standing_at

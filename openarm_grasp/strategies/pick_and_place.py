@@ -17,10 +17,11 @@ from enum import Enum
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.verdicts import GripVerdict, PlaceVerdict, SightVerdict, Verdict
-from openarm_grasp.perception.detections import Detection, Frame, Sighting, apart, labels_in_view
+from openarm_grasp.perception.detections import Frame, Sighting, apart, labels_in_view
 from openarm_grasp.perception.find import find, on_table
 from openarm_grasp.planning import candidates
 from openarm_grasp.planning.arms import ARMS, arm_order, out_of_reach

@@ -17,12 +17,13 @@ from math import cos, hypot, inf, pi, radians, sin
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription, Side
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Detection, Sighting
+from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.perception.find import find
 from openarm_grasp.planning.arms import ARMS, arm_order
 from openarm_grasp.planning.candidates import UP, GraspCandidate, shifted

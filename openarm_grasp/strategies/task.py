@@ -6,11 +6,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.drift import DriftWatch
 from openarm_grasp.evidence.verdicts import Verdict
-from openarm_grasp.perception.detections import Detection, Sighting
+from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import GraspCandidate
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.skills import Skills

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from openarm_grasp.perception.detections import Detection
+from openarm_common.detection import Detection
 from tests.openarm_grasp.scripted import World, standing
 
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Table
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.verdicts import Evidence
-from openarm_grasp.perception.detections import Detection, Frame
+from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.planning.feasibility import standing_at
 from openarm_grasp.planning.options import NoWayError

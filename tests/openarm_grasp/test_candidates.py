@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig, HandConfig
-from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import (
     USED_PENALTY,
     held_box,

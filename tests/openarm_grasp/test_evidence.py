@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code
 from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.verdicts import (
@@ -23,7 +24,7 @@ from openarm_grasp.evidence.verdicts import (
     judge_sight,
     judge_still,
 )
-from openarm_grasp.perception.detections import Detection, Frame
+from openarm_grasp.perception.detections import Frame
 
 HELD = HeldConfig()
 GOOD = Evidence(gap=0.0503, expected=0.05, effort=-30.0, speed=0.0)

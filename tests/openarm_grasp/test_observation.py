@@ -11,14 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import DetectConfig
-from openarm_grasp.perception.detections import Detection, Frame, average, in_base, sticks_out
+from openarm_grasp.perception.detections import Frame, average, in_base, sticks_out
 from openarm_grasp.perception.find import find, on_table
 
 
 def seen(label="red", x=0.26, y=-0.2, z=0.425, yaw=0.0, size=(0.04, 0.06, 0.05), score=0.9) -> Detection:
-    return Detection(label, score, se3.make(se3.rot_z(yaw), (x, y, z)), np.array(size))
+    T = se3.make(se3.rot_z(yaw), (x, y, z))
+    return Detection(label, score, T, np.array(size), measured=score > 0.0)
 
 
 def frames(*detections: tuple[Detection, ...]) -> list[Frame]:

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import GraspCandidate, propose
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, yaw_offsets
 

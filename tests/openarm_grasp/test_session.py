@@ -8,10 +8,10 @@ from itertools import product
 import numpy as np
 import pytest
 
+from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Grip, GripVerdict, PlaceVerdict
-from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import propose
 from openarm_grasp.strategies.pair import PairOutcome, check_pair
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, Proof

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import PALETTE, Scene, SceneObject, parse_scene, random_scene
@@ -19,7 +20,6 @@ from openarm_evaluation.campaign.link import approach_of
 from openarm_evaluation.campaign.robot import arms_behind
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import propose, target_box
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.interface import PlanGrasp

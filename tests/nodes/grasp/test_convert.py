@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.detection import Detection
 from openarm_common.ros.convert import pose_to_matrix
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.perception.detections import Detection
 from openarm_grasp.planning.candidates import Box, held_box, propose, target_box
 from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
 from openarm_grasp.ros import convert
