@@ -186,31 +186,38 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         "influence": {v.name: solution.tests[int(problem.pose[k])].influence for k, v in enumerate(problem.views)},
         "outliers": {outlier.name: outlier.reason for outlier in solution.outliers},
     }  # fmt: skip
+    beyond = max(abs(scale - 1.0) - 3.0 * scale_sigma, 0.0)
+    away = max(abs(focal - 1.0) - 3.0 * focal_sigma, 0.0)
+    hint = "; are these its intrinsics?" if away > limits.focal else ""
+    outliers, views = len(solution.outliers), len(problem)
     checks = [
         Check("position", sigma_t / limits.translation, f"predicted error of the position {sigma_t * 1e3:.3f} mm"),
         Check("rotation", sigma_r / limits.rotation, f"predicted error of the rotation {math.degrees(sigma_r):.4f}°"),
-    ]
-    if not math.isnan(one_out.metres):
-        told = f"held-out error {one_out.metres * 1e3:.3f} mm at the board"
-        checks.append(Check("held out", one_out.metres / limits.held_out, told))
-    beyond = max(abs(scale - 1.0) - 3.0 * scale_sigma, 0.0)
-    told = f"the board seems {abs(scale - 1.0) * 100:.2f} % off its stated size"
-    checks.append(Check("board size", beyond / limits.scale, told))
-    away = max(abs(focal - 1.0) - 3.0 * focal_sigma, 0.0)
-    told = f"the focal length seems {(focal - 1.0) * 100:+.2f} % off what camera_info says"
-    told += "; are these its intrinsics?" if away > limits.focal else ""
-    checks.append(Check("focal length", away / limits.focal, told))
-    share = len(solution.outliers) / max(len(problem), 1)
-    told = f"{len(solution.outliers)} of {len(problem)} samples contradict the others"
-    checks.append(Check("contradictions", share / 0.1, told))
-    told = f"{poses} poses, {limits.samples} are wanted"
-    checks.append(Check("poses", 1.5 if poses < limits.samples else 0.0, told))
+        Check(
+            "held out", one_out.metres / limits.held_out, f"held-out error {one_out.metres * 1e3:.3f} mm at the board"
+        ),
+        Check(
+            "board size", beyond / limits.scale,
+            f"the board seems {abs(scale - 1.0) * 100:.2f} % off its stated size",
+        ),
+        Check(
+            "focal length", away / limits.focal,
+            f"the focal length seems {(focal - 1.0) * 100:+.2f} % off its value in camera_info{hint}",
+        ),
+        Check(
+            "contradictions", outliers / max(views, 1) / 0.1,
+            f"{outliers} of {views} samples contradict the others",
+        ),
+        Check("poses", 1.5 if poses < limits.samples else 0.0, f"{poses} poses, {limits.samples} are wanted"),
+    ]  # fmt: skip
+    if math.isnan(one_out.metres):
+        del checks[2]
     if stored is not None:
         offset, angle = mount_error(solution.estimate.X[0], stored)
         figures |= {"drift": offset, "drift_rotation": angle}
         # a drift is no fault of this result: never more than a warning
-        told = f"the camera is {offset * 1e3:.1f} mm and {math.degrees(angle):.2f}° from what is stored"
-        checks.append(Check("drift", min(offset / limits.drift, 2.0), told))
+        text = f"the camera is {offset * 1e3:.1f} mm and {math.degrees(angle):.2f}° from what is stored"
+        checks.append(Check("drift", min(offset / limits.drift, 2.0), text))
     reasons = tuple(check.text for check in checks if check.ratio > 1.0)
     worst = max(check.ratio for check in checks)
     grade: Grade = "fail" if worst > 3.0 else "warn" if worst > 1.0 else "pass"
