@@ -72,11 +72,6 @@ class CameraReport:
     draw_ms: float = 0.0
 
 
-@dataclass(frozen=True)
-class _Model:
-    """Comes with the descriptor of a file."""
-
-
 @dataclass(frozen=True, eq=False)
 class _State:
     t_ns: int
@@ -151,7 +146,7 @@ class StateSender:
         try:
             with open(file, "wb", closefd=False) as out:
                 out.write(data.tobytes())
-            self._send(_Model(), [file])
+            self._send(None, [file])
         finally:
             os.close(file)
 
@@ -194,7 +189,7 @@ class StateReceiver:
         select.select([self._end], [], [], timeout_s)
         work: Work | None = None
         for message, files in _received(self._end):
-            if isinstance(message, _Model):
+            if files:
                 self._model = _load_model(files)
             elif isinstance(message, tuple):
                 self.faults = message

@@ -16,10 +16,8 @@ from openarm_common.types import Array, Ints
 from openarm_sim_bridge.control.arm import TrajectoryConfig, TrajectoryFollower
 from openarm_sim_bridge.control.follower import Follower
 from openarm_sim_bridge.control.gripper import GripperConfig, GripperFollower
-from openarm_sim_bridge.control.trajectory import JointGroup
+from openarm_sim_bridge.control.trajectory import LIMIT_SLACK, JointGroup
 from openarm_sim_bridge.world.world import JointReadout, World
-
-_LIMIT_SLACK = 1e-4
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ class RobotController:
                 raise OpenArmError(
                     Code.INVALID_ARGUMENT, f"commanded position of {name} is {position}, expected a finite number"
                 )
-            if not lower - _LIMIT_SLACK <= position <= upper + _LIMIT_SLACK:
+            if not lower - LIMIT_SLACK <= position <= upper + LIMIT_SLACK:
                 raise OpenArmError(
                     Code.LIMITS,
                     f"commanded position of {name} is {position:.4f}, out of its limits {lower:.4f} to {upper:.4f}",

@@ -19,9 +19,7 @@ from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_sim_bridge.control.follower import End, Follower, Tracker
-from openarm_sim_bridge.control.trajectory import JointGroup
-
-_LIMIT_SLACK = 1e-4
+from openarm_sim_bridge.control.trajectory import LIMIT_SLACK, JointGroup
 
 
 class GripperConfig(Config):
@@ -99,7 +97,7 @@ class GripperFollower(Follower):
         for what, value in (("position", goal.position), ("effort", goal.max_effort), ("velocity", goal.max_velocity)):
             if not np.isfinite(value):
                 raise OpenArmError(Code.INVALID_ARGUMENT, f"{what} of {name} is {value}, expected a finite number")
-        if not lower - _LIMIT_SLACK <= goal.position <= upper + _LIMIT_SLACK:
+        if not lower - LIMIT_SLACK <= goal.position <= upper + LIMIT_SLACK:
             raise OpenArmError(
                 Code.LIMITS,
                 f"position of {name} is {goal.position:.4f} m, out of its limits {lower:.3f} (closed) to {upper:.3f}"

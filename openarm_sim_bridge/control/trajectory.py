@@ -18,7 +18,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 
 #: A limit that was rounded in a file or a message is still kept, rad or m.
-_LIMIT_SLACK = 1e-4
+LIMIT_SLACK = 1e-4
 #: A trajectory ends at rest; what a planner leaves as rounding is allowed, rad/s.
 _END_VELOCITY = 1e-2
 
@@ -165,7 +165,7 @@ def _check_times(t: Array) -> None:
 
 
 def _check_limits(q: Array, group: JointGroup) -> None:
-    out = np.argwhere((q < group.lower - _LIMIT_SLACK) | (q > group.upper + _LIMIT_SLACK))
+    out = np.argwhere((q < group.lower - LIMIT_SLACK) | (q > group.upper + LIMIT_SLACK))
     if out.size:
         i, j = out[0]
         raise TrajectoryError(
