@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The panel beside the scene: the state of the grasp, what can be asked for, how the nodes are.
+// The panel next to the scene: the state of the grasp, requests, the health of the nodes.
 // What comes from the graph is shown as text (textContent), never as markup.
 
 const $ = (id) => document.getElementById(id);
@@ -18,7 +18,7 @@ export function element(tag, { text, ...attributes } = {}, ...children) {
 const swatch = (label) => SWATCHES[label] ?? "#8b989e";
 const spoken = (state) => state.charAt(0) + state.slice(1).toLowerCase().replaceAll("_", " ");
 
-/** Whose step it is: of two objects that are picked at once, the steps of both are told. */
+/** Object and arm of a step: two objects may be picked simultaneously. */
 const whose = ({ label, arm }) => [label, arm && `${arm} arm`].filter(Boolean);
 
 export class GraspPanel {
@@ -86,7 +86,7 @@ export class AskPanel {
       chip.addEventListener("click", () => this.choose(name));
       return chip;
     });
-    $("choices").replaceChildren(...(chips.length ? chips : [element("span", { text: "nothing is seen" })]));
+    $("choices").replaceChildren(...(chips.length ? chips : [element("span", { text: "nothing detected" })]));
     this.#enable();
     this.onChosen(label);
   }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The page: a websocket brings what is wanted, the scene and the panel show it, requests ask the robot.
+// The page: data of the wanted layers come by a websocket, scene and panel show them, requests go to the server.
 
 import { AskPanel, GraspPanel, HealthPanel, element } from "./panel.js";
 import { Scene, boxEdges, cubes, group, lines, place, points, solid } from "./scene.js";
@@ -98,7 +98,7 @@ function show(head, body) {
 
 function want() {
   if (socket?.readyState !== WebSocket.OPEN) return;
-  // A page that nobody sees wants nothing.
+  // A hidden page wants nothing.
   socket.send(JSON.stringify({ want: document.hidden ? [] : [...wanted] }));
 }
 
@@ -233,7 +233,7 @@ function makeLayers() {
 
 function makeCameras(names) {
   for (const name of names) {
-    const picture = element("img", { alt: `what the ${name} camera sees` });
+    const picture = element("img", { alt: `image of the ${name} camera` });
     const button = element("button", { type: "button", text: name });
     const figure = element("figure", { "data-camera": name }, picture, button);
     const set = (on) => {
