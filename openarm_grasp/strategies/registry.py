@@ -8,6 +8,7 @@ name of the strategy that succeeded.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
@@ -55,6 +56,11 @@ async def carry_out(task: Task) -> GraspOutcome:
                 return task.answer(replace(known, code=error.code, message=error.message), "")
             task.outcome = replace(known, message=f"{known.message}; {error.message}")
             continue
+        except Exception as error:
+            # A defect of a strategy: the request must still be answered, and the next one served.
+            task.robot.warn(traceback.format_exc())
+            text = f"strategy {route!r}: {type(error).__name__}: {error}; see the log of the grasp node"
+            return task.answer(GraspOutcome(Code.INTERNAL, text, task.request.label), "")
         if outcome is not None:
             task.outcome = outcome
             if not task.may_go_on(outcome):

@@ -66,3 +66,13 @@ def test_a_new_strategy_cannot_claim_success(far, monkeypatch):
     monkeypatch.setitem(registry.STRATEGIES, "tap", boast)
     with pytest.raises(OpenArmError, match="OK without evidence"):
         registry.carry_out(far.task(GraspRequest("red"))).send(None)
+
+
+def test_a_defect_of_a_strategy_is_answered(far, monkeypatch):
+    async def breaks(task: Task) -> GraspOutcome | None:
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setitem(registry.STRATEGIES, "tap", breaks)
+    outcome = far.ask()
+    assert (outcome.code, outcome.route) == (Code.INTERNAL, "")
+    assert "strategy 'tap': ZeroDivisionError: by nothing" in outcome.message
