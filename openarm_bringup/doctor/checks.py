@@ -48,6 +48,21 @@ class Finding:
     advice: str = ""
 
 
+def ok(name: str, observed: str) -> Finding:
+    """Return the finding of a check that passed."""
+    return Finding(name, "ok", observed)
+
+
+def note(name: str, observed: str, advice: str) -> Finding:
+    """Return the finding of a limitation."""
+    return Finding(name, "note", observed, advice)
+
+
+def error(name: str, observed: str, advice: str) -> Finding:
+    """Return the finding of a fault."""
+    return Finding(name, "error", observed, advice)
+
+
 def version_tuple(text: str) -> tuple[int, ...]:
     """Return the leading numbers of a version."""
     return tuple(int(part) for part in re.findall(r"\d+", text.split("+")[0])[:3])
@@ -58,10 +73,10 @@ def check_python(version: tuple[int, int], system: str, machine: str) -> Finding
     observed = f"CPython {version[0]}.{version[1]} on {system} {machine}"
     if (system, machine) != ("Linux", "x86_64"):
         advice = "the ROS 2 wheels exist for Linux x86_64 only; elsewhere build the suite with colcon in a native Jazzy"
-        return Finding("python", "error", observed, advice)
+        return error("python", observed, advice)
     if version not in PYTHONS:
-        return Finding("python", "error", observed, "use CPython 3.11, 3.12 or 3.13 (OPENARM_PYTHON=/path ./openarm)")
-    return Finding("python", "ok", observed)
+        return error("python", observed, "use CPython 3.11, 3.12 or 3.13 (OPENARM_PYTHON=/path ./openarm)")
+    return ok("python", observed)
 
 
 def check_versions(installed: Mapping[str, str]) -> list[Finding]:
@@ -72,14 +87,12 @@ def check_versions(installed: Mapping[str, str]) -> list[Finding]:
         wanted = f">= {'.'.join(map(str, lowest))}" + (f", < {'.'.join(map(str, first_bad))}" if first_bad else "")
         if version is None:
             findings.append(
-                Finding(name, "error", f"not installed ({purpose})", f"run ./openarm again, or install {name} {wanted}")
+                error(name, f"not installed ({purpose})", f"run ./openarm again, or install {name} {wanted}")
             )
         elif version_tuple(version) < lowest or (first_bad and version_tuple(version) >= first_bad):
-            findings.append(
-                Finding(name, "error", f"{version} ({purpose})", f"needs {wanted}; remove .venv and run ./openarm")
-            )
+            findings.append(error(name, f"{version} ({purpose})", f"needs {wanted}; remove .venv and run ./openarm"))
         else:
-            findings.append(Finding(name, "ok", f"{version} ({purpose})"))
+            findings.append(ok(name, f"{version} ({purpose})"))
     return findings
 
 
@@ -88,16 +101,16 @@ def check_opencv(installed: Mapping[str, str], links_gl: bool) -> Finding:
     others = [name for name in installed if name.startswith("opencv-") and name != "opencv-python-headless"]
     if others:
         advice = f"they overwrite each other: uninstall {', '.join(others)}, then reinstall opencv-python-headless"
-        return Finding("opencv build", "error", f"{', '.join(others)} next to the headless one", advice)
+        return error("opencv build", f"{', '.join(others)} next to the headless one", advice)
     if links_gl:
-        return Finding("opencv build", "error", "linked against libGL", "install opencv-python-headless instead")
-    return Finding("opencv build", "ok", "headless, needs no libGL")
+        return error("opencv build", "linked against libGL", "install opencv-python-headless instead")
+    return ok("opencv build", "headless, needs no libGL")
 
 
 def check_ros(environ: Mapping[str, str], rclpy_file: str | None, rclpy_version: str, prefix: str) -> list[Finding]:
     """Check that there is one ROS, that it is Jazzy, and that wheels and a sourced ROS are not mixed."""
     if rclpy_file is None:
-        return [Finding("ros", "error", "rclpy cannot be imported", "run ./openarm, or source /opt/ros/jazzy/setup.sh")]
+        return [error("ros", "rclpy cannot be imported", "run ./openarm, or source /opt/ros/jazzy/setup.sh")]
     sourced = sorted(
         {
             found
@@ -108,28 +121,18 @@ def check_ros(environ: Mapping[str, str], rclpy_file: str | None, rclpy_version:
     )
     if len(sourced) > 1:
         advice = f"source one only: open a shell that does not source {' or '.join(d for d in sourced if d != DISTRO)}"
-        return [Finding("ros", "error", f"several ROS distributions are sourced: {', '.join(sourced)}", advice)]
+        return [error("ros", f"several ROS distributions are sourced: {', '.join(sourced)}", advice)]
     if sourced and sourced != [DISTRO]:
-        return [
-            Finding(
-                "ros", "error", f"ROS {sourced[0]} is sourced", f"the suite is for {DISTRO}; open a shell without it"
-            )
-        ]
+        return [error("ros", f"ROS {sourced[0]} is sourced", f"the suite is for {DISTRO}; open a shell without it")]
     from_wheels = rclpy_file.startswith(prefix)
     if sourced and from_wheels:
         advice = "use one of them: ./openarm leaves a sourced ROS aside; a colcon workspace needs no .venv"
-        return [
-            Finding("ros", "error", f"ROS {DISTRO} is sourced, but rclpy comes from the wheels in {prefix}", advice)
-        ]
+        return [error("ros", f"ROS {DISTRO} is sourced, but rclpy comes from the wheels in {prefix}", advice)]
     major = version_tuple(rclpy_version)[:1]
     if major and major != (RCLPY_MAJOR,):
-        return [
-            Finding(
-                "ros", "error", f"rclpy {rclpy_version}", f"{DISTRO} has rclpy {RCLPY_MAJOR}; another ROS shadows it"
-            )
-        ]
+        return [error("ros", f"rclpy {rclpy_version}", f"{DISTRO} has rclpy {RCLPY_MAJOR}; another ROS shadows it")]
     origin = f"wheels in {prefix}" if from_wheels else f"a native ROS {DISTRO}"
-    return [Finding("ros", "ok", f"rclpy {rclpy_version} from {origin}, no other ROS is sourced")]
+    return [ok("ros", f"rclpy {rclpy_version} from {origin}, no other ROS is sourced")]
 
 
 def check_rmw(environ: Mapping[str, str]) -> list[Finding]:
@@ -137,59 +140,55 @@ def check_rmw(environ: Mapping[str, str]) -> list[Finding]:
     findings: list[Finding] = []
     rmw = environ.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
     if rmw == "rmw_fastrtps_cpp":
-        findings.append(Finding("rmw", "ok", rmw))
+        findings.append(ok("rmw", rmw))
     else:
         advice = "large images rely on the Fast DDS profile of the suite; unset RMW_IMPLEMENTATION"
-        findings.append(Finding("rmw", "note", rmw, advice))
+        findings.append(note("rmw", rmw, advice))
     if environ.get("ROS_LOCALHOST_ONLY", "0") == "1":
         advice = "it is deprecated and overrides ROS_AUTOMATIC_DISCOVERY_RANGE; unset it"
-        findings.append(Finding("discovery", "note", "ROS_LOCALHOST_ONLY is set", advice))
+        findings.append(note("discovery", "ROS_LOCALHOST_ONLY is set", advice))
     else:
         reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "localhost (set by the graph)")
-        findings.append(Finding("discovery", "ok", reach))
+        findings.append(ok("discovery", reach))
     if environ.get("FASTRTPS_DEFAULT_PROFILES_FILE"):
         advice = (
             "every process takes it, and with a large segment each takes that much of /dev/shm; unset it unless wanted"
         )
-        findings.append(Finding("fast dds profile", "note", environ["FASTRTPS_DEFAULT_PROFILES_FILE"], advice))
+        findings.append(note("fast dds profile", environ["FASTRTPS_DEFAULT_PROFILES_FILE"], advice))
     return findings
 
 
 def check_domain(text: str, first_ephemeral_port: int) -> Finding:
     """Check ROS_DOMAIN_ID: a number, and its ports below those that the system gives to other programs."""
     if not text.isdecimal() or int(text) > 232:
-        return Finding("domain", "error", f"ROS_DOMAIN_ID={text!r}", "set a number from 0 to 101")
+        return error("domain", f"ROS_DOMAIN_ID={text!r}", "set a number from 0 to 101")
     last_port = 7400 + 250 * int(text) + PORTS
     if last_port >= first_ephemeral_port:
         advice = f"its UDP ports (up to {last_port}) can be taken by other programs; choose one from 0 to 101"
-        return Finding("domain", "note", f"ROS_DOMAIN_ID={text}", advice)
-    return Finding("domain", "ok", f"ROS_DOMAIN_ID={text}, UDP ports {last_port - PORTS} to {last_port}")
+        return note("domain", f"ROS_DOMAIN_ID={text}", advice)
+    return ok("domain", f"ROS_DOMAIN_ID={text}, UDP ports {last_port - PORTS} to {last_port}")
 
 
 def check_ports(taken: Sequence[int], domain: int) -> Finding:
     """Check that the domain's discovery ports can be used on this machine."""
     if taken:
         advice = "another program holds them without sharing; choose another ROS_DOMAIN_ID"
-        return Finding(
-            "ports", "error", f"UDP {', '.join(map(str, taken))} of domain {domain} cannot be opened", advice
-        )
-    return Finding("ports", "ok", f"the UDP ports of domain {domain} can be opened")
+        return error("ports", f"UDP {', '.join(map(str, taken))} of domain {domain} cannot be opened", advice)
+    return ok("ports", f"the UDP ports of domain {domain} can be opened")
 
 
 def check_shm(total_mib: float, free_mib: float, need_mib: float, graph: str) -> Finding:
     """Check /dev/shm against what the graph takes of it."""
     observed = f"{free_mib:.0f} of {total_mib:.0f} MiB free, graph {graph} needs {need_mib:.0f}"
     if free_mib >= need_mib:
-        return Finding("/dev/shm", "ok", observed)
+        return ok("/dev/shm", observed)
     if total_mib >= need_mib:
-        return Finding(
-            "/dev/shm", "error", observed, "stop other graphs, or remove what dead ones left: `fastdds shm clean`"
-        )
+        return error("/dev/shm", observed, "stop other graphs, or remove what dead ones left: `fastdds shm clean`")
     advice = (
         "images would be lost; give the container more (`docker run --shm-size=256m`), or "
         "`mount -o remount,size=256m /dev/shm`"
     )
-    return Finding("/dev/shm", "error", observed, advice)
+    return error("/dev/shm", observed, advice)
 
 
 def check_gl(milliseconds: Mapping[str, float | str], chosen: str) -> Finding:
@@ -199,23 +198,19 @@ def check_gl(milliseconds: Mapping[str, float | str], chosen: str) -> Finding:
         for name, value in milliseconds.items()
     )
     if isinstance(milliseconds.get(chosen), float):
-        return Finding("rendering", "ok", f"MUJOCO_GL={chosen}: {observed}; no display is needed")
+        return ok("rendering", f"MUJOCO_GL={chosen}: {observed}; no display is needed")
     working = [name for name, value in milliseconds.items() if isinstance(value, float)]
     if working:
-        return Finding("rendering", "error", observed, f"set MUJOCO_GL={working[0]}")
-    return Finding(
-        "rendering", "error", observed, "install a software renderer: apt-get install libegl1 libgl1 libegl-mesa0"
-    )
+        return error("rendering", observed, f"set MUJOCO_GL={working[0]}")
+    return error("rendering", observed, "install a software renderer: apt-get install libegl1 libgl1 libegl-mesa0")
 
 
 def check_imports(failed: Mapping[str, str], purpose: str, names: Sequence[str]) -> Finding:
     """Check that all packages of one purpose can be imported."""
     if not failed:
-        return Finding(purpose, "ok", f"{', '.join(names)} can be imported")
+        return ok(purpose, f"{', '.join(names)} can be imported")
     name, why = next(iter(failed.items()))
-    return Finding(
-        purpose, "error", f"{name} cannot be imported: {why}", "run ./openarm again; it repairs the installation"
-    )
+    return error(purpose, f"{name} cannot be imported: {why}", "run ./openarm again; it repairs the installation")
 
 
 def check_machine(cores: int, memory_gib: float, load: float, display: bool, wsl: bool) -> Finding:
@@ -223,7 +218,7 @@ def check_machine(cores: int, memory_gib: float, load: float, display: bool, wsl
     observed = f"{cores} cores, {memory_gib:.0f} GiB, load {load:.1f}, {'WSL, ' if wsl else ''}"
     observed += f"{'a' if display else 'no'} display (none is needed)"
     if cores < 2:
-        return Finding("machine", "note", observed, "images and control share one core: slower than real time")
+        return note("machine", observed, "images and control share one core: slower than real time")
     if load > cores:
-        return Finding("machine", "note", observed, "other programs are busy; images may come late")
-    return Finding("machine", "ok", observed)
+        return note("machine", observed, "other programs are busy; images may come late")
+    return ok("machine", observed)

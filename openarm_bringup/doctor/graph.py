@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from openarm_bringup.doctor.checks import Finding
+from openarm_bringup.doctor.checks import Finding, error, note, ok
 
 if TYPE_CHECKING:
     from openarm_bringup.supervision.runs import RunRecord
@@ -47,16 +47,14 @@ def check_nodes(run: RunRecord) -> list[Finding]:
         if node.state == "ready" and not node.restarts:
             continue
         if node.state == "ready":
-            findings.append(Finding(where, "note", f"ready, after {node.restarts} restarts", look))
+            findings.append(note(where, f"ready, after {node.restarts} restarts", look))
         elif node.state in ("failed", "stopped", "exited"):
             advice = f"{look}; Ctrl-C and `openarm up {run.graph}` start it again"
-            findings.append(Finding(where, "error", node.state, advice))
+            findings.append(error(where, node.state, advice))
         else:
-            findings.append(Finding(where, "note", node.state, f"wait; {look}"))
+            findings.append(note(where, node.state, f"wait; {look}"))
     if not findings:
-        findings.append(
-            Finding("nodes", "ok", f"all {len(run.nodes)} nodes of {run.graph} are ready, none was restarted")
-        )
+        findings.append(ok("nodes", f"all {len(run.nodes)} nodes of {run.graph} are ready, none was restarted"))
     return findings
 
 
@@ -66,7 +64,7 @@ def check_status(run: RunRecord, status: GraphStatus) -> list[Finding]:
         advice = (
             "a firewall, or a container without --network=host, keeps processes apart; see `openarm logs supervisor`"
         )
-        return [Finding("graph", "error", f"no node of {run.graph} is discovered in domain {run.domain}", advice)]
+        return [error("graph", f"no node of {run.graph} is discovered in domain {run.domain}", advice)]
     return [*_rates(run, status), *_diagnostics(run, status), *_clash(run, status)]
 
 
@@ -78,7 +76,7 @@ def _rates(run: RunRecord, status: GraphStatus) -> list[Finding]:
         got = status.rates.get(topic, 0.0)
         observed = f"{got:.0f} Hz of {rate:.0f}"
         if got >= _SLOW * rate:
-            findings.append(Finding(topic, "ok", observed))
+            findings.append(ok(topic, observed))
         else:
             level = "error" if got < _LATE * rate else "note"
             advice = "the machine is too busy for real time (`openarm ps` shows by what), or simulated time is held"
@@ -89,16 +87,16 @@ def _rates(run: RunRecord, status: GraphStatus) -> list[Finding]:
 def _diagnostics(run: RunRecord, status: GraphStatus) -> list[Finding]:
     ready = run.ready_nodes
     findings = [
-        Finding(f"node {name}", "error", f"reports: {status.diagnostics[name][1]}", f"`openarm logs {name}` shows more")
+        error(f"node {name}", f"reports: {status.diagnostics[name][1]}", f"`openarm logs {name}` shows more")
         for name in ready
         if name in status.diagnostics and not status.diagnostics[name][0]
     ]
     silent = [name for name in ready if name not in status.diagnostics]
     for name in silent:
         advice = f"it hangs or starves: `openarm ps`, `openarm logs {name}`"
-        findings.append(Finding(f"node {name}", "note", "is silent on /diagnostics", advice))
+        findings.append(note(f"node {name}", "is silent on /diagnostics", advice))
     if not findings:
-        findings.append(Finding("diagnostics", "ok", f"{len(ready)} nodes report OK"))
+        findings.append(ok("diagnostics", f"{len(ready)} nodes report OK"))
     return findings
 
 
@@ -108,6 +106,6 @@ def _clash(run: RunRecord, status: GraphStatus) -> list[Finding]:
     own = {name for name, node in run.nodes.items() if not node.restarts}
     twice = sorted(name for name, count in Counter(status.nodes).items() if count > 1 and name in own)
     if not twice:
-        return [Finding("domain clash", "ok", f"no node is twice in domain {run.domain}")]
+        return [ok("domain clash", f"no node is twice in domain {run.domain}")]
     advice = "another graph is in the same domain: stop it, or start one with --domain"
-    return [Finding("domain clash", "error", f"more than one of {', '.join(twice)} in domain {run.domain}", advice)]
+    return [error("domain clash", f"more than one of {', '.join(twice)} in domain {run.domain}", advice)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import yaml
 from pydantic import Field, model_validator
@@ -31,33 +31,23 @@ _OF_ROS = ("use_sim_time", "qos_overrides.")
 
 
 class Ready(Config):
-    """One condition of readiness: exactly one of the four names is given."""
+    """One condition of readiness, written as `{kind: name}`.
 
-    topic: str | None = Field(default=None, description="has a publisher")
-    message: str | None = Field(default=None, description="a message of this topic was received")
-    service: str | None = Field(default=None, description="has a server")
-    action: str | None = Field(default=None, description="has a server")
+    A topic has a publisher, of a message topic one was received, a service or an action has a server.
+    """
 
-    @model_validator(mode="after")
-    def _one(self) -> Ready:
-        given = [kind for kind in type(self).model_fields if getattr(self, kind) is not None]
-        if len(given) != 1:
-            raise ValueError("give exactly one of topic, message, service, action")
-        if not self.name.startswith("/"):
-            raise ValueError(f"{self.name!r} must be an absolute name, such as /{self.name}")
-        return self
+    kind: ConditionKind
+    name: str = Field(description="absolute ROS name")
 
-    @property
-    def kind(self) -> ConditionKind:
-        """Which of the four it is."""
-        kinds: tuple[ConditionKind, ...] = ("topic", "message", "service", "action")
-        return next(kind for kind in kinds if getattr(self, kind) is not None)
-
-    @property
-    def name(self) -> str:
-        """The absolute ROS name."""
-        name: str = getattr(self, self.kind)
-        return name
+    @model_validator(mode="before")
+    @classmethod
+    def _of_one_key(cls, data: Any) -> Any:
+        if not isinstance(data, dict) or len(data) != 1 or not set(data) <= set(get_args(ConditionKind)):  # pyright: ignore
+            raise ValueError(f"give exactly one of {', '.join(get_args(ConditionKind))}")
+        ((kind, name),) = data.items()  # pyright: ignore
+        if not str(name).startswith("/"):  # pyright: ignore
+            raise ValueError(f"{name!r} must be an absolute name, such as /{name}")
+        return {"kind": kind, "name": name}
 
     def __str__(self) -> str:
         return f"{self.kind} {self.name}"

@@ -13,7 +13,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -134,15 +134,10 @@ def _rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Gener
     # Spawned, not forked: OpenGL and numba's threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(options.workers, mp_context=context, initializer=_quiet_worker) as pool:
-        waiting: set[Future[Row]] = set()
-        queue = list(reversed(seeds))
+        futures = [pool.submit(run_one, options, seed, folder) for seed in seeds]
         try:
-            while queue or waiting:
-                while queue and len(waiting) < 2 * options.workers:
-                    waiting.add(pool.submit(run_one, options, queue.pop(), folder))
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in done:
-                    yield future.result()
+            for future in as_completed(futures):
+                yield future.result()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 

@@ -23,7 +23,7 @@ from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import MISSES, PLAN_FAILS, Task
 from openarm_evaluation.judging.judge import JudgeConfig, Sample, Verdict, at_rest, judge
 from openarm_evaluation.judging.provenance import scene_hash
-from openarm_evaluation.judging.trial import Step, Trial
+from openarm_evaluation.judging.trial import Step, Trial, trial_of
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.planning.arms import ARMS
@@ -158,31 +158,10 @@ class Trials:
         return GraspTask(self.session, self.skills, request, self._report)
 
     def _trial(self, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
-        """What came of a request, judged."""
-        task = self._task
-        ends = [*(step.t_ns for step in steps[1:]), self.robot.t_ns]
+        """Judge a request."""
+        end_ns = self.robot.t_ns
         target, verdict = self._judge(outcome)
-        return Trial(
-            seed=task.seed,
-            scene=task.scene.name,
-            scene_hash=scene_hash(task.scene),
-            target=target,
-            label=outcome.label,
-            arm=outcome.arm,
-            attempts=outcome.attempts,
-            claimed=outcome.success,
-            code=outcome.code.value,
-            message=outcome.message,
-            verdict=verdict,
-            states=tuple(
-                (step.state, (end - step.t_ns) * 1e-9, step.attempt, step.reason)
-                for step, end in zip(steps, ends, strict=bool(steps))
-                if step.state != "IDLE"
-            ),
-            sim_s=(steps[-1].t_ns - steps[0].t_ns) * 1e-9 if steps else 0.0,
-            wall_s=wall_s,
-            route=outcome.route,
-        )
+        return trial_of(self._task.scene, self._task.seed, target, outcome, verdict, steps, wall_s, end_ns)
 
     # --- while it runs
     def _report(self, status: Status) -> None:

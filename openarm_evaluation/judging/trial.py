@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +18,9 @@ from openarm_evaluation.judging.provenance import scene_hash
 
 if TYPE_CHECKING:
     from openarm_evaluation.judging.ros.observer import Observer
-    from openarm_grasp.ros.client import GraspClient, GraspResult
+    from openarm_grasp.ros.answers import GraspResult
+    from openarm_grasp.ros.client import GraspClient
+    from openarm_grasp.strategies.request import GraspOutcome
 
 #: How near an object must be to its place in the scene file to be that scene's, m.
 _SAME_PLACE = 0.02
@@ -164,12 +165,54 @@ def wait_scene(observer: Observer, scene: Scene, after_ns: int, rules: JudgeConf
     observer.wait(there, SETTLE_TIMEOUT_S, f"ground truth of scene {scene.name} at rest")
 
 
-def durations(steps: Sequence[Step], start: str = "IDLE") -> tuple[tuple[str, float, int, str], ...]:
-    """Return how long each state lasted, s of simulated time; a last state has no end and is left out."""
+def durations(steps: Sequence[Step], end_ns: int | None = None) -> tuple[tuple[str, float, int, str], ...]:
+    """Return how long each state but IDLE lasted, s of simulated time; without an end, the last state is left out."""
+    ends = [step.t_ns for step in steps[1:]] + ([] if end_ns is None else [end_ns])
     return tuple(
-        (step.state, (later.t_ns - step.t_ns) * 1e-9, step.attempt, step.reason)
-        for step, later in itertools.pairwise(steps)
-        if step.state != start
+        (step.state, (end - step.t_ns) * 1e-9, step.attempt, step.reason)
+        for step, end in zip(steps, ends, strict=False)
+        if step.state != "IDLE"
+    )
+
+
+def trial_of(
+    scene: Scene,
+    seed: int | None,
+    target: str,
+    answer: GraspResult | GraspOutcome,
+    verdict: Verdict | None,
+    steps: Sequence[Step],
+    wall_s: float,
+    end_ns: int | None = None,
+) -> Trial:
+    """Return the record of a grasp.
+
+    Args:
+        scene: What was on the table.
+        seed: Of the scene.
+        target: Name of the object; "" when the scene has none of the label.
+        answer: `GraspResult` of a client, or `GraspOutcome` in process.
+        verdict: By ground truth.
+        steps: States that it entered.
+        wall_s: How long it took, s of wall clock.
+        end_ns: When the last state ended; None when it still lasts.
+    """
+    return Trial(
+        seed=seed,
+        scene=scene.name,
+        scene_hash=scene_hash(scene),
+        target=target,
+        label=answer.label,
+        arm=answer.arm,
+        attempts=answer.attempts,
+        claimed=answer.success,
+        code=str(answer.code),
+        message=answer.message,
+        verdict=verdict,
+        states=durations(steps, end_ns),
+        sim_s=(steps[-1].t_ns - steps[0].t_ns) * 1e-9 if steps else 0.0,
+        wall_s=wall_s,
+        route=answer.route,
     )
 
 
@@ -210,11 +253,10 @@ def run_trial(
     observer.forget()
     _wait_track(observer, item.name)
     began = time.monotonic()
-    result: GraspResult | OpenArmError
     try:
         result = client.pick(item.label, arm=ask.arm, place=ask.place)
     except OpenArmError as error:
-        result = error
+        result = _failed(error, item.label)
     wall_s = time.monotonic() - began
     _wait_rest(observer, item.name, rules)
     _wait_idle(observer)
@@ -240,12 +282,11 @@ def run_pair(
     for item in items:
         _wait_track(observer, item.name)
     began = time.monotonic()
-    results: Sequence[GraspResult | OpenArmError]
     try:
         both = client.pick_two(first.label, second.label)
-        results = both.answers or 2 * [OpenArmError(both.code, both.message)]
+        results = both.answers or [_failed(OpenArmError(both.code, both.message), item.label) for item in items]
     except OpenArmError as error:
-        results = 2 * [error]
+        results = [_failed(error, item.label) for item in items]
     wall_s = 0.5 * (time.monotonic() - began)
     for item in items:
         _wait_rest(observer, item.name, rules)
@@ -257,11 +298,18 @@ def run_pair(
     return trials
 
 
+def _failed(error: OpenArmError, label: str) -> GraspResult:
+    """Return the result of a request that was not answered."""
+    from openarm_grasp.ros.answers import GraspResult
+
+    return GraspResult(False, error.code, error.message, "FAILED", label, "", 0, (0.0, 0.0, 0.0), 0.0)
+
+
 def _judged(
     observer: Observer,
     scene: Scene,
     item: SceneObject,
-    result: GraspResult | OpenArmError,
+    result: GraspResult,
     steps: Sequence[Step],
     wall_s: float,
     seed: int | None,
@@ -269,28 +317,9 @@ def _judged(
     place: tuple[float, float] | None = None,
 ) -> Trial:
     """Judge an object by where it was to be placed: as requested, else as the grasp chose."""
-    done = None if isinstance(result, OpenArmError) else result
-    if place is None:
-        chosen = done.place_position if done is not None and any(done.place_position) else (math.nan, math.nan)
-        place = (chosen[0], chosen[1])
-    claimed = done is not None and done.success
-    return Trial(
-        seed=seed,
-        scene=scene.name,
-        scene_hash=scene_hash(scene),
-        target=item.name,
-        label=item.label,
-        arm=done.arm if done else "",
-        attempts=done.attempts if done else 0,
-        claimed=claimed,
-        code=str(result.code),
-        message=result.message,
-        verdict=judge(observer.track(item.name), place, claimed=claimed, config=rules),
-        states=durations(steps),
-        sim_s=(steps[-1].t_ns - steps[0].t_ns) * 1e-9 if steps else 0.0,
-        wall_s=wall_s,
-        route=done.route if done else "",
-    )
+    chosen = result.place_position if any(result.place_position) else (math.nan, math.nan)
+    verdict = judge(observer.track(item.name), place or chosen[:2], claimed=result.success, config=rules)
+    return trial_of(scene, seed, item.name, result, verdict, steps, wall_s)
 
 
 def _wait_track(observer: Observer, name: str) -> None:
