@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map laid to rest and woken by ROS 2's lifecycle, as `ros2 lifecycle` or nav2's manager does it."""
+"""The map deactivated and activated by the lifecycle of ROS 2, as `ros2 lifecycle` or nav2's manager does it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_a_map_at_rest_listens_to_nothing_and_goes_on_where_it_was(ros, tmp_path
     assert change(bench, "deactivate")
     assert state(bench) == "inactive"
     for topic in (CAMERA, "/joint_states"):
-        ros.spin_until(lambda topic=topic: not ros.node.count_subscribers(topic), what=f"nobody listens to {topic}")
+        ros.spin_until(lambda topic=topic: not ros.node.count_subscribers(topic), what=f"{topic} has no subscriber")
     assert at(bench, ON_TABLE) == "occupied", "what was seen is kept, and services answer"
     assert change(bench, "activate")
     higher = (0.45, 0.25, 0.51)
