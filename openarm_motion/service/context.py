@@ -11,7 +11,7 @@ import numpy as np
 
 from openarm_common.types import Array
 from openarm_motion.collision.occupancy import Environment, carried
-from openarm_motion.collision.solids import Box, Solid
+from openarm_motion.collision.solids import Box
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.scene.held import HeldObjects
@@ -71,55 +71,51 @@ class PlanningContext:
 
     def prepare(
         self,
-        arm: Arm,
+        arms: Sequence[Arm],
         start: Sequence[float] | Array,
         scale: float,
         stopped: Callable[[], bool],
         estimates: Sequence[Box] = (),
-        attached: Sequence[Box] = (),
+        attached: Sequence[Sequence[Box]] = (),
         expected: int = 0,
     ) -> Prepared:
         """Take the robot as it is now; a given start is enough where the joint states are missing.
 
-        Another arm under way is taken to be where it will end.
+        Other arms under way are taken to be where they will end.
 
         Args:
-            arm: The arm that is asked.
-            start: Its joints, or empty for the present ones.
+            arms: The arms that are asked; the start is that of all of them, one after the other.
+            start: Joints of the one arm, or empty for the present ones.
             scale: Velocity scale.
             stopped: Whether the request was cancelled.
             estimates: Boxes of the request: what the map shows of them is theirs.
-            attached: What the arm holds, tool frame.
+            attached: What each arm holds, tool frame.
             expected: Version that the scene must have; 0 is any.
 
         Raises:
-            OpenArmError: from `Arm.situation`, `PlanningScene.require` and `MapView.read`; NOT_READY without joints.
+            OpenArmError: from `Arm.start_state`, `PlanningScene.require` and `MapView.read`; NOT_READY without joints.
         """
         self._scene.require(expected)
-        now = self.start(arm, start, scale, stopped)
-        ends = self._coordination.ends(arm)
-        later = {**now.state, **ends}
-        solids = (*self._scene.solids, *self._others_hold(arm, later))
-        held = carried(attached, arm.kinematics.fk(now.start))
-        return self._prepared(now, solids, [*estimates, *held], later, _NEXT_TO if ends else 0.0)
-
-    def prepare_both(
-        self,
-        arms: Sequence[Arm],
-        scale: float,
-        stopped: Callable[[], bool],
-        estimates: Sequence[Box],
-        attached: Sequence[Sequence[Box]],
-        expected: int,
-    ) -> Prepared:
-        """As `prepare`, for two arms: `start` is the joints of both."""
-        self._scene.require(expected)
-        parts = [self.start(arm, (), scale, stopped) for arm in arms]
-        known = list(estimates)
-        for arm, part, boxes in zip(arms, parts, attached, strict=True):
-            known += carried(boxes, arm.kinematics.fk(part.start))
+        parts = [self.start(arm, start, scale, stopped) for arm in arms]
         now = replace(parts[0], start=np.concatenate([part.start for part in parts]))
-        return self._prepared(now, self._scene.solids, known, now.state)
+        uncertain = list(estimates)
+        for arm, part, boxes in zip(arms, parts, attached, strict=True):
+            uncertain += carried(boxes, arm.kinematics.fk(part.start))
+        ends = self._coordination.ends(arms)
+        later = {**now.state, **ends}
+        solids = (*self._scene.solids, *self._others_hold(arms, later))
+        view, config, clearance = self.map_state(), self._config.map, _NEXT_TO if ends else 0.0
+
+        def complete() -> StartState:
+            occupied = view.occupied
+            if occupied is not None:
+                certain, robot = (*self._scene.fixed, *solids), arms[0].description  # with what is mounted on it
+                occupied = unexplained(occupied, config, robot, now.state, certain, uncertain)
+            return replace(now, state=later, environment=Environment(solids, occupied, clearance))
+
+        # a graph without a map is as it should be; one with an old map is not
+        note = f" without the map: {view.why}" if view.why and view.version else ""
+        return Prepared(now, self._scene.version, note, complete)
 
     def start(self, arm: Arm, start: Sequence[float] | Array, scale: float, stopped: Callable[[], bool]) -> StartState:
         """Take the joints alone, without scene and map; arguments as `prepare`."""
@@ -136,34 +132,12 @@ class PlanningContext:
         if self._robot.state_age() > self._config.execution.stale_after:
             await Watch(self._robot).fresh()
 
-    def _prepared(
-        self,
-        now: StartState,
-        solids: tuple[Solid, ...],
-        estimates: Sequence[Box],
-        later: Mapping[str, float],
-        apart: float = 0.0,
-    ) -> Prepared:
-        view, config = self.map_state(), self._config.map
-        certain = (*self._scene.fixed, *solids)
-        robot = next(iter(self._arms.values())).description  # with what is mounted on it
-
-        def complete() -> StartState:
-            occupied = view.occupied
-            if occupied is not None:
-                occupied = unexplained(occupied, config, robot, now.state, certain, estimates)
-            return replace(now, state=later, environment=Environment(solids, occupied, apart))
-
-        # a graph without a map is as it should be; one with an old map is not
-        note = f" without the map: {view.why}" if view.why and view.version else ""
-        return Prepared(now, self._scene.version, note, complete)
-
-    def _others_hold(self, arm: Arm, state: Mapping[str, float]) -> list[Box]:
+    def _others_hold(self, arms: Sequence[Arm], state: Mapping[str, float]) -> list[Box]:
         """What the other arms hold, where they hold it in a state."""
         boxes: list[Box] = []
         for name, held in self._held.held.items():
             other = self._arms[name]
-            if other is arm or any(joint not in state for joint in other.names):
+            if other in arms or any(joint not in state for joint in other.names):
                 continue
             T = other.kinematics.fk(np.array([state[joint] for joint in other.names]))
             boxes += [replace(box, id=f"{box.id} in the {name} hand") for box in carried(held, T)]

@@ -152,9 +152,10 @@ class ArmCoordination:
         """Whether another arm is under way."""
         return any(f.active is not None for name, f in self.followers.items() if name != arm.name)
 
-    def ends(self, arm: Arm) -> dict[str, float]:
+    def ends(self, arms: Sequence[Arm]) -> dict[str, float]:
         """Return where the joints of the other arms under way will end."""
-        active = [f.active.motion for name, f in self.followers.items() if name != arm.name and f.active is not None]
+        names = {arm.name for arm in arms}
+        active = [f.active.motion for name, f in self.followers.items() if name not in names and f.active is not None]
         return {joint: x for motion in active for joint, x in motion.joints_at(motion.duration).items()}
 
     def check_again(self, arm: Arm, name: str) -> OpenArmError | None:

@@ -141,7 +141,7 @@ class MotionService:
                 await self._context.fresh()
             estimates = (*wanted.obstacles, *request.ignore_regions)
             prepared = self._context.prepare(
-                arm, request.start, request.scale, stopped, estimates, wanted.attached, request.scene_version
+                [arm], request.start, request.scale, stopped, estimates, [wanted.attached], request.scene_version
             )
             answer = replace(answer, scene_version=prepared.version)
 
@@ -182,7 +182,7 @@ class MotionService:
                 around = moves.RequestBoxes(request.obstacles, held)
                 await self._context.fresh()
                 prepared = self._context.prepare(
-                    arm, (), request.scale, stopped, request.obstacles, held, request.scene_version
+                    [arm], (), request.scale, stopped, request.obstacles, [held], request.scene_version
                 )
                 answer = replace(answer, scene_version=prepared.version)
                 planner = self._planner(arm, request.goal, around)
@@ -211,8 +211,8 @@ class MotionService:
                 begin = self.robot.now()
                 held = [self.memory.on_request(t.arm, t.attached, t.hand_empty)[0] for t in request.targets]
                 await self._context.fresh()
-                prepared = self._context.prepare_both(
-                    arms, request.scale, stopped, request.obstacles, held, request.scene_version
+                prepared = self._context.prepare(
+                    arms, (), request.scale, stopped, request.obstacles, held, request.scene_version
                 )
                 answer = replace(answer, scene_version=prepared.version)
                 both = DualArm(*arms)
