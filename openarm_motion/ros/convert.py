@@ -130,32 +130,27 @@ def scene_markers(solids: Sequence[Solid], frame: str) -> MarkerArray:
     array = MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
     kinds: dict[type[Solid], int] = {Cylinder: Marker.CYLINDER, Sphere: Marker.SPHERE}
     for k, solid in enumerate(solids):
-        marker = Marker(ns=solid.id, id=k, type=kinds.get(type(solid), Marker.CUBE), action=Marker.ADD)
-        marker.header.frame_id = frame
+        marker = _marker(solid.id, k, kinds.get(type(solid), Marker.CUBE), frame, _SCENE_COLOR)
         T = solid.T.copy()
         T[:3, 3] += T[:3, :3] @ solid.centre
         marker.pose, marker.scale = matrix_to_pose(T), vector(solid.extents)
-        marker.color.r, marker.color.g, marker.color.b, marker.color.a = _SCENE_COLOR
         array.markers.append(marker)
     return array
 
 
-def preview_markers(ways: Mapping[str, Array], frame: str) -> MarkerArray:
-    """The way of each arm's tool (n, 3), its start and its end; replaces what was shown before."""
+def preview_markers(paths: Mapping[str, Array], frame: str) -> MarkerArray:
+    """The path of each arm's tool (n, 3), its start and its end; replaces what was shown before."""
     array = MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
-    for k, (arm, points) in enumerate(ways.items()):
-        line = Marker(ns=f"{arm}/way", id=3 * k, type=Marker.LINE_STRIP, action=Marker.ADD)
+    for k, (arm, points) in enumerate(paths.items()):
+        line = _marker(f"{arm}/way", 3 * k, Marker.LINE_STRIP, frame, _PREVIEW_COLOR)
         line.points = [Point(x=float(x), y=float(y), z=float(z)) for x, y, z in points]
         line.scale.x = 0.005
-        ends = [Marker(ns=f"{arm}/{what}", type=Marker.SPHERE, action=Marker.ADD) for what in ("start", "end")]
-        for i, (end, at) in enumerate(zip(ends, (points[0], points[-1]), strict=True)):
-            end.id = 3 * k + 1 + i
+        array.markers.append(line)
+        for i, (what, at) in enumerate((("start", points[0]), ("end", points[-1]))):
+            end = _marker(f"{arm}/{what}", 3 * k + 1 + i, Marker.SPHERE, frame, _PREVIEW_COLOR)
             end.pose.position = Point(x=float(at[0]), y=float(at[1]), z=float(at[2]))
             end.scale = vector(np.full(3, 0.02 + 0.01 * i))
-        for marker in (line, *ends):
-            marker.header.frame_id = frame
-            marker.color.r, marker.color.g, marker.color.b, marker.color.a = _PREVIEW_COLOR
-            array.markers.append(marker)
+            array.markers.append(end)
     return array
 
 
@@ -260,13 +255,17 @@ def held_markers(held: Mapping[str, tuple[str, Sequence[Box]]]) -> MarkerArray:
     array = MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
     for arm, (frame, boxes) in held.items():
         for k, box in enumerate(boxes):
-            marker = Marker(ns=f"{arm}/{box.id}", id=k, type=Marker.CUBE, action=Marker.ADD, frame_locked=True)
-            marker.header.frame_id = frame
-            marker.pose = matrix_to_pose(box.T)
-            marker.scale = vector(box.size)
-            marker.color.r, marker.color.g, marker.color.b, marker.color.a = _HELD_COLOR
+            marker = _marker(f"{arm}/{box.id}", k, Marker.CUBE, frame, _HELD_COLOR)
+            marker.frame_locked, marker.pose, marker.scale = True, matrix_to_pose(box.T), vector(box.size)
             array.markers.append(marker)
     return array
+
+
+def _marker(name: str, id: int, kind: int, frame: str, color: tuple[float, float, float, float]) -> Marker:
+    marker = Marker(ns=name, id=id, type=kind, action=Marker.ADD)
+    marker.header.frame_id = frame
+    marker.color.r, marker.color.g, marker.color.b, marker.color.a = color
+    return marker
 
 
 def _target(message: ApproachTarget) -> Target:
