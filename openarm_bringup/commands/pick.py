@@ -196,9 +196,9 @@ def _result_row(result: GraspResult) -> dict[str, Any]:
 def _of_two(result: PairResult, *, dry_run: bool) -> Outcome:
     answers = [
         {"success": one.success, "code": str(one.code), "message": one.message, **_result_row(one)}
-        for one in result.answers
+        for one in result.results
     ]
-    data = {name: getattr(result, name) for name in ("outcome", "at_once", "duration")}
+    data = {name: getattr(result, name) for name in ("outcome", "simultaneous", "duration")}
     data |= {"answers": answers, "dry_run": dry_run}
     return Outcome(result.success, result.message, result.code, data)
 
@@ -226,7 +226,7 @@ def order(
     with requires_node("grasp", "sim"), GraspClient() as client:
         while ask := work.next():
             try:
-                result = client.pick(ask.label, place=ask.place, leave=ask.leave, timeout=timeout)
+                result = client.pick(ask.label, place=ask.place, exclude_near=ask.exclude_near, timeout=timeout)
             except KeyboardInterrupt:
                 data = {"placed": work.placed, "results": results}
                 return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED, data)

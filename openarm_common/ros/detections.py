@@ -2,7 +2,8 @@
 """Detections to and from vision_msgs/Detection3DArray: all that is known of /detections_3d stands here.
 
 The first hypothesis is the label; others of the same score name the shape (box, cylinder, sphere, cube, can). An object
-that was not measured has the score 0.
+that was detected but not measured has covariance[0] = -1, the mark of ROS for an unknown value; its box encloses its
+visible part.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from openarm_common.detection import WIDER, Detection
 from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, pose_to_matrix, vector, xyz
 from openarm_common.types import Array
 
+#: First element of the covariance of a pose that was not measured.
+UNKNOWN = -1.0
 #: Shapes that are round seen from above when they stand; one that lies is seldom as long as wide.
 _ROUND, _AS_LONG_AS_WIDE = frozenset({"cylinder", "can", "sphere"}), 0.001
 
@@ -44,8 +47,9 @@ def detections_to_msg(
     for name, detection, covariance in zip(ids, detections, covariances, strict=True):
         pose = matrix_to_pose(detection.T_base_object)
         uncertain = PoseWithCovariance(pose=pose, covariance=covariance.ravel())
-        score = detection.score if detection.measured else 0.0
-        results = [hypothesis(each, score, uncertain) for each in class_ids(detection)]
+        if not detection.measured:
+            uncertain.covariance[0] = UNKNOWN
+        results = [hypothesis(each, detection.score, uncertain) for each in class_ids(detection)]
         box = BoundingBox3D(center=pose, size=vector(detection.size))
         message.detections.append(Detection3D(header=message.header, results=results, bbox=box, id=name))
     return message
@@ -61,13 +65,14 @@ def detections_from_msg(message: Detection3DArray) -> tuple[Detection, ...]:
     for item in message.detections:
         if not item.results:
             continue
-        best = max(item.results, key=lambda result: result.hypothesis.score).hypothesis
+        result = max(item.results, key=lambda result: result.hypothesis.score)
+        best, measured = result.hypothesis, result.pose.covariance[0] != UNKNOWN
         others = [r.hypothesis.class_id for r in item.results if r.hypothesis.class_id != best.class_id]
         T, size = pose_to_matrix(item.bbox.center), xyz(item.bbox.size)
         names = {best.class_id, *others}
         is_round = bool(names & _ROUND) and abs(float(size[0] - size[1])) < _AS_LONG_AS_WIDE
         kind = others[0] if others else best.class_id
-        out.append(Detection(best.class_id, best.score, T, np.asarray(size), is_round, kind, best.score > 0.0))
+        out.append(Detection(best.class_id, best.score, T, np.asarray(size), is_round, kind, measured))
     return tuple(out)
 
 

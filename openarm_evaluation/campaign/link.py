@@ -53,16 +53,16 @@ class DirectLink:
         self.cancelled = ""
         self.deadline_ns = 0
         #: Longest start delay of a motion next to the other arm, s; 0: both never move at once.
-        self.max_wait = 0.0
+        self.max_start_delay = 0.0
         #: So many plans fail, by fault injection.
         self.plans_to_fail = 0
         #: Called after each tick; what it raises ends what is waited for.
         self.watch: Callable[[], None] = lambda: None
 
-    def beside(self, max_wait: float) -> DirectLink:
+    def beside(self, max_start_delay: float) -> DirectLink:
         """Return another link to the same robot, for an arm that moves while another does."""
         link = copy(self)
-        link.max_wait = max_wait
+        link.max_start_delay = max_start_delay
         return link
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
@@ -186,7 +186,7 @@ class DirectLink:
             approach_of(request),
             after.q[-1] if isinstance(after, Trajectory) else np.zeros(0),
             self._config.velocity_scale,
-            boxes_of(request.gone),
+            boxes_of(request.ignore_regions),
         )
         answer = await self._asked(lambda stopped: self.robot.motion.plan_approach(asked, stopped))
         refusals = {refused.id: Verdict(refused.code, refused.message) for refused in answer.refusals}
@@ -198,7 +198,7 @@ class DirectLink:
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
         """How far the arm's TCP stays from a point, in any orientation."""
-        answer = self.robot.motion.compute_ik(arm, T_base_tcp, (), free_orientation=True)
+        answer = self.robot.motion.compute_ik(arm, T_base_tcp, (), position_only=True)
         return {arm: float(answer.position_error)}
 
     # --- moving
@@ -212,7 +212,7 @@ class DirectLink:
         """
         if not isinstance(trajectory, Trajectory):
             raise OpenArmError(Code.INTERNAL, f"{type(trajectory).__name__} is no trajectory of the planner")
-        request = ExecuteRequest(arm, trajectory, self.max_wait)
+        request = ExecuteRequest(arm, trajectory, self.max_start_delay)
         await self._moved(lambda stopped: self.robot.motion.execute(request, stopped), what, guard)
 
     async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
@@ -224,7 +224,7 @@ class DirectLink:
         await self._move(MoveRequest(arm, NamedGoal(named), boxes_of(obstacles), **self._options()), what)
 
     def _options(self) -> dict[str, Any]:
-        return {"hand_empty": True, "scale": self._config.velocity_scale, "max_start_delay": self.max_wait}
+        return {"hand_empty": True, "scale": self._config.velocity_scale, "max_start_delay": self.max_start_delay}
 
     async def _move(self, request: MoveRequest, what: str) -> None:
         await self._moved(lambda stopped: self.robot.motion.move(request, stopped), what)

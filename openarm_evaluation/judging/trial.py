@@ -284,7 +284,7 @@ def run_pair(
     began = time.monotonic()
     try:
         both = client.pick_two(first.label, second.label)
-        results = both.answers or [_failed(OpenArmError(both.code, both.message), item.label) for item in items]
+        results = both.results or [_failed(OpenArmError(both.code, both.message), item.label) for item in items]
     except OpenArmError as error:
         results = [_failed(error, item.label) for item in items]
     wall_s = 0.5 * (time.monotonic() - began)

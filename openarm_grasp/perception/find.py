@@ -22,7 +22,7 @@ def find(
     limits: DetectConfig,
     *,
     at: Sequence[float] | None = None,
-    leave: Sequence[Sequence[float]] = (),
+    exclude_near: Sequence[Sequence[float]] = (),
 ) -> Sighting:
     """Follow one object through all frames and average it.
 
@@ -31,7 +31,7 @@ def find(
         label: What to look for; "" takes any.
         limits: How near detections must be to be one object, and how much it may seem to move.
         at: (x, y) where it stands, m; None takes the detection with the highest score.
-        leave: (x, y) of objects that are excluded, m.
+        exclude_near: (x, y) of objects that are excluded, m.
 
     Raises:
         OpenArmError: NOTHING_DETECTED, when no frame holds anything, or the chosen one cannot be measured;
@@ -43,7 +43,7 @@ def find(
         raise OpenArmError(Code.NOTHING_DETECTED, f"nothing is in view (asked for {label or 'any object'!r})")
     if label and label not in seen:
         raise OpenArmError(Code.UNKNOWN_OBJECT, f"no {label!r} in view; in view: {', '.join(seen)}")
-    anchor = _anchor(frames[-1], label, at, leave)
+    anchor = _anchor(frames[-1], label, at, exclude_near)
     track: list[Detection] = []
     for frame in frames:
         fit = [d for d in frame.detections if d.label == anchor.label and d.measured]
@@ -71,13 +71,13 @@ def find(
     return Sighting(target, _others(frames, target, limits.match_radius), frames[-1].t_ns, spread)
 
 
-def _anchor(frame: Frame, label: str, at: Sequence[float] | None, leave: Sequence[Sequence[float]]) -> Detection:
+def _anchor(frame: Frame, label: str, at: Sequence[float] | None, exclude_near: Sequence[Sequence[float]]) -> Detection:
     """The detection of the object that is asked for."""
     name = label or "the object"
     fitting = [d for d in frame.detections if not label or d.label == label]
     if not fitting:
         raise OpenArmError(Code.STALE_DATA, f"{name!r} was in view, but not in the newest frame")
-    chosen = [d for d in fitting if all(_from(d, p) > SAME_PLACE for p in leave)]
+    chosen = [d for d in fitting if all(_from(d, p) > SAME_PLACE for p in exclude_near)]
     if not chosen:
         raise OpenArmError(
             Code.UNKNOWN_OBJECT, f"no {name!r} in view besides {len(fitting)} that shall stay where they are"

@@ -27,14 +27,14 @@ class PlanGrasp:
     """Choose and plan one of the candidates with one arm; result `Planned`.
 
     Attributes:
-        gone: Where the object will not stand any more then: the map still shows it there.
+        ignore_regions: Where the object will not stand any more then: the map still shows it there.
     """
 
     arm: str
     candidates: tuple[GraspCandidate, ...]
     obstacles: tuple[Box, ...]
     target: Box
-    gone: tuple[Box, ...] = ()
+    ignore_regions: tuple[Box, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class PlanPlace:
     Attributes:
         held: What the hand carries, TCP frame.
         after: Trajectory whose end is the start; None starts at the present joints.
-        gone: Where the object stood: the map may not know yet that it was taken away.
+        ignore_regions: Where the object stood: the map may not know yet that it was taken away.
     """
 
     arm: str
@@ -52,7 +52,7 @@ class PlanPlace:
     obstacles: tuple[Box, ...]
     held: Box
     after: Trajectory | None = None
-    gone: tuple[Box, ...] = ()
+    ignore_regions: tuple[Box, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -46,12 +46,12 @@ class PairResult(Answer):
     Attributes:
         outcome: SUCCESS; PARTIAL: one of them, or picked and not placed as asked; FAILED; REFUSED: none was touched;
             CANCELLED.
-        at_once: Both arms worked at the same time.
-        answers: To each, in the order asked; none when they were not taken.
+        simultaneous: Both arms moved at the same time.
+        results: Of each, in the order asked; none when they were not taken.
         duration: s of robot time.
     """
 
     outcome: str
-    at_once: bool
-    answers: tuple[GraspResult, ...]
+    simultaneous: bool
+    results: tuple[GraspResult, ...]
     duration: float

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from openarm_interfaces.action import Pick, PickTwo
-from openarm_interfaces.msg import GraspStatus, PickAnswer, PickRequest
+from openarm_interfaces.msg import GraspStatus, PickRequest, PickResult
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
@@ -44,7 +44,7 @@ class GraspClient(BackgroundNode):
         place: Sequence[float] | None = None,
         place_yaw: float | None = None,
         object_at: Sequence[float] | None = None,
-        leave: Sequence[Sequence[float]] = (),
+        exclude_near: Sequence[Sequence[float]] = (),
         phase: str = "all",
         dry_run: bool = False,
         time_limit: float = 0.0,
@@ -60,7 +60,7 @@ class GraspClient(BackgroundNode):
                 chosen.
             place_yaw: Of the object's x axis about the base z where it is put down, rad; None: unconstrained.
             object_at: (x, y) near which the object stands, base frame, m, when there are several alike.
-            leave: (x, y) of objects that stay where they are.
+            exclude_near: (x, y) of objects that stay where they are.
             phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
             dry_run: Plan and report, do not move.
             time_limit: s of robot time; then it ends with TIMEOUT, the hand keeping what it holds. 0: none.
@@ -76,7 +76,7 @@ class GraspClient(BackgroundNode):
         """
         goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run, phase=phase, timeout=time_limit)
         _where(goal, place, place_yaw, object_at)
-        goal.leave = [point((p[0], p[1], 0.0)) for p in leave]
+        goal.exclude_near = [point((p[0], p[1], 0.0)) for p in exclude_near]
         return _result(self._ask(Pick, "/grasp/pick", goal, timeout, on_feedback))
 
     def pick_two(
@@ -117,8 +117,8 @@ class GraspClient(BackgroundNode):
             outcome=answer.outcome,
             code=_code(answer.code),
             message=answer.message,
-            at_once=answer.at_once,
-            answers=tuple(_result(one) for one in answer.answers),
+            simultaneous=answer.simultaneous,
+            results=tuple(_result(one) for one in answer.results),
             duration=answer.duration,
         )
 
@@ -155,7 +155,7 @@ def _code(text: str) -> Code:
     return Code(text) if text in Code.__members__ else Code.INTERNAL
 
 
-def _result(message: Pick.Result | PickAnswer) -> GraspResult:
+def _result(message: Pick.Result | PickResult) -> GraspResult:
     x, y, z = (float(v) for v in xyz(message.place_position))
     return GraspResult(
         success=message.success,
@@ -168,5 +168,5 @@ def _result(message: Pick.Result | PickAnswer) -> GraspResult:
         place_position=(x, y, z),
         duration=message.duration,
         route=message.route,
-        options=() if isinstance(message, PickAnswer) else tuple(map(option_from_msg, message.options)),
+        options=() if isinstance(message, PickResult) else tuple(map(option_from_msg, message.options)),
     )

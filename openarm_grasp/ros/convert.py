@@ -45,7 +45,9 @@ def box_to_msg(box: Box) -> CollisionBox:
 def plan_goal(request: PlanGrasp | PlanPlace, velocity_scale: float) -> PlanApproach.Goal:
     """The planning goal of a grasp (the target may be touched, and is carried on the retreat) or of a place."""
     goal = PlanApproach.Goal(
-        arm=request.arm, gone=[box_to_msg(box) for box in request.gone], velocity_scale=velocity_scale
+        arm=request.arm,
+        ignore_regions=[box_to_msg(box) for box in request.ignore_regions],
+        velocity_scale=velocity_scale,
     )
     if isinstance(request, PlanGrasp):
         goal.targets = _targets(request.candidates)
@@ -115,7 +117,7 @@ def gripper_goal(
 
 def reach_request(arm: str, T_base_tcp: Array) -> ComputeIK.Request:
     """Ask how near an arm's TCP comes to a point, in any orientation."""
-    request = ComputeIK.Request(arm=arm, free_orientation=True)
+    request = ComputeIK.Request(arm=arm, position_only=True)
     request.pose.header.frame_id = BASE_FRAME
     request.pose.pose = matrix_to_pose(T_base_tcp)
     return request
@@ -131,7 +133,7 @@ def reach_from_msg(arm: str, answer: ComputeIK.Response, T_base_tcp: Array) -> d
 
 
 def move_goal(
-    arm: str, to: str | Array, obstacles: Sequence[Box], velocity_scale: float, max_wait: float
+    arm: str, to: str | Array, obstacles: Sequence[Box], velocity_scale: float, max_start_delay: float
 ) -> MoveArm.Goal:
     """A free path to a named posture, or a straight line of the TCP to a pose.
 
@@ -140,14 +142,14 @@ def move_goal(
         to: Name of the posture, or the pose (4, 4), base frame.
         obstacles: Boxes to keep clear of, base frame.
         velocity_scale: Of the motion limits; 0: the planner's default.
-        max_wait: Longest start delay until the other arm leaves clearance, s.
+        max_start_delay: Longest start delay until the other arm leaves clearance, s.
     """
     goal = MoveArm.Goal(
         arm=arm,
         obstacles=[box_to_msg(box) for box in obstacles],
         hand_empty=True,
         velocity_scale=velocity_scale,
-        max_wait=max_wait,
+        max_start_delay=max_start_delay,
     )
     if isinstance(to, str):
         goal.kind, goal.named = MoveArm.Goal.NAMED, to

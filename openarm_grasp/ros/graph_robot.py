@@ -48,12 +48,12 @@ class GraphRobot:
         }
         self.deadline_ns = 0
         #: Longest start delay of a motion until the other arm leaves clearance, s; 0: the arms never move at once.
-        self.max_wait = 0.0
+        self.max_start_delay = 0.0
 
     def next_to_other(self) -> GraphRobot:
         """The same for an arm that moves while the other does: its motions may start later, its deadline is its own."""
         robot = copy(self)
-        robot.max_wait = self._config.limits.beside_wait
+        robot.max_start_delay = self._config.limits.beside_wait
         return robot
 
     # --- begin, end, cancel
@@ -200,23 +200,23 @@ class GraphRobot:
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
     ) -> None:
         """Ask /motion/execute."""
-        goal = ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_wait=self.max_wait)
+        goal = ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_start_delay=self.max_start_delay)
         await self._moved(self._execute, goal, what, guard)
 
     async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Ask /motion/move for a straight line."""
-        goal = convert.move_goal(arm, T_base_tcp, (), self._config.velocity_scale, self.max_wait)
+        goal = convert.move_goal(arm, T_base_tcp, (), self._config.velocity_scale, self.max_start_delay)
         await self._moved(self._move, goal, what)
 
     async def move_named(self, arm: str, named: str, obstacles: Sequence[Box], what: str) -> None:
         """Ask /motion/move for a free path to a posture."""
-        goal = convert.move_goal(arm, named, obstacles, self._config.velocity_scale, self.max_wait)
+        goal = convert.move_goal(arm, named, obstacles, self._config.velocity_scale, self.max_start_delay)
         await self._moved(self._move, goal, what)
 
     async def _moved(
         self, client: ActionClient, goal: object, what: str, guard: Callable[[], None] | None = None
     ) -> None:
-        limit = self._config.limits.move_timeout + self.max_wait
+        limit = self._config.limits.move_timeout + self.max_start_delay
         result = await self._nodes.goal(client, goal, limit, what, self._watched(guard))
         if not result.success:
             code = convert.code_from_text(result.code, Code.EXECUTION_FAILED)

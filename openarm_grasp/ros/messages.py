@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from geometry_msgs.msg import Point
 from openarm_interfaces.action import Pick, PickTwo
-from openarm_interfaces.msg import GraspOption, GraspStatus, PickAnswer, PickRequest
+from openarm_interfaces.msg import GraspOption, GraspStatus, PickRequest, PickResult
 from openarm_interfaces.srv import Grasp
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
@@ -35,7 +35,7 @@ def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
         dry_run=message.dry_run,
         phase=message.phase or "all",
         timeout=message.timeout,
-        leave=tuple((p.x, p.y) for p in message.leave),
+        exclude_near=tuple((p.x, p.y) for p in message.exclude_near),
     )
 
 
@@ -57,7 +57,7 @@ def _request(message: Grasp.Request | Pick.Goal | PickRequest) -> GraspRequest:
     )
 
 
-def fill_answer(answer: Grasp.Response | Pick.Result | PickAnswer, outcome: GraspOutcome) -> None:
+def fill_answer(answer: Grasp.Response | Pick.Result | PickResult, outcome: GraspOutcome) -> None:
     """Write an outcome into a service response, an action result, or one of its answers."""
     answer.success = outcome.success
     answer.outcome = outcome.kind
@@ -69,7 +69,7 @@ def fill_answer(answer: Grasp.Response | Pick.Result | PickAnswer, outcome: Gras
     answer.place_position = point(outcome.place_position)
     answer.duration = outcome.duration
     answer.route = outcome.route
-    if not isinstance(answer, PickAnswer):
+    if not isinstance(answer, PickResult):
         answer.options = [option_to_msg(option) for option in outcome.options]
 
 
@@ -107,13 +107,13 @@ def pair_result(outcome: PairOutcome) -> PickTwo.Result:
         outcome=outcome.kind,
         code=outcome.code.value,
         message=outcome.message,
-        at_once=outcome.at_once,
+        simultaneous=outcome.simultaneous,
         duration=outcome.duration,
     )
     for one in outcome.answers:
-        answer = PickAnswer()
+        answer = PickResult()
         fill_answer(answer, one)
-        result.answers.append(answer)
+        result.results.append(answer)
     return result
 
 

@@ -119,12 +119,12 @@ class Order:
                 continue  # nothing has been taken away since
             stand = self._stand.get(label, ())
             if self.bins is None:
-                return GraspRequest(label, leave=stand)
+                return GraspRequest(label, exclude_near=stand)
             name = self.bins.of(label)
             slots = self.bins.bins[name].slots(self.bins.spacing)
             at = self._used.get(name, 0)
             if at < len(slots):
-                return GraspRequest(label, place=slots[at], leave=stand)
+                return GraspRequest(label, place=slots[at], exclude_near=stand)
             self.failed[label] = f"bin {name!r} is full: it has {len(slots)} places"
         self.failed |= {label: why for label, (_, why) in self._blocked.items()}
         return None

@@ -42,14 +42,14 @@ class PairOutcome:
         answers: To each, in their order; none when they were not taken.
         code: OK, or of the first that failed; CANCELLED, when one of them was.
         message: What happened to each.
-        at_once: Both arms worked at the same time.
+        simultaneous: Both arms worked at the same time.
         duration: s of robot time.
     """
 
     answers: tuple[GraspOutcome, ...]
     code: Code
     message: str
-    at_once: bool = False
+    simultaneous: bool = False
     duration: float = 0.0
 
     @property
@@ -135,12 +135,12 @@ class Pair:
         """Robot time since both were asked for, s."""
         return (self.robot.now_ns - self.began_ns) * 1e-9
 
-    def answer(self, answers: tuple[GraspOutcome, GraspOutcome], *, at_once: bool) -> PairOutcome:
+    def answer(self, answers: tuple[GraspOutcome, GraspOutcome], *, simultaneous: bool) -> PairOutcome:
         """The answer to both."""
         codes = [answer.code for answer in answers if not answer.success]
         code = Code.CANCELLED if Code.CANCELLED in codes else next(iter(codes), Code.OK)
         text = "; ".join(f"{answer.label}: {answer.message}" for answer in answers)
-        return PairOutcome(answers, code, f"{self.reason}. {text}", at_once, self.seconds)
+        return PairOutcome(answers, code, f"{self.reason}. {text}", simultaneous, self.seconds)
 
 
 # --- strategies
@@ -176,7 +176,7 @@ async def simultaneous(pair: Pair) -> PairOutcome | None:
         # What was not touched next to the other arm may be reached when that is home.
         if outcome.kind == "REFUSED" and not pair.session.kept:
             outcomes[i] = await pair.alone(i)
-    return pair.answer((outcomes[0], outcomes[1]), at_once=True)
+    return pair.answer((outcomes[0], outcomes[1]), simultaneous=True)
 
 
 async def in_turn(pair: Pair) -> PairOutcome:
@@ -187,7 +187,7 @@ async def in_turn(pair: Pair) -> PairOutcome:
         second = GraspOutcome(first.code, text, pair.requests[1].label)
     else:
         second = await pair.alone(1)
-    return pair.answer((first, second), at_once=False)
+    return pair.answer((first, second), simultaneous=False)
 
 
 # --- which arm
@@ -228,7 +228,7 @@ async def _observe_both(pair: Pair) -> list[Sighting]:
         await robot.go_home(ARMS, back_off_below=context.table.top_z + 2.0 * context.config.approach.lift_height)
     frames = (await robot.observe_in_base(context.config.detect.frames)).frames
     found = [
-        find(frames, request.label, context.config.detect, at=request.object_at, leave=request.leave)
+        find(frames, request.label, context.config.detect, at=request.object_at, exclude_near=request.exclude_near)
         for request in pair.requests
     ]
     return [replace(one, target=on_table(one.target, context.table.top_z)) for one in found]

@@ -410,7 +410,7 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
         others = (d for d in newest.detections if d.label != kept.target.label)
         sighting = Sighting(kept.target, _standing(others, top_z), newest.t_ns, 0.0)
     else:
-        found = find(frames, request.label, limits, at=request.object_at, leave=request.leave)
+        found = find(frames, request.label, limits, at=request.object_at, exclude_near=request.exclude_near)
         target = on_table(found.target, top_z)
         sighting = replace(found, target=target, others=_standing(found.others, top_z))
     age = (run.robot.now_ns - sighting.t_ns) * 1e-9

@@ -27,7 +27,7 @@ class GraspRequest:
         place_yaw: Of the object's x axis about the base z, rad (half a turn makes no difference); None: unconstrained.
         timeout: s of robot time for all of it; 0: none.
         object_at: (x, y) near which the object is, base frame, m; None: any of that label.
-        leave: (x, y) of objects that stay where they are, base frame, m.
+        exclude_near: (x, y) of objects that stay where they are, base frame, m.
         why: What it is for, when it is a part of another request.
     """
 
@@ -39,7 +39,7 @@ class GraspRequest:
     place_yaw: float | None = None
     timeout: float = 0.0
     object_at: tuple[float, ...] | None = None
-    leave: tuple[tuple[float, float], ...] = ()
+    exclude_near: tuple[tuple[float, float], ...] = ()
     why: str = ""
 
     def check(self) -> None:

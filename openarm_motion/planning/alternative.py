@@ -64,7 +64,7 @@ def explained_approach(
 
 
 def near_pose(
-    arm: Arm, now: StartState, around: RequestBoxes, pose: Array, *, free_orientation: bool = False, budget: float = 1.0
+    arm: Arm, now: StartState, around: RequestBoxes, pose: Array, *, position_only: bool = False, budget: float = 1.0
 ) -> Alternative | None:
     """The nearest tool pose that the arm can be planned to; None when none is found within `budget` s.
 
@@ -72,13 +72,13 @@ def near_pose(
     """
     end = time.monotonic() + budget
     scene, asked = moves.free_scene(arm, now, around), pose[:3, 3].copy()
-    nearest = arm.inverse.nearest(pose, now.start, position_only=free_orientation)
+    nearest = arm.inverse.nearest(pose, now.start, position_only=position_only)
     if not nearest.success:
         pose = arm.kinematics.fk(nearest.q)
     for target in _poses_around(pose):
         if time.monotonic() > end or now.stopped():
             return None
-        solve = arm.inverse.position_solutions if free_orientation else arm.inverse.solutions
+        solve = arm.inverse.position_solutions if position_only else arm.inverse.solutions
         found = solve(target, arm.config.planning.joint_margin, now.start)
         # of a whole turn of the elbow, some of every part
         goals = [s.q for s in found[:: max(1, len(found) // _CONFIGURATIONS)] if not scene.collides(s.q)]

@@ -219,8 +219,8 @@ class DualArmPlan:
     """Trajectories that begin at the same moment, how long each rests in it first, and the arms' least distance, m."""
 
     trajectories: tuple[Trajectory, Trajectory]
-    delays: tuple[float, float]
-    separation: float
+    start_delays: tuple[float, float]
+    clearance: float
 
 
 def plan_together(both: DualArm, now: StartState, wanted: DualArmGoals, time_limit: float) -> DualArmPlan:

@@ -59,16 +59,14 @@ def to_named(arm: Arm, now: StartState, posture: str, around: RequestBoxes) -> T
     return to_joints(arm, now, named_posture(arm, posture, now.start), around, f"posture {posture!r}")
 
 
-def to_pose(
-    arm: Arm, now: StartState, pose: Array, around: RequestBoxes, *, free_orientation: bool = False
-) -> Trajectory:
+def to_pose(arm: Arm, now: StartState, pose: Array, around: RequestBoxes, *, position_only: bool = False) -> Trajectory:
     """Free path to the tool pose (4, 4), in whichever configuration is nearest.
 
     Raises:
         OpenArmError: UNREACHABLE, with the nearest reachable pose; IN_COLLISION, naming the pair; NO_PLAN; CANCELLED.
     """
     scene = free_scene(arm, now, around)
-    ordered = _configurations(arm, now.scale, now.start, pose, free_orientation=free_orientation)
+    ordered = _configurations(arm, now.scale, now.start, pose, position_only=position_only)
     goals = [q for q in ordered if not scene.collides(q)][:_GOALS]
     if not goals:
         contact = scene.contacts(ordered[0])[0]
@@ -112,13 +110,13 @@ def to_pose_on_line(arm: Arm, now: StartState, pose: Array, around: RequestBoxes
 
 
 def unreachable(
-    arm: Arm, pose: Array, *, free_orientation: bool, margin: float | None = None, near: Array | None = None
+    arm: Arm, pose: Array, *, position_only: bool, margin: float | None = None, near: Array | None = None
 ) -> OpenArmError:
     """The error for a pose that the arm can't reach: the reason, and the nearest pose to it, searched from `near`."""
     x, y, z = pose[:3, 3]
     kept = arm.config.planning.joint_margin if margin is None else margin
-    why = arm.inverse.why_not(pose, kept, near, position_only=free_orientation)
-    hint = "" if free_orientation else "; or leave the orientation free"
+    why = arm.inverse.why_not(pose, kept, near, position_only=position_only)
+    hint = "" if position_only else "; or leave the orientation free"
     text = f"{arm.name} arm can't reach ({x:.3f}, {y:.3f}, {z:.3f}) m: {why}{hint}"
     return PlanFailedError(Code.UNREACHABLE, text, "goal")
 
@@ -158,24 +156,22 @@ def yielding(arm: Arm, start: Array, name: str) -> Array:
     return np.stack([start, named_posture(arm, name, start)])
 
 
-def goal_configurations(
-    arm: Arm, now: StartState, start: Array, pose: Array, *, free_orientation: bool = False
-) -> Array:
+def goal_configurations(arm: Arm, now: StartState, start: Array, pose: Array, *, position_only: bool = False) -> Array:
     """Configurations with the tool at a pose, the nearest first; (k, n).
 
     Raises:
         PlanFailedError: UNREACHABLE, with the reason.
     """
     # of a whole turn of the elbow, some of every part: the nearest alone may all meet the other arm
-    ordered = _configurations(arm, now.scale, start, pose, free_orientation=free_orientation)
+    ordered = _configurations(arm, now.scale, start, pose, position_only=position_only)
     return np.array(ordered[:: max(1, len(ordered) // _MOST)][:_MOST])
 
 
-def _configurations(arm: Arm, scale: float, start: Array, pose: Array, *, free_orientation: bool) -> list[Array]:
+def _configurations(arm: Arm, scale: float, start: Array, pose: Array, *, position_only: bool) -> list[Array]:
     """All configurations with the tool at a pose, those that are reached first come first; UNREACHABLE without one."""
-    solve = arm.inverse.position_solutions if free_orientation else arm.inverse.solutions
+    solve = arm.inverse.position_solutions if position_only else arm.inverse.solutions
     solutions = solve(pose, arm.config.planning.joint_margin, start)
     if not solutions:
-        raise unreachable(arm, pose, free_orientation=free_orientation)
+        raise unreachable(arm, pose, position_only=position_only)
     limits = arm.limits(scale)
     return sorted((s.q for s in solutions), key=lambda q: segment_time(start, q, limits))

@@ -76,7 +76,7 @@ class MotionClient(BackgroundNode):
             arm: For example "left".
             q: The goal.
             options: `obstacles` and `attached` (boxes; without `attached` what the hand is known to hold, `hand_empty`
-                drops it), `scale` of the velocity, `plan_only`, `max_wait` s for another arm under way,
+                drops it), `scale` of the velocity, `plan_only`, `max_start_delay` s for another arm under way,
                 `scene_version` that the scene must have, `on_feedback(stage, progress)`.
 
         Raises:
@@ -91,11 +91,11 @@ class MotionClient(BackgroundNode):
         return self._move(MoveArm.Goal(arm=arm, kind=MoveArm.Goal.NAMED, named=posture), **options)
 
     def move_to_pose(
-        self, arm: str, pose: Array, frame: str = "", *, free_orientation: bool = False, **options: Any
+        self, arm: str, pose: Array, frame: str = "", *, position_only: bool = False, **options: Any
     ) -> MotionResult:
         """Free path of the tool to a pose (4, 4) in a frame; options and errors as `move_to_joints`."""
         goal = MoveArm.Goal(arm=arm, kind=MoveArm.Goal.POSE, pose=stamped(pose, frame))
-        goal.free_orientation = free_orientation
+        goal.position_only = position_only
         return self._move(goal, **options)
 
     def move_on_line(self, arm: str, pose: Array, frame: str = "", **options: Any) -> MotionResult:
@@ -108,13 +108,13 @@ class MotionClient(BackgroundNode):
         plan: MotionResult,
         on_progress: Callable[[float], None] | None = None,
         *,
-        max_wait: float = 0.0,
+        max_start_delay: float = 0.0,
     ) -> MotionResult:
         """Carry out what was planned with `plan_only`; refused when the scene has changed since.
 
-        With `max_wait` it rests first until another arm under way leaves room, for so many seconds at most.
+        With `max_start_delay` it rests first until another arm under way leaves room, for so many seconds at most.
         """
-        goal = ExecuteTrajectory.Goal(arm=arm, scene_version=plan.scene_version, max_wait=max_wait)
+        goal = ExecuteTrajectory.Goal(arm=arm, scene_version=plan.scene_version, max_start_delay=max_start_delay)
         goal.trajectory = convert.trajectory_msg(plan.trajectories[0])
         deliver = None if on_progress is None else (lambda feedback: on_progress(feedback.progress))
         result = self.do(ExecuteTrajectory, "/motion/execute", goal, timeout=_LONG, on_feedback=deliver)
@@ -139,13 +139,13 @@ class MotionClient(BackgroundNode):
         return _result(result, result.trajectories)
 
     # --- kinematics and scene
-    def compute_ik(self, arm: str, pose: Array, frame: str = "", *, free_orientation: bool = False) -> Array:
+    def compute_ik(self, arm: str, pose: Array, frame: str = "", *, position_only: bool = False) -> Array:
         """Joint positions (n,) with the tool at a pose (4, 4), nearest to the present ones.
 
         Raises:
             OpenArmError: UNREACHABLE, with the nearest reachable pose, and as the service says.
         """
-        request = ComputeIK.Request(arm=arm, pose=stamped(pose, frame), free_orientation=free_orientation)
+        request = ComputeIK.Request(arm=arm, pose=stamped(pose, frame), position_only=position_only)
         answer = self.call(ComputeIK, "/motion/compute_ik", request)
         if not answer.success:
             raise OpenArmError(Code(answer.code), answer.message)
@@ -179,13 +179,13 @@ class MotionClient(BackgroundNode):
         hand_empty: bool = False,
         scale: float = 0.0,
         plan_only: bool = False,
-        max_wait: float = 0.0,
+        max_start_delay: float = 0.0,
         scene_version: int = 0,
         on_feedback: Callable[[str, float], None] | None = None,
     ) -> MotionResult:
         goal.obstacles = [convert.box_msg(box) for box in obstacles]
         goal.attached = [convert.box_msg(box) for box in attached]
-        goal.hand_empty, goal.max_wait = hand_empty, max_wait
+        goal.hand_empty, goal.max_start_delay = hand_empty, max_start_delay
         goal.velocity_scale, goal.plan_only, goal.expected_scene_version = scale, plan_only, scene_version
         deliver = None if on_feedback is None else (lambda message: on_feedback(message.stage, message.progress))
         result = self.do(MoveArm, "/motion/move", goal, timeout=_LONG, on_feedback=deliver)

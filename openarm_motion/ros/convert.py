@@ -173,7 +173,7 @@ def approach_request(goal: PlanApproach.Goal) -> PlanApproachRequest:
         approach,
         np.array(goal.start, np.float64),
         goal.velocity_scale,
-        boxes_from_msg(goal.gone),
+        boxes_from_msg(goal.ignore_regions),
         goal.expected_scene_version,
     )
 
@@ -188,7 +188,7 @@ def move_request(goal: MoveArm.Goal) -> MoveRequest:
         goal.hand_empty,
         goal.velocity_scale,
         goal.plan_only,
-        goal.max_wait,
+        goal.max_start_delay,
         goal.expected_scene_version,
     )
 
@@ -211,7 +211,7 @@ def move_arms_request(goal: MoveArms.Goal) -> MoveArmsRequest:
 def execute_request(goal: ExecuteTrajectory.Goal) -> ExecuteRequest:
     """What a goal of /motion/execute asks."""
     names, t, q, v, a = trajectory_from_msg(goal.trajectory)
-    return ExecuteRequest(goal.arm, Motion(tuple(names), t, q, v, a), goal.max_wait, goal.scene_version)
+    return ExecuteRequest(goal.arm, Motion(tuple(names), t, q, v, a), goal.max_start_delay, goal.scene_version)
 
 
 def _goal(goal: MoveArm.Goal) -> Goal:
@@ -221,7 +221,7 @@ def _goal(goal: MoveArm.Goal) -> Goal:
     if kind == goal.NAMED:
         return NamedGoal(goal.named)
     if kind == goal.POSE:
-        return PoseGoal(pose_to_matrix(goal.pose.pose), frame, goal.free_orientation)
+        return PoseGoal(pose_to_matrix(goal.pose.pose), frame, goal.position_only)
     if kind == goal.LINEAR:
         return LineGoal(pose_to_matrix(goal.pose.pose), frame)
     raise OpenArmError(Code.INVALID_ARGUMENT, f"kind is {kind}; valid: JOINTS 0, POSE 1, LINEAR 2, NAMED 3")
@@ -236,7 +236,7 @@ def _dual_goal(target: ArmTarget) -> DualGoal:
     if kind == ArmTarget.YIELD:
         return YieldGoal(target.named or "home")
     if kind == ArmTarget.POSE:
-        return PoseGoal(pose_to_matrix(target.pose.pose), target.pose.header.frame_id, target.free_orientation)
+        return PoseGoal(pose_to_matrix(target.pose.pose), target.pose.header.frame_id, target.position_only)
     raise OpenArmError(Code.INVALID_ARGUMENT, f"kind is {kind}; valid: JOINTS 0, POSE 1, NAMED 3, YIELD 4")
 
 

@@ -93,7 +93,7 @@ class MotionNode(BaseNode[MotionConfig]):
             answer = await _answered(ApproachAnswer, ask)
         finally:
             self.destroy_timer(timer)
-        result = PlanApproach.Result(chosen=answer.chosen, wait=answer.start_delay)
+        result = PlanApproach.Result(chosen=answer.chosen, start_delay=answer.start_delay)
         if answer.parts:
             result.transfer, result.approach, result.retreat = map(convert.trajectory_msg, answer.parts)
         result.refusals, result.limit_margins = convert.refusals_msg(answer.refusals), list(answer.limit_margins)
@@ -104,7 +104,7 @@ class MotionNode(BaseNode[MotionConfig]):
         answer = await _answered(
             MoveAnswer, lambda: self.service.move(convert.move_request(handle.request), cancelled(handle), report)
         )
-        result = MoveArm.Result(waited=answer.start_delay)
+        result = MoveArm.Result(start_delay=answer.start_delay)
         if answer.trajectory is not None:
             result.trajectory = convert.trajectory_msg(answer.trajectory)
         return _end(handle, result, answer)
@@ -115,7 +115,7 @@ class MotionNode(BaseNode[MotionConfig]):
             MoveArmsAnswer,
             lambda: self.service.move_arms(convert.move_arms_request(handle.request), cancelled(handle), report),
         )
-        result = MoveArms.Result(delays=list(answer.delays), separation=answer.separation)
+        result = MoveArms.Result(start_delays=list(answer.start_delays), clearance=answer.clearance)
         result.trajectories = [convert.trajectory_msg(part) for part in answer.trajectories]
         return _end(handle, result, answer)
 
@@ -130,13 +130,13 @@ class MotionNode(BaseNode[MotionConfig]):
             MotionAnswer,
             lambda: self.service.execute(convert.execute_request(handle.request), cancelled(handle), report),
         )
-        return _end(handle, ExecuteTrajectory.Result(waited=answer.start_delay), answer)
+        return _end(handle, ExecuteTrajectory.Result(start_delay=answer.start_delay), answer)
 
     # --- services
     def _on_ik(self, request: ComputeIK.Request, response: ComputeIK.Response) -> ComputeIK.Response:
         try:
             pose = self.service.in_base(pose_to_matrix(request.pose.pose), request.pose.header.frame_id)
-            answer = self.service.compute_ik(request.arm, pose, request.seed, free_orientation=request.free_orientation)
+            answer = self.service.compute_ik(request.arm, pose, request.seed, position_only=request.position_only)
             response.joint_positions, response.nearest = answer.q.tolist(), matrix_to_pose(answer.pose)
             response.position_error, response.orientation_error = answer.position_error, answer.orientation_error
             if answer.error is not None:

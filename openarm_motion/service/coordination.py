@@ -75,7 +75,7 @@ class ArmCoordination:
                 no clearance, or no longer because another arm stopped; as `TrajectoryFollower.follow`.
         """
         if not 0.0 <= max_delay < float("inf"):
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"max_wait is {max_delay:g} s, expected 0 or more")
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"max_start_delay is {max_delay:g} s, expected 0 or more")
         while self._starting:
             await self._robot.pause()
         self._starting = True

@@ -227,12 +227,12 @@ class MotionService:
 
                 plan = await self.robot.compute(work)
                 seconds = max(part.duration for part in plan.trajectories)
-                apart = f"{plan.separation * 1e3:.0f} mm apart"
+                apart = f"{plan.clearance * 1e3:.0f} mm apart"
                 answer = replace(
                     answer,
                     trajectories=plan.trajectories,
-                    delays=plan.delays,
-                    separation=plan.separation,
+                    start_delays=plan.start_delays,
+                    clearance=plan.clearance,
                     planning_time=self.robot.now() - begin,
                     message=f"planned, {seconds:.2f} s, {apart}{prepared.note}",
                 )
@@ -281,24 +281,24 @@ class MotionService:
         return {name: (self.arms[name].kinematics.tool_link, boxes) for name, boxes in self.memory.held.items()}
 
     # --- questions
-    def compute_ik(self, arm_name: str, pose: Array, seed: Sequence[float], *, free_orientation: bool) -> IkAnswer:
+    def compute_ik(self, arm_name: str, pose: Array, seed: Sequence[float], *, position_only: bool) -> IkAnswer:
         """Solve the inverse kinematics of an arm's tool.
 
         Args:
             arm_name: Name of the arm.
             pose: (4, 4) base frame.
             seed: (n,) joints to stay near to; empty: the present ones.
-            free_orientation: Position alone counts.
+            position_only: Position alone counts.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT; LIMITS; NOT_READY, without seed and joint states.
         """
         arm = self._arm(arm_name)
         start = self._context.start(arm, seed, 0.0, never).start
-        best = arm.inverse.nearest(pose, start, position_only=free_orientation)
+        best = arm.inverse.nearest(pose, start, position_only=position_only)
         error = None
         if not best.success:
-            error = moves.unreachable(arm, pose, free_orientation=free_orientation, margin=0.0, near=start)
+            error = moves.unreachable(arm, pose, position_only=position_only, margin=0.0, near=start)
         fk = arm.kinematics.fk(best.q)
         return IkAnswer(best.q, fk, best.position_error, best.orientation_error, error)
 
@@ -369,10 +369,10 @@ class MotionService:
             )
         pose = self.in_base(goal.pose, goal.frame)
         if isinstance(goal, PoseGoal):
-            free = goal.free_orientation
+            free = goal.position_only
             return lambda now: explained(
-                lambda: moves.to_pose(arm, now, pose, around, free_orientation=free),
-                lambda: near_pose(arm, now, around, pose, free_orientation=free),
+                lambda: moves.to_pose(arm, now, pose, around, position_only=free),
+                lambda: near_pose(arm, now, around, pose, position_only=free),
             )
         return lambda now: moves.to_pose_on_line(arm, now, pose, around)
 
@@ -386,8 +386,8 @@ class MotionService:
             return lambda _: named_posture(arm, goal.name, start)[None]
         if isinstance(goal, YieldGoal):
             return lambda _: yielding(arm, start, goal.name)
-        pose, free = self.in_base(goal.pose, goal.frame), goal.free_orientation
-        return lambda now: goal_configurations(arm, now, start, pose, free_orientation=free)
+        pose, free = self.in_base(goal.pose, goal.frame), goal.position_only
+        return lambda now: goal_configurations(arm, now, start, pose, position_only=free)
 
     def _two_arms(self, targets: Sequence[ArmGoal]) -> tuple[Arm, Arm]:
         names = [target.arm for target in targets]

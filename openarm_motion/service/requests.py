@@ -32,11 +32,11 @@ class NamedGoal:
 
 @dataclass(frozen=True, eq=False)
 class PoseGoal:
-    """A tool pose in a frame ("" is the base frame), on a free path; `free_orientation`: position alone counts."""
+    """A tool pose in a frame ("" is the base frame), on a free path; `position_only`: position alone counts."""
 
     pose: Array
     frame: str = ""
-    free_orientation: bool = False
+    position_only: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,8 +193,8 @@ class MoveArmsAnswer(MotionAnswer):
     """A dual-arm motion: trajectories, the delay contained in each (s), and the least clearance of the arms (m)."""
 
     trajectories: tuple[Trajectory, ...] = ()
-    delays: tuple[float, ...] = ()
-    separation: float = 0.0
+    start_delays: tuple[float, ...] = ()
+    clearance: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

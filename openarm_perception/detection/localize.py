@@ -172,7 +172,7 @@ class Localizer:
         top = self._top_height(points[:, 2], patch.band)
         shape = footprint.bound(points[:, :2], 3.0 * float(np.median(patch.z[solid])) / patch.intrinsics.fx)
         around = self._detection(patch.found, shape, top, len(points), 0.0)
-        return replace(around, score=0.0, kind=kind_of(patch.found.kind, around.size), measured=False)
+        return replace(around, score=patch.found.score, kind=kind_of(patch.found.kind, around.size), measured=False)
 
     def locate_on_plane(
         self, found: Detection2D, height: float, intrinsics: Intrinsics, T_base_camera: Array

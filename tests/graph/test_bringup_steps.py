@@ -146,12 +146,12 @@ def test_the_map_shows_the_objects_and_not_the_arms_and_the_step_is_recorded(sta
     done = up.openarm("record", str(bag), "--topics", topics, "--duration", "6", "--json")
     assert done.returncode == 0, done.stdout + done.stderr
     # P-31: at rest the map lets the cameras rest too
-    listens = json.loads(up.openarm("node", "info", "octomap", "--json").stdout)["listens to"]
-    assert "/overhead/depth/image_raw" in listens
+    topics_of_octomap = json.loads(up.openarm("node", "info", "octomap", "--json").stdout)["subscribes to"]
+    assert "/overhead/depth/image_raw" in topics_of_octomap
     rests = up.openarm("service", "call", "/octomap/change_state", "{transition: {label: deactivate}}")
     assert rests.returncode == 0, rests.stdout + rests.stderr
-    listens = json.loads(up.openarm("node", "info", "octomap", "--json").stdout)["listens to"]
-    assert not {"/overhead/depth/image_raw", "/wrist/depth/image_raw", "/joint_states"} & set(listens)
+    topics_of_octomap = json.loads(up.openarm("node", "info", "octomap", "--json").stdout)["subscribes to"]
+    assert not {"/overhead/depth/image_raw", "/wrist/depth/image_raw", "/joint_states"} & set(topics_of_octomap)
     assert up.stop() == 0
     told = json.loads(done.stdout)
     assert told["lost"] == 0

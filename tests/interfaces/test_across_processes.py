@@ -35,7 +35,7 @@ transforms = node.create_publisher(TFMessage, "/transforms", 1)
 
 
 def compute(request, response):
-    response.success = request.free_orientation
+    response.success = request.position_only
     response.joint_positions = [2.0 * value for value in request.seed]
     response.message = request.arm
     return response
@@ -88,7 +88,7 @@ def test_a_message_a_service_and_actions_make_the_round_trip(ros, peer) -> None:
 
     answer = ros.call(
         ros.node.create_client(ComputeIK, "/compute"),
-        ComputeIK.Request(arm="left", free_orientation=True, seed=[0.5, -1]),
+        ComputeIK.Request(arm="left", position_only=True, seed=[0.5, -1]),
     )
     assert (answer.success, answer.message, list(answer.joint_positions)) == (True, "left", [1.0, -2.0])
 

@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter
 
 from openarm_bringup.ros.object_client import DetectionListener
 from openarm_common.ros.convert import pose_to_matrix, stamp_to_ns
+from openarm_common.ros.detections import UNKNOWN
 from openarm_perception.detection.attributes import parse, resolve
 from tests.nodes.detect_bench import TABLE, Bench, FakeCamera
 from tests.openarm_perception.onnx_file import boxes, write_network
@@ -140,11 +141,12 @@ def test_a_network_that_cannot_be_used_leaves_the_work_to_the_colours(ros, camer
 
 @pytest.mark.requirement("N-16")
 def test_what_only_colour_sees_is_told_but_not_given_to_be_grasped(ros, camera, tmp_path) -> None:
-    """In view with score 0, as everything that is in the way and not measured."""
+    """Published as detected but not measured: an obstacle."""
     blind = write_network(tmp_path / "blind.onnx", boxes(), (1, 3, 480, 640))
     bench = Bench(ros, camera=camera, detector="both", **{"network.model": str(blind)})
     (found,) = bench.detect().detections
-    assert found.results[0].hypothesis.score == 0.0
+    assert found.results[0].pose.covariance[0] == UNKNOWN
+    assert 0.0 < found.results[0].hypothesis.score <= 1.0
     bench.said("the network detects nothing there; it is observed again")
 
 

@@ -122,7 +122,7 @@ def test_what_stays_blocked_failed_with_its_reason():
 def test_what_an_order_has_placed_it_does_not_pick_again():
     order = Order(("red",), each={"red": 2})
     order.done(order.next(), Code.OK, "", (0.3, -0.2, 0.4))
-    assert order.next() == GraspRequest("red", leave=((0.3, -0.2),))
+    assert order.next() == GraspRequest("red", exclude_near=((0.3, -0.2),))
     order.done(order.next(), Code.OK, "", (0.2, -0.2, 0.4))
     assert order.next() is None
     assert order.outcome == "SUCCESS"

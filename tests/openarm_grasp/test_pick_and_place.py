@@ -108,7 +108,7 @@ def test_dry_run_plans_both_and_moves_nothing(world):
     assert not world.done(Follow) + world.done(Grip) + world.done(GoHome) + world.done(MoveLinear)
     (place,) = world.done(PlanPlace)
     assert place.after == "lift"
-    assert [b.id for b in place.gone] == ["target/red"], "the map still shows it where it stands"
+    assert [b.id for b in place.ignore_regions] == ["target/red"], "the map still shows it where it stands"
 
 
 # --- seeing

@@ -41,7 +41,7 @@ def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_obj
     assert two.ask().route == "push"
     assert ahead
     for effect in ahead:
-        (gone,) = effect.gone
+        (gone,) = effect.ignore_regions
         assert gone.T_frame_box[:2, 3] == pytest.approx((0.46, 0.02), abs=1e-6)
 
 

@@ -69,7 +69,7 @@ def test_arms_that_take_each_others_place_keep_20_mm_all_the_way(both, home, how
     plan: DualArmPlan = how(both, starting(both, state), goals, 10.0)
     seen = apart_all_the_way(both, state, plan)
     assert seen >= 0.020
-    assert plan.separation == pytest.approx(seen, abs=0.002)
+    assert plan.clearance == pytest.approx(seen, abs=0.002)
     for arm, part, wanted in zip(both.arms, plan.trajectories, goals.goals, strict=True):
         assert part.names == arm.names
         np.testing.assert_allclose(part.q[0], [state[name] for name in arm.names], atol=1e-9)
@@ -89,13 +89,13 @@ def test_the_arm_in_the_way_goes_first_and_the_other_waits_no_longer_than_it_mus
 
     monkeypatch.setattr(together, "_alone", slow_left)
     plan = plan_staggered(both, starting(both, state), goals, 10.0)
-    assert plan.delays[0] == 0.0
-    assert 0.0 < plan.delays[1] < plan.trajectories[0].duration
+    assert plan.start_delays[0] == 0.0
+    assert 0.0 < plan.start_delays[1] < plan.trajectories[0].duration
     late = plan.trajectories[1]
     np.testing.assert_array_equal(late.q[0], late.q[1])
-    moving = replace(late, t=late.t[1:] - plan.delays[1], q=late.q[1:], v=late.v[1:], a=late.a[1:])
+    moving = replace(late, t=late.t[1:] - plan.start_delays[1], q=late.q[1:], v=late.v[1:], a=late.a[1:])
     scene = both.scene(state)
-    sooner = delayed(moving, plan.delays[1] - 0.1)
+    sooner = delayed(moving, plan.start_delays[1] - 0.1)
     assert separation(scene, joined(both, (plan.trajectories[0], sooner))) < 0.024
     assert separation(scene, joined(both, plan.trajectories)) >= 0.024
     assert apart_all_the_way(both, state, plan) >= 0.020
@@ -157,7 +157,7 @@ def test_corners_of_both_arms_are_rounded_and_keep_apart(both, home) -> None:
         assert np.all(np.abs(whole.v) <= both.limits(0.5).velocity * (1 + 1e-6))
         moving = np.abs(whole.v).max(axis=1)[1:-1] > 1e-6
         if turns(whole) and moving.all():  # it does not stop where it turns
-            assert plan.separation >= 0.020
+            assert plan.clearance >= 0.020
             assert apart_all_the_way(both, state, plan) >= 0.020
             return
     pytest.fail("every plan with a corner stops in it")

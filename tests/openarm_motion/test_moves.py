@@ -41,7 +41,7 @@ def test_the_sample_target_is_solved_with_free_orientation_and_refused_with_a_ve
     arm = arms["left"]
     now = arm.start_state(home)
     pose = T_base_table @ se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.4, 0.2, 0.3))
-    trajectory = moves.to_pose(arm, now, pose, NOTHING, free_orientation=True)
+    trajectory = moves.to_pose(arm, now, pose, NOTHING, position_only=True)
     np.testing.assert_allclose(arm.kinematics.fk(trajectory.q[-1])[:3, 3], pose[:3, 3], atol=1e-4)
     assert_free(arm, home, trajectory)
     message = refused(Code.UNREACHABLE, moves.to_pose, arm, now, pose, NOTHING)

@@ -232,13 +232,13 @@ def test_a_dual_arm_motion_moves_both_arms_from_the_same_moment(bench) -> None:
     assert answer.code is Code.OK, answer.message
     left, right = (controller.goals[0] for controller in bench.robot.controllers.values())
     assert left.begin_ns == right.begin_ns > 0
-    assert answer.separation >= 0.02
+    assert answer.clearance >= 0.02
 
 
 def test_an_unreachable_pose_carries_the_nearest_alternative(bench) -> None:
     pose = se3.make(se3.rotation_from_z_y((0, 0, -1), (0, 1, 0)), (0.9, -0.2, 0.6))
     (answer,) = bench.run(bench.service.move(MoveRequest("right", PoseGoal(pose), scale=1.0, plan_only=True)))
     assert answer.code is Code.UNREACHABLE
-    ik = bench.service.compute_ik("right", pose, (), free_orientation=False)
+    ik = bench.service.compute_ik("right", pose, (), position_only=False)
     assert ik.error is not None
     assert ik.position_error > 0.05

@@ -200,7 +200,7 @@ class FakeGraph(Node):
 
     async def _interrupted(self, goal, what: str) -> bool:
         self.log.append(what)
-        self.asked.append((goal.request.arm, what, goal.request.max_wait))
+        self.asked.append((goal.request.arm, what, goal.request.max_start_delay))
         waiting = self.during(what)
         if waiting is not None:
             self._waiting[bytes(goal.goal_id.uuid)] = waiting

@@ -20,9 +20,11 @@ def test_a_plan_of_what_comes_later_names_where_the_object_will_not_stand_any_mo
     ways = propose(target, config)
     box, gone = target_box(target, config), Box("red", se3.make(p=(0.40, -0.20, 0.425)), (0.06, 0.06, 0.05))
     grasp = convert.plan_goal(PlanGrasp("right", ways, (), box, (gone,)), 0.0)
-    place = convert.plan_goal(PlanPlace("right", (), (), held_box(target, ways[0], config), gone=(gone,)), 0.0)
+    place = convert.plan_goal(
+        PlanPlace("right", (), (), held_box(target, ways[0], config), ignore_regions=(gone,)), 0.0
+    )
     for goal in (grasp, place):
-        (told,) = goal.gone
+        (told,) = goal.ignore_regions
         np.testing.assert_allclose(pose_to_matrix(told.pose), gone.T_frame_box)
         assert (told.size.x, told.size.y, told.size.z) == gone.size
-    assert list(convert.plan_goal(PlanGrasp("right", ways, (), box), 0.0).gone) == []
+    assert list(convert.plan_goal(PlanGrasp("right", ways, (), box), 0.0).ignore_regions) == []

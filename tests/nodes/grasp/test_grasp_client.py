@@ -64,7 +64,7 @@ def test_the_client_means_an_object_by_its_position_and_leaves_others(bench):
     def script() -> None:
         with GraspClient() as grasp:
             results.append(grasp.pick(object_at=(0.26, 0.21), dry_run=True))
-            results.append(grasp.pick("red", leave=((0.26, -0.2),), dry_run=True))
+            results.append(grasp.pick("red", exclude_near=((0.26, -0.2),), dry_run=True))
 
     thread = Thread(target=script)
     thread.start()

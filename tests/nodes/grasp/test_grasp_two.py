@@ -33,7 +33,7 @@ def ask(bench, *labels: str, **fields) -> PickTwo.Result:
     return bench.ros.result(result, 60.0).result
 
 
-def at_once(bench) -> tuple[object, Future]:
+def simultaneous(bench) -> tuple[object, Future]:
     """Two grasps whose lifts do not end; the goal and its result."""
     bench.world.during = lambda what: Future() if len(bench.world.hands) == 2 and what == "execute" else None
     handle, result = bench.ros.send_goal(bench.two, goal("red", "blue"))
@@ -49,15 +49,15 @@ def test_two_objects_are_picked_at_once_each_by_its_arm_and_each_tells_its_state
     wish.requests[1].place_position.x, wish.requests[1].place_position.y = 0.3, 0.3
     ended = lambda: {f.request for f in heard if f.status.label and f.status.state == "IDLE"} == {0, 1}  # noqa: E731
     result: PickTwo.Result = bench.ros.hear_all(bench.two, wish, heard, ended, 60.0)
-    assert (result.success, result.outcome, result.code, result.at_once) == (True, "SUCCESS", "OK", True), result
-    assert [(a.label, a.arm, a.attempts, a.route) for a in result.answers] == [
+    assert (result.success, result.outcome, result.code, result.simultaneous) == (True, "SUCCESS", "OK", True), result
+    assert [(a.label, a.arm, a.attempts, a.route) for a in result.results] == [
         ("red", "right", 1, "direct"),
         ("blue", "left", 1, "direct"),
     ]
-    for answer in result.answers:
+    for answer in result.results:
         target = (answer.place_position.x, answer.place_position.y)
         assert bench.world.objects[answer.label][:2] == pytest.approx(target, abs=0.005)
-    assert (result.answers[1].place_position.x, result.answers[1].place_position.y) == (0.3, 0.3)
+    assert (result.results[1].place_position.x, result.results[1].place_position.y) == (0.3, 0.3)
     # both are under way before either has ended, and each motion may rest for the other arm
     told = [(f.request, f.status.state) for f in heard]
     assert max(told.index((k, "MOVE_TO_PREGRASP")) for k in (0, 1)) < min(told.index((k, "LIFT")) for k in (0, 1))
@@ -66,7 +66,7 @@ def test_two_objects_are_picked_at_once_each_by_its_arm_and_each_tells_its_state
     for k, label in enumerate(("red", "blue")):
         mine = [f.status for f in heard if f.request == k and f.status.label == label]
         assert " ".join(state for state, _ in groupby(s.state for s in mine)) == STATES
-        assert mine[-1].arm == result.answers[k].arm
+        assert mine[-1].arm == result.results[k].arm
 
 
 def test_the_newest_status_is_of_the_one_that_is_at_work(bench) -> None:
@@ -93,7 +93,7 @@ def test_one_request_at_a_time_whatever_its_kind(bench) -> None:
     assert (answer.code, answer.success) == ("BUSY", False)
     assert "a grasp of 'red' and 'blue' is running" in answer.message
     busy = ask(bench, "red", "blue")
-    assert (busy.code, busy.outcome, len(busy.answers)) == ("BUSY", "REFUSED", 0)
+    assert (busy.code, busy.outcome, len(busy.results)) == ("BUSY", "REFUSED", 0)
     handle, _ = bench.ros.send_goal(bench.action, Pick.Goal(label="red"))
     assert not bench.ros.result(handle.cancel_goal_async()).goals_canceling
     held_up.set_result(None)
@@ -103,12 +103,12 @@ def test_one_request_at_a_time_whatever_its_kind(bench) -> None:
 
 @pytest.mark.requirement("P-01", "P-21")
 def test_a_cancel_stops_both_arms_and_each_hand_keeps_its_object_until_it_is_placed(bench) -> None:
-    handle, result = at_once(bench)
+    handle, result = simultaneous(bench)
     assert bench.ros.result(handle.cancel_goal_async()).goals_canceling
     end = bench.ros.result(result, 5.0)
     assert end.status == GoalStatus.STATUS_CANCELED
     assert (end.result.code, end.result.outcome) == ("CANCELLED", "CANCELLED")
-    assert [answer.code for answer in end.result.answers] == ["CANCELLED", "CANCELLED"]
+    assert [answer.code for answer in end.result.results] == ["CANCELLED", "CANCELLED"]
     assert bench.world.cancelled == ["execute", "execute"]
     assert bench.world.hands == {"right": "red", "left": "blue"}
     # either hand would drop what it holds
@@ -129,7 +129,7 @@ def test_a_limit_of_time_ends_both_with_their_hands_closed(bench) -> None:
     bench.world.during = lambda what: Future() if len(bench.world.hands) == 2 and what == "execute" else None
     result = ask(bench, "red", "blue", timeout=20.0)
     assert (result.success, result.code, result.outcome) == (False, "TIMEOUT", "PARTIAL")
-    assert [answer.code for answer in result.answers] == ["TIMEOUT", "TIMEOUT"]
+    assert [answer.code for answer in result.results] == ["TIMEOUT", "TIMEOUT"]
     assert result.duration == pytest.approx(20.0, abs=5.0)
     assert bench.world.hands == {"right": "red", "left": "blue"}
 
@@ -145,27 +145,27 @@ def test_a_cancel_while_both_are_looked_at_moves_nothing(bench) -> None:
 
 
 def test_a_robot_that_goes_silent_ends_both_within_two_seconds(bench) -> None:
-    _, result = at_once(bench)
+    _, result = simultaneous(bench)
     bench.world.silent = True
     began = time.monotonic()
     end: PickTwo.Result = bench.ros.result(result, 5.0).result
     assert time.monotonic() - began < 2.0
     assert end.code == "ROBOT_LOST"
-    assert [answer.code for answer in end.answers] == ["ROBOT_LOST", "ROBOT_LOST"]
+    assert [answer.code for answer in end.results] == ["ROBOT_LOST", "ROBOT_LOST"]
 
 
 def test_a_dry_run_of_two_moves_nothing(bench) -> None:
     result = ask(bench, "red", "blue", dry_run=True)
-    assert (result.success, result.at_once) == (True, True), result.message
+    assert (result.success, result.simultaneous) == (True, True), result.message
     assert {entry.split()[0] for entry in bench.world.log} == {"plan"}
-    assert {answer.arm for answer in result.answers} == {"left", "right"}
+    assert {answer.arm for answer in result.results} == {"left", "right"}
 
 
 def test_of_two_that_one_arm_is_asked_for_one_waits_for_the_other(bench) -> None:
     bench.world.objects["blue"][:2] = (0.30, -0.08)
     result = ask(bench, "red", "blue", arms=("right", "right"))
-    assert (result.success, result.at_once) == (True, False), result.message
-    assert [answer.arm for answer in result.answers] == ["right", "right"]
+    assert (result.success, result.simultaneous) == (True, False), result.message
+    assert [answer.arm for answer in result.results] == ["right", "right"]
     assert "the same arm is asked for: one after the other" in result.message.replace(")", "")
 
 
@@ -173,14 +173,14 @@ def test_of_two_that_one_arm_is_asked_for_one_waits_for_the_other(bench) -> None
 def test_one_of_two_that_is_not_in_view_is_refused_and_the_other_placed(bench) -> None:
     result = ask(bench, "mug", "blue")
     assert (result.success, result.outcome, result.code) == (False, "PARTIAL", "UNKNOWN_OBJECT")
-    assert [answer.outcome for answer in result.answers] == ["REFUSED", "SUCCESS"]
+    assert [answer.outcome for answer in result.results] == ["REFUSED", "SUCCESS"]
     assert "no 'mug' in view" in result.message
     assert bench.ask("", phase="place").code == "NOT_READY"
 
 
 def test_what_is_no_pair_is_refused_before_anything_moves(bench) -> None:
     result = ask(bench, "red", "red")
-    assert (result.code, result.outcome, len(result.answers)) == ("INVALID_ARGUMENT", "REFUSED", 0)
+    assert (result.code, result.outcome, len(result.results)) == ("INVALID_ARGUMENT", "REFUSED", 0)
     assert "'red' is asked for twice" in result.message
     assert bench.world.log == []
 
@@ -205,11 +205,11 @@ def test_the_client_picks_two_from_plain_python(bench) -> None:
     done, refused = results
     assert done.success, done.message
     assert done.raise_for_code() is done
-    assert done.at_once
-    assert [(a.label, a.arm) for a in done.answers] == [("red", "right"), ("blue", "left")]
-    assert done.answers[1].place_position[:2] == (0.3, 0.3)
+    assert done.simultaneous
+    assert [(a.label, a.arm) for a in done.results] == [("red", "right"), ("blue", "left")]
+    assert done.results[1].place_position[:2] == (0.3, 0.3)
     assert {("red", "LIFT"), ("blue", "LIFT")} <= set(heard)
-    assert (refused.code, refused.answers) == (Code.INVALID_ARGUMENT, ())
+    assert (refused.code, refused.results) == (Code.INVALID_ARGUMENT, ())
 
 
 def test_openarm_pick_red_blue_picks_both_and_says_so_as_json(bench, tmp_path, capsys) -> None:
@@ -221,7 +221,7 @@ def test_openarm_pick_red_blue_picks_both_and_says_so_as_json(bench, tmp_path, c
     bench.until(lambda: not thread.is_alive(), 60.0, "the command ends")
     thread.join()
     told = json.loads(report.read_text(encoding="utf-8"))
-    assert (codes, told["success"], told["code"], told["at_once"]) == ([0], True, "OK", True), told
+    assert (codes, told["success"], told["code"], told["simultaneous"]) == ([0], True, "OK", True), told
     assert [(a["label"], a["arm"], a["outcome"]) for a in told["answers"]] == [
         ("red", "right", "SUCCESS"),
         ("blue", "left", "SUCCESS"),

@@ -52,7 +52,7 @@ class FakeRobot:
         self.sag: dict[str, float] = {}
         self.accept = True
         self.cancelled: list[str] = []
-        self.gone: set[str] = set()
+        self.ignore_regions: set[str] = set()
         #: Sides whose controller gives up after so many seconds of a motion.
         self.fail_after: dict[str, float] = {}
         self.active: dict[str, tuple[int, list[str], np.ndarray, np.ndarray]] = {}
@@ -96,10 +96,10 @@ class FakeRobot:
         result = FollowJointTrajectory.Result(error_code=Result.SUCCESSFUL)
         end_ns = begin_ns + int(t[-1] * 1e9)
         fail_ns = begin_ns + int(self.fail_after.get(side, 1e6) * 1e9)
-        while self.t_ns < min(end_ns, fail_ns) and side not in self.gone and not handle.is_cancel_requested:
+        while self.t_ns < min(end_ns, fail_ns) and side not in self.ignore_regions and not handle.is_cancel_requested:
             await self._wake
         self.active.pop(side)
-        if side in self.gone:
+        if side in self.ignore_regions:
             return result
         if handle.is_cancel_requested:
             self.cancelled.append(side)

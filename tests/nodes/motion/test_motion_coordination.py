@@ -20,8 +20,8 @@ def to(bench, arm: str, p: tuple[float, float, float], **kwargs) -> MoveArm.Goal
     return MoveArm.Goal(arm=arm, kind=MoveArm.Goal.POSE, pose=pose, **{"velocity_scale": 1.0, **kwargs})
 
 
-def execute(arm: str, trajectory, max_wait: float = 30.0) -> ExecuteTrajectory.Goal:
-    return ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_wait=max_wait)
+def execute(arm: str, trajectory, max_start_delay: float = 30.0) -> ExecuteTrajectory.Goal:
+    return ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_start_delay=max_start_delay)
 
 
 def nearest(bench, futures, limit: float = 30.0) -> float:
@@ -63,8 +63,8 @@ def test_an_arm_rests_until_the_one_under_way_leaves_room(bench) -> None:
     first, second = left.result().result, right.result().result
     assert first.success, first.message
     assert second.success, second.message
-    assert first.waited == 0.0
-    assert 0.1 < second.waited < slow.points[-1].time_from_start.sec + 1.0
+    assert first.start_delay == 0.0
+    assert 0.1 < second.start_delay < slow.points[-1].time_from_start.sec + 1.0
     assert gap >= 0.020
     tip = bench.node.service.arms["right"].kinematics.fk(bench.q("right"))[:3, 3]
     np.testing.assert_allclose(tip, MIDDLE, atol=2e-3)
@@ -136,7 +136,7 @@ def test_an_approach_is_planned_beside_where_the_other_arm_will_end(bench) -> No
     bench.ros.spin_until(lambda: "left" in bench.robot.active, 5.0, "the left arm to set out")
     plan = bench.run(bench.plan_client, approach("right", -0.02))
     assert plan.success, plan.message
-    assert 0.0 < plan.wait < 20.0
+    assert 0.0 < plan.start_delay < 20.0
     assert not left.done()
     _, right = bench.start(bench.execute_client, execute("right", plan.transfer))
     assert nearest(bench, [left, right]) >= 0.020

@@ -46,9 +46,9 @@ def test_arms_take_each_others_place_at_once(bench, strategy: int) -> None:
     result, gap = watched(bench, both_goal(over_the_middle(bench, "right"), home("left"), strategy=strategy))
     assert (result.success, result.code) == (True, "OK"), result.message
     assert gap >= 0.020
-    assert result.separation >= 0.024
+    assert result.clearance >= 0.024
     assert [t.joint_names[0] for t in result.trajectories] == ["openarm_right_joint1", "openarm_left_joint1"]
-    assert len(result.delays) == 2
+    assert len(result.start_delays) == 2
     # both controllers are told the same moment
     assert len({stamp_to_ns(t.header.stamp) for t in result.trajectories}) == 1
     tip = bench.node.service.arms["right"].kinematics.fk(bench.q("right"))[:3, 3]

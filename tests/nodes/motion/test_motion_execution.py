@@ -114,7 +114,7 @@ def test_a_controller_that_vanishes_ends_a_motion_within_two_seconds(bench) -> N
     _, future = bench.begin("right", bench.slow_plan())
     begin = time.monotonic()
     bench.robot.servers["right"].destroy()
-    bench.robot.gone.add("right")
+    bench.robot.ignore_regions.add("right")
     result = bench.ros.result(future).result
     assert time.monotonic() - begin < 2.0
     assert (result.success, result.code) == (False, "ROBOT_LOST")

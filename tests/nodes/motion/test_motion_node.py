@@ -26,7 +26,7 @@ from openarm_motion.ros.node import table_boxes
 @pytest.mark.requirement("A-66")
 def test_compute_ik_in_the_table_frame(bench) -> None:
     target = se3.make(bench.DOWN, (0.4, 0.2, 0.3))
-    request = ComputeIK.Request(arm="left", pose=bench.stamped(target, "table"), free_orientation=True)
+    request = ComputeIK.Request(arm="left", pose=bench.stamped(target, "table"), position_only=True)
     answer = bench.ros.call(bench.ik_client, request)
     assert (answer.success, answer.code) == (True, "OK")
     assert answer.position_error < 1e-4
@@ -34,7 +34,7 @@ def test_compute_ik_in_the_table_frame(bench) -> None:
         "openarm_left_hand_tcp", dict(zip(bench.description.arm_joints("left"), answer.joint_positions, strict=True))
     )
     np.testing.assert_allclose(reached[:3, 3], [0.4, 0.2, 0.7], atol=1e-4)
-    request.free_orientation = False
+    request.position_only = False
     answer = bench.ros.call(bench.ik_client, request)
     assert (answer.success, answer.code) == (False, "UNREACHABLE")
     assert "left arm can't reach (0.400, 0.200, 0.700) m" in answer.message

@@ -209,7 +209,7 @@ def test_what_will_be_gone_by_then_is_in_nobodys_way(make_bench, writer) -> None
     write(writer, cells)
     result = bench.run(bench.plan_client, goal)
     assert (result.success, result.failure.second) == (False, "the map"), result.message
-    goal.gone = [cube]
+    goal.ignore_regions = [cube]
     write(writer, cells)
     result = bench.run(bench.plan_client, goal)
     assert result.success, result.message
