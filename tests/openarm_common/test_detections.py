@@ -11,7 +11,7 @@ from vision_msgs.msg import Detection3D
 
 from openarm_common import se3
 from openarm_common.detection import Detection
-from openarm_common.ros.detections import class_ids, detections_from_msg, detections_to_msg
+from openarm_common.ros.detections import UNKNOWN, class_ids, detections_from_msg, detections_to_msg
 
 T = se3.make(se3.rot_z(0.3), (0.3, -0.2, 0.43))
 CUBE = Detection("red", 0.9, T, np.array([0.050, 0.051, 0.052]), kind="cube")
@@ -30,10 +30,11 @@ def test_an_object_is_read_as_it_was_written(detection: Detection) -> None:
     np.testing.assert_allclose(found.size, detection.size)
 
 
-def test_an_object_that_was_not_measured_stays_so_and_has_no_score() -> None:
+def test_an_object_that_was_not_measured_stays_so_and_keeps_its_score() -> None:
     message = detections_to_msg([replace(CUBE, measured=False)], NONE, "base", 0)
-    assert all(result.hypothesis.score == 0.0 for result in message.detections[0].results)
-    assert not detections_from_msg(message)[0].measured
+    assert all(result.pose.covariance[0] == UNKNOWN for result in message.detections[0].results)
+    (found,) = detections_from_msg(message)
+    assert (found.score, found.measured) == (pytest.approx(CUBE.score), False)
 
 
 def test_equal_labels_are_numbered_and_detections_without_a_class_left_out() -> None:

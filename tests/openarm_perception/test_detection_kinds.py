@@ -96,7 +96,7 @@ def test_what_the_network_does_not_see_is_looked_at_again(tabletop, perceive) ->
     seen = perceive("both", three(tabletop), {2: (0, 0.9, 0.0)})
     assert [place.label for place in seen.located] == ["box"]
     assert sorted(place.label for place in seen.unmeasured) == ["blue", "red"]
-    assert all(place.score == 0.0 for place in seen.unmeasured)
+    assert not any(place.measured for place in seen.unmeasured)
     assert any(
         "red at pixel" in why and "the network detects nothing there; it is observed again" in why
         for why in seen.refused

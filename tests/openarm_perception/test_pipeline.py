@@ -46,7 +46,7 @@ def test_the_pipeline_ranks_and_filters(tabletop, pipeline) -> None:
 
 
 def test_what_cannot_be_measured_is_still_in_the_way(tabletop, pipeline) -> None:
-    """A block closely built in on both sides has no outline of its own, but a box around it, with score 0."""
+    """A block closely built in on both sides has no outline of its own, but an enclosing box, marked as not measured."""
     things = [
         tabletop.Thing(c, "box", (0.05, 0.05, 0.05), 0.27, y)
         for c, y in (("red", -0.05), ("blue", 0.0), ("green", 0.05))
@@ -56,7 +56,7 @@ def test_what_cannot_be_measured_is_still_in_the_way(tabletop, pipeline) -> None
     assert set(boxes) == {"red", "blue", "green"}
     built_in = boxes["blue"]
     assert built_in not in perceived.located
-    assert built_in.score == 0.0
+    assert not built_in.measured
     assert built_in.p_base[:2] == pytest.approx((0.27, 0.0), abs=0.006)
     assert built_in.size == pytest.approx((0.05, 0.05, 0.05), abs=0.008)
 
