@@ -46,7 +46,7 @@ def test_the_pipeline_ranks_and_filters(tabletop, pipeline) -> None:
 
 
 def test_what_cannot_be_measured_is_still_in_the_way(tabletop, pipeline) -> None:
-    """A block closely built in on both sides has no outline of its own, but an enclosing box, marked as not measured."""
+    """A block between two others has no outline of its own: its box encloses it and is marked as not measured."""
     things = [
         tabletop.Thing(c, "box", (0.05, 0.05, 0.05), 0.27, y)
         for c, y in (("red", -0.05), ("blue", 0.0), ("green", 0.05))
