@@ -8,6 +8,7 @@ identifiers: those that were there before a (re)start do not count.
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,7 +18,11 @@ from rclpy.subscription import Subscription
 
 from openarm_bringup.messages import interface
 from openarm_bringup.supervision.graph import Ready
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import ContextNode
+
+#: Time that a service gets to answer before it is asked again, s.
+_ASK_AGAIN_S = 2.0
 
 
 class ReadinessClient(ContextNode):
@@ -52,10 +57,15 @@ class ReadinessClient(ContextNode):
             OpenArmError: TIMEOUT, when the node does not answer.
         """
         client = self._node.create_client(ListParameters, f"/{node}/list_parameters")
+        deadline = time.monotonic() + timeout_s
         try:
-            ready = self.spin_until(client.service_is_ready, timeout_s)
-            answer = client.call_async(ListParameters.Request())
-            return frozenset(self.result(answer, timeout_s if ready else 0.0, client.srv_name).result.names)
+            self.spin_until(client.service_is_ready, timeout_s)
+            while (left := deadline - time.monotonic()) > 0.0:
+                # A response is lost when the server has not matched the client's reader yet; then it is asked again.
+                answer = client.call_async(ListParameters.Request())
+                if self.spin_until(answer.done, min(left, _ASK_AGAIN_S)):
+                    return frozenset(answer.result().result.names)
+            raise OpenArmError(Code.TIMEOUT, f"{client.srv_name}: no answer within {timeout_s:g} s")
         finally:
             self._node.destroy_client(client)
 
