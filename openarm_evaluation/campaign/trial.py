@@ -23,7 +23,7 @@ from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import MISSES, PLAN_FAILS, Task
 from openarm_evaluation.judging.judge import JudgeConfig, Sample, Verdict, at_rest, judge
 from openarm_evaluation.judging.provenance import scene_hash
-from openarm_evaluation.judging.trial import Step, Trial, trial_of
+from openarm_evaluation.judging.trial import Step, Trial
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.planning.arms import ARMS
@@ -104,14 +104,14 @@ class Trials:
         order, placed, open_ = Order(labels, each=Counter(labels)), list[Trial](), dict[str, Trial]()
         while ask := order.next():
             trial = self._grasp(ask)
-            order.done(ask, Code(trial.code), trial.message, self._stands)
-            if trial.claimed:
+            order.done(ask, Code(trial.answer.code), trial.answer.message, self._stands)
+            if trial.answer.success:
                 placed.append(trial)
                 continue
             open_[ask.label] = trial
-            if trial.attempts and not clear:  # three attempts are what a scene may take
-                order.failed[ask.label] = trial.message
-        missing = Counter(labels) - Counter(trial.label for trial in placed)
+            if trial.answer.attempts and not clear:  # three attempts are what a scene may take
+                order.failed[ask.label] = trial.answer.message
+        missing = Counter(labels) - Counter(trial.answer.label for trial in placed)
         return [*placed, *(open_[label] for label in missing.elements())]
 
     def _grasp(self, ask: GraspRequest) -> Trial:
@@ -161,7 +161,7 @@ class Trials:
         """Judge a request."""
         end_ns = self.robot.t_ns
         target, verdict = self._judge(outcome)
-        return trial_of(self._task.scene, self._task.seed, target, outcome, verdict, steps, wall_s, end_ns)
+        return Trial(self._task.scene, self._task.seed, target, outcome, verdict, steps, wall_s, end_ns)
 
     # --- while it runs
     def _report(self, status: Status) -> None:
@@ -252,11 +252,8 @@ def row_of(task: Task, trials: list[Trial], wall_s: float) -> dict[str, Any]:
         "as_expected": expected,
         "placed": placed,
         "false_success": false,
-        "code": shown["code"],
-        "message": shown["message"],
-        "reasons": shown["reasons"],
-        "arm": shown["arm"],
-        "attempts": max(trial.attempts for trial in trials),
+        **{key: shown[key] for key in ("code", "message", "reasons", "arm")},
+        "attempts": max(g["attempts"] for g in grasps),
         "place_error_mm": max(errors, default=None),
         "sim_s": round(sum(g["sim_s"] for g in grasps), 2),
         "wall_s": round(wall_s, 2),

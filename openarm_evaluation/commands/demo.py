@@ -111,7 +111,7 @@ class _Show:
             return
         row = trial.as_row()
         error = "-" if row["place_error_mm"] is None else f"{row['place_error_mm']:.1f}"
-        outcome = "placed" if trial.placed else f"FALSE {trial.code}" if trial.claimed else trial.code
+        outcome = "placed" if trial.placed else f"FALSE {row['code']}" if row["claimed_success"] else row["code"]
         self._console.print(
             f"{row['seed']:>4} {row['target']:<17}{row['arm']:<6}{row['attempts']:>4}  {outcome:<18}{error:>6}"
             f"{row['sim_s']:>7.1f}{row['wall_s']:>7.1f}",
@@ -145,14 +145,16 @@ def _outcome(result: DemoResult, seeds: tuple[int, ...], accept: float) -> Outco
         return _campaign_outcome(result.trials, summary, accept, where, data, notes)
     trial = result.trials[0]
     if trial.verdict is None or not trial.placed:
-        why = "; ".join(trial.as_row()["reasons"])
-        claim = "it reported success, but " if trial.claimed else f"{trial.message} — "
-        code = Code.PLACE_FAILED if trial.claimed else trial.code
+        why = "; ".join(rows[0]["reasons"])
+        claimed = trial.answer.success
+        claim = "it reported success, but " if claimed else f"{trial.answer.message} — "
+        code = Code.PLACE_FAILED if claimed else trial.answer.code
         return Outcome(False, f"{trial.target} was not placed: {claim}{why}. See {where}", code, data, notes)
     verdict = trial.verdict
+    arm, attempts = trial.answer.arm, trial.answer.attempts
     message = (
-        f"{trial.target} was placed {verdict.place_error * 1e3:.1f} mm from its target by the {trial.arm} arm "
-        f"({trial.attempts} attempt{'s' if trial.attempts != 1 else ''}, lifted {verdict.rise * 1e3:.0f} mm, "
+        f"{trial.target} was placed {verdict.place_error * 1e3:.1f} mm from its target by the {arm} arm "
+        f"({attempts} attempt{'s' if attempts != 1 else ''}, lifted {verdict.rise * 1e3:.0f} mm, "
         f"{trial.sim_s:.1f} s), judged by ground truth. Report, pictures and video: {where}"
     )
     return Outcome(True, message, data=data, text=notes)
@@ -164,7 +166,8 @@ def _campaign_outcome(
     lines = [notes] if notes else []
     failed = [trial for trial in trials if not trial.placed]
     for trial in failed:
-        lines.append(f"seed {trial.seed}, {trial.target}: {trial.outcome}: {trial.code}: {trial.message}")
+        answer = trial.answer
+        lines.append(f"seed {trial.seed}, {trial.target}: {trial.outcome}: {answer.code}: {answer.message}")
         lines += [f"    ground truth: {reason}" for reason in trial.as_row()["reasons"]]
     error = summary["place_error_mm"]
     figures = f", place error median {error['median']:.1f} mm, max {error['max']:.1f} mm" if error else ""

@@ -57,31 +57,27 @@ class Ask:
 
 @dataclass(frozen=True)
 class Trial:
-    """Result of a grasp that was observed.
+    """A grasp that was observed, and its verdict.
 
     Args:
-        claimed: The grasp reported success.
+        scene: What was on the table.
+        seed: Of the scene.
+        target: Name of the object; "" when the scene has none of the label.
+        answer: `GraspResult` of a client, or `GraspOutcome` in process.
         verdict: Of ground truth; None when the object could not be observed.
-        states: (state, s of simulated time, attempt, reason it was entered for), in order.
-        sim_s: Simulated s from the request's first state to the last one's beginning.
-        route: By which the object came to its place.
+        steps: States that the grasp entered, in order.
+        wall_s: How long it took, s of wall clock.
+        end_ns: When the last state ended; None when it still lasts.
     """
 
+    scene: Scene
     seed: int | None
-    scene: str
-    scene_hash: str
     target: str
-    label: str
-    arm: str
-    attempts: int
-    claimed: bool
-    code: str
-    message: str
+    answer: GraspResult | GraspOutcome
     verdict: Verdict | None
-    states: tuple[tuple[str, float, int, str], ...]
-    sim_s: float
+    steps: Sequence[Step]
     wall_s: float
-    route: str = ""
+    end_ns: int | None = None
 
     @property
     def placed(self) -> bool:
@@ -93,36 +89,48 @@ class Trial:
         """Placed, failed (and reported so), or false success."""
         if self.placed:
             return "placed"
-        return "false success" if self.claimed else "failed"
+        return "false success" if self.answer.success else "failed"
+
+    @property
+    def sim_s(self) -> float:
+        """Simulated s from the request's first state to the last one's beginning."""
+        return (self.steps[-1].t_ns - self.steps[0].t_ns) * 1e-9 if self.steps else 0.0
 
     def as_row(self) -> dict[str, Any]:
-        """Return what reports write."""
-        verdict = self.verdict
+        """Return what reports write; without an end, the last state is left out of `states`, and so is IDLE."""
+        verdict, answer = self.verdict, self.answer
         error = verdict.place_error * 1e3 if verdict else math.nan
+        ends = [step.t_ns for step in self.steps[1:]] + ([] if self.end_ns is None else [self.end_ns])
         return {
             "seed": self.seed,
-            "scene": self.scene,
-            "scene_hash": self.scene_hash,
+            "scene": self.scene.name,
+            "scene_hash": scene_hash(self.scene),
             "target": self.target,
-            "label": self.label,
-            "arm": self.arm,
-            "route": self.route,
+            "label": answer.label,
+            "arm": answer.arm,
+            "route": answer.route,
             "outcome": self.outcome,
             "placed": self.placed,
-            "claimed_success": self.claimed,
+            "claimed_success": answer.success,
             "false_success": self.outcome == "false success",
-            "code": self.code,
-            "message": self.message,
+            "code": str(answer.code),
+            "message": answer.message,
             "reasons": list(verdict.reasons) if verdict else ["the object could not be observed"],
-            "attempts": self.attempts,
+            "attempts": answer.attempts,
             "place_error_mm": round(error, 2) if math.isfinite(error) else None,
             "rise_mm": round(verdict.rise * 1e3, 1) if verdict else None,
             "tilt_deg": round(math.degrees(verdict.tilt), 2) if verdict else None,
             "sim_s": round(self.sim_s, 2),
             "wall_s": round(self.wall_s, 2),
             "states": [
-                {"state": state, "seconds": round(seconds, 3), "attempt": attempt, "reason": reason}
-                for state, seconds, attempt, reason in self.states
+                {
+                    "state": step.state,
+                    "seconds": round((end - step.t_ns) * 1e-9, 3),
+                    "attempt": step.attempt,
+                    "reason": step.reason,
+                }
+                for step, end in zip(self.steps, ends, strict=False)
+                if step.state != "IDLE"
             ],
         }
 
@@ -163,57 +171,6 @@ def wait_scene(observer: Observer, scene: Scene, after_ns: int, rules: JudgeConf
         return truth is not None and truth.t_ns > after_ns and shows(scene, dict(truth.objects), rules)
 
     observer.wait(there, SETTLE_TIMEOUT_S, f"ground truth of scene {scene.name} at rest")
-
-
-def durations(steps: Sequence[Step], end_ns: int | None = None) -> tuple[tuple[str, float, int, str], ...]:
-    """Return how long each state but IDLE lasted, s of simulated time; without an end, the last state is left out."""
-    ends = [step.t_ns for step in steps[1:]] + ([] if end_ns is None else [end_ns])
-    return tuple(
-        (step.state, (end - step.t_ns) * 1e-9, step.attempt, step.reason)
-        for step, end in zip(steps, ends, strict=False)
-        if step.state != "IDLE"
-    )
-
-
-def trial_of(
-    scene: Scene,
-    seed: int | None,
-    target: str,
-    answer: GraspResult | GraspOutcome,
-    verdict: Verdict | None,
-    steps: Sequence[Step],
-    wall_s: float,
-    end_ns: int | None = None,
-) -> Trial:
-    """Return the record of a grasp.
-
-    Args:
-        scene: What was on the table.
-        seed: Of the scene.
-        target: Name of the object; "" when the scene has none of the label.
-        answer: `GraspResult` of a client, or `GraspOutcome` in process.
-        verdict: By ground truth.
-        steps: States that it entered.
-        wall_s: How long it took, s of wall clock.
-        end_ns: When the last state ended; None when it still lasts.
-    """
-    return Trial(
-        seed=seed,
-        scene=scene.name,
-        scene_hash=scene_hash(scene),
-        target=target,
-        label=answer.label,
-        arm=answer.arm,
-        attempts=answer.attempts,
-        claimed=answer.success,
-        code=str(answer.code),
-        message=answer.message,
-        verdict=verdict,
-        states=durations(steps, end_ns),
-        sim_s=(steps[-1].t_ns - steps[0].t_ns) * 1e-9 if steps else 0.0,
-        wall_s=wall_s,
-        route=answer.route,
-    )
 
 
 def run_trial(
@@ -319,7 +276,7 @@ def _judged(
     """Judge an object by where it was to be placed: as requested, else as the grasp chose."""
     chosen = result.place_position if any(result.place_position) else (math.nan, math.nan)
     verdict = judge(observer.track(item.name), place or chosen[:2], claimed=result.success, config=rules)
-    return trial_of(scene, seed, item.name, result, verdict, steps, wall_s)
+    return Trial(scene, seed, item.name, result, verdict, steps, wall_s)
 
 
 def _wait_track(observer: Observer, name: str) -> None:

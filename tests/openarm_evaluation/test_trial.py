@@ -13,7 +13,8 @@ from openarm_common.scene.scene import Scene, load_scene
 from openarm_evaluation.judging.judge import JudgeConfig, Sample, judge
 from openarm_evaluation.judging.provenance import machine, scene_hash, versions
 from openarm_evaluation.judging.statistics import summarise, wilson_low
-from openarm_evaluation.judging.trial import Trial, choose_target, shows
+from openarm_evaluation.judging.trial import Step, Trial, choose_target, shows
+from openarm_grasp.ros.answers import GraspResult
 
 
 def standing(scene: Scene, shift: float = 0.0, speed: float = 0.0) -> dict[str, Sample]:
@@ -58,22 +59,19 @@ def trial(*, claimed: bool, rise: float, error: float) -> Trial:
         return Sample(int(t * 1e9), np.array([x, 0.0, z]), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
 
     verdict = judge([at(0, 0.2, 0.43), at(1, 0.2, 0.43 + rise), at(3, 0.3 + error, 0.43)], (0.3, 0.0), claimed=claimed)
-    return Trial(
-        seed=1,
-        scene="toy",
-        scene_hash="0",
-        target="red_cube",
-        label="red",
-        arm="left",
-        attempts=1,
-        claimed=claimed,
-        code="OK" if claimed else "GRASP_MISSED",
-        message="",
-        verdict=verdict,
-        states=(("DETECT", 0.5, 1, "asked"),),
-        sim_s=12.0,
-        wall_s=13.0,
-    )
+    code = Code.OK if claimed else Code.GRASP_MISSED
+    answer = GraspResult(claimed, code, "", "SUCCESS" if claimed else "FAILED", "red", "left", 1, (0.3, 0.0, 0.4), 12.0)
+    steps = [
+        Step(0, "DETECT", "IDLE", "asked", 1, "red", "left"),
+        Step(500_000_000, "IDLE", "DETECT", "", 1, "red", "left"),
+    ]
+    return Trial(load_scene("demo"), 1, "red_cube", answer, verdict, steps, wall_s=13.0)
+
+
+def test_row_says_how_long_each_state_lasted() -> None:
+    row = trial(claimed=True, rise=0.12, error=0.002).as_row()
+    assert row["states"] == [{"state": "DETECT", "seconds": 0.5, "attempt": 1, "reason": "asked"}]
+    assert row["sim_s"] == 0.5
 
 
 def test_outcomes_and_their_sum() -> None:
