@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layers of a page: each is a class that subscribes while it exists.
+"""Layers of a page: each subscribes while it exists.
 
 Subscriptions are polled and keep the newest message alone: of a topic with 100 Hz, no more is taken, and no more of it
 deserialised, than is shown.
@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import json
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -91,195 +90,155 @@ class Polled:
         self._node.destroy_subscription(self._subscription)
 
 
-class Layer(ABC):
+class Source(NamedTuple):
+    """A topic that a layer shows.
+
+    Args:
+        kind: Type of the messages.
+        topic: Absolute name.
+        qos: Quality of service.
+        silence: The layer can't be shown when nothing has come for longer than this, s; 0: it may be silent.
+    """
+
+    kind: Any
+    topic: str
+    qos: QoSProfile = QOS_NEWEST
+    silence: float = 0.0
+
+
+#: Given the messages that have come from each source since the last time, yields what is new.
+Show = Callable[..., Items]
+
+
+class Layer:
     """One layer.
 
-    Attributes:
+    Args:
+        node: Owns the subscriptions.
+        sources: What is polled.
+        show: Given the new messages of each of them.
         period: Between two updates, s.
+
+    Attributes:
         fault: What keeps it from being shown; empty when nothing does.
     """
 
-    period = 0.2
-
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, sources: Sequence[Source], show: Show, period: float = 0.2) -> None:
         self.fault = ""
-        self._node = node
-        self._polled: list[Polled] = []
+        self.period = period
+        self._show = show
+        self._polled = [(Polled(node, source.kind, source.topic, source.qos), source.silence) for source in sources]
 
-    @abstractmethod
     def update(self) -> Items:
         """Yield what is new since the last update."""
+        taken = [polled.take() for polled, _ in self._polled]
+        silent = (polled.silence(limit) for polled, limit in self._polled if limit)
+        self.fault = next(filter(None, silent), "")
+        yield from self._show(*taken)
 
     def close(self) -> None:
         """Unsubscribe."""
-        for polled in self._polled:
+        for polled, _ in self._polled:
             polled.close()
 
-    def _subscribe(self, kind: Any, topic: str, qos: QoSProfile = QOS_NEWEST) -> Polled:
-        self._polled.append(Polled(self._node, kind, topic, qos))
-        return self._polled[-1]
 
+def _show_states() -> Show:
+    """Each transition of the grasp, in order; diagnostics and the speed of the simulation once a second."""
+    steps: deque[dict[str, Any]] = deque(maxlen=40)
+    nodes: dict[str, tuple[float, DiagnosticStatus]] = {}
+    speed: float | None = None
+    told = 0.0
 
-class StatesLayer(Layer):
-    """States of the grasp, diagnostics, speed of the simulation."""
-
-    def __init__(self, node: Node) -> None:
-        super().__init__(node)
-        self._status = self._subscribe(
-            GraspStatus, "/grasp/status", QoSProfile(depth=20, durability=QOS_LATCHED.durability)
-        )
-        self._diagnostics = self._subscribe(DiagnosticArray, "/diagnostics", QoSProfile(depth=100))
-        self._speed = self._subscribe(Float64, "/sim/real_time_factor")
-        self._steps: deque[dict[str, Any]] = deque(maxlen=40)
-        self._nodes: dict[str, tuple[float, DiagnosticStatus]] = {}
-        self._told = 0.0
-
-    def update(self) -> Items:
-        """Each transition of the grasp, in order; the rest once a second."""
-        new = self._status.take()
-        self._steps.extend(_step(message) for message in new)
-        if new:
-            yield "grasp", _text("grasp", steps=list(self._steps))
+    def show(status: list[GraspStatus], diagnostics: list[DiagnosticArray], speeds: list[Float64]) -> Items:
+        nonlocal told, speed
+        steps.extend(_step(message) for message in status)
+        if status:
+            yield "grasp", _text("grasp", steps=list(steps))
         now = time.monotonic()
-        for message in self._diagnostics.take():
-            self._nodes.update({status.name: (now, status) for status in message.status})
-        if now - self._told > 1.0:
-            self._told = now
-            speed = self._speed.newest()
-            nodes = [_health(status, now - at) for at, status in self._nodes.values()]
-            yield (
-                "health",
-                _text("health", nodes=sorted(nodes, key=_by_name), speed=None if speed is None else speed.data),
-            )
+        for message in diagnostics:
+            nodes.update({status.name: (now, status) for status in message.status})
+        speed = speeds[-1].data if speeds else speed
+        if now - told > 1.0:
+            told = now
+            health = [_health(status, now - at) for at, status in nodes.values()]
+            yield "health", _text("health", nodes=sorted(health, key=_by_name), speed=speed)
+            speed = None
+
+    return show
 
 
-class RobotLayer(Layer):
-    """Where the links are, and what hangs on them."""
+def _show_robot(description: RobotDescription) -> Show:
+    """Poses of the links when they have changed; held objects when they have."""
+    shown: list[float] = []
 
-    period = 0.04
-
-    def __init__(self, node: Node, description: RobotDescription) -> None:
-        super().__init__(node)
-        self._description = description
-        self._joints = self._subscribe(JointState, "/joint_states")
-        self._held = self._subscribe(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
-        self._shown: list[float] = []
-
-    def update(self) -> Items:
-        """Poses of the links when they have changed; held objects when they have."""
-        joints = self._joints.newest()
-        self.fault = self._joints.silence(1.0)
-        if joints is not None and not (self._shown and np.allclose(joints.position, self._shown, atol=2e-5)):
-            self._shown = list(joints.position)
+    def show(states: list[JointState], attached: list[MarkerArray]) -> Items:
+        nonlocal shown
+        joints = states[-1] if states else None
+        if joints is not None and not (shown and np.allclose(joints.position, shown, atol=2e-5)):
+            shown = list(joints.position)
             q = dict(zip(joints.name, joints.position, strict=True))
-            yield "robot", wire.frame({"kind": "robot"}, wire.link_poses(self._description, q))
-        held = self._held.newest()
-        if held is not None:
-            boxes = [wire.box(b.name, b.T_link_box, b.size, link=b.link) for b in held_from_msg(held)]
+            yield "robot", wire.frame({"kind": "robot"}, wire.link_poses(description, q))
+        if attached:
+            boxes = [wire.box(b.name, b.T_link_box, b.size, link=b.link) for b in held_from_msg(attached[-1])]
             yield "held", _text("held", boxes=boxes)
 
-
-class ImageLayer(Layer):
-    """The picture of a camera, up to five times a second."""
-
-    def __init__(self, node: Node, camera: str) -> None:
-        super().__init__(node)
-        self._camera = camera
-        self._image = self._subscribe(Image, f"/{camera}/color/image_raw")
-
-    def update(self) -> Items:
-        """The newest picture as JPEG."""
-        image = self._image.newest()
-        self.fault = self._image.silence(3.0)
-        if image is not None:
-            key = f"image:{self._camera}"
-            yield key, wire.frame({"kind": "image", "camera": self._camera}, wire.jpeg(_rgb(image)))
+    return show
 
 
-class CloudLayer(Layer):
-    """Points of a fixed camera with their colours, one a centimetre."""
+def _show_image(camera: str) -> Show:
+    """The newest picture as JPEG."""
 
-    period = 0.25
+    def show(images: list[Image]) -> Items:
+        if images:
+            head = {"kind": "image", "camera": camera}
+            yield f"image:{camera}", wire.frame(head, wire.jpeg(_rgb(images[-1])))
 
-    def __init__(self, node: Node, description: RobotDescription, camera: CameraConfig) -> None:
-        super().__init__(node)
-        self._frame = camera.optical_frame
-        self._depth = self._subscribe(Image, f"/{camera.name}/depth/image_raw")
-        self._color = self._subscribe(Image, f"/{camera.name}/color/image_raw")
-        self._info = self._subscribe(CameraInfo, f"/{camera.name}/depth/camera_info")
-        self._static = self._subscribe(TFMessage, "/tf_static", QOS_STATIC_TF)
-        self._states = RobotStateBuffer(description)
-        self._maker = wire.CloudMaker(Deprojector(DepthLimits(near=camera.near, far=camera.far)))
-        self._images: dict[Polled, Any] = {}
+    return show
 
-    def update(self) -> Items:
-        """Yield the cloud of the newest frame with both depth and colour."""
-        for message in self._static.take():
+
+def _show_cloud(description: RobotDescription, camera: CameraConfig) -> Show:
+    """The cloud of the newest frame with both depth and colour, one point a centimetre."""
+    states = RobotStateBuffer(description)
+    maker = wire.CloudMaker(Deprojector(DepthLimits(near=camera.near, far=camera.far)))
+    newest: list[Any] = [None, None, None]
+
+    def show(static: list[TFMessage], *images: list[Any]) -> Items:
+        for message in static:
             for edge in message.transforms:
-                T = transform_to_matrix(edge.transform)
-                self._states.set_static(edge.header.frame_id, edge.child_frame_id, T)
-        for polled in (self._depth, self._color, self._info):
-            self._images[polled] = polled.newest() or self._images.get(polled)
-        self.fault = self._depth.silence(3.0) or self._color.silence(3.0)
-        depth, color, info = (self._images[polled] for polled in (self._depth, self._color, self._info))
+                states.set_static(edge.header.frame_id, edge.child_frame_id, transform_to_matrix(edge.transform))
+        newest[:] = [taken[-1] if taken else kept for taken, kept in zip(images, newest, strict=True)]
+        depth, color, info = newest
         if depth is None or color is None or info is None or depth.header.stamp != color.header.stamp:
             return  # the other half of the frame comes soon
-        T_base_optical = self._states.lookup(BASE_FRAME, self._frame, stamp_to_ns(depth.header.stamp))
-        points, colors = self._maker.make(
-            image_to_array(depth), _rgb(color), intrinsics_from_info(info), T_base_optical
-        )
-        self._images[self._depth] = None  # shown
+        T_base_optical = states.lookup(BASE_FRAME, camera.optical_frame, stamp_to_ns(depth.header.stamp))
+        points, colors = maker.make(image_to_array(depth), _rgb(color), intrinsics_from_info(info), T_base_optical)
+        newest[0] = None  # shown
         yield "cloud", wire.frame({"kind": "cloud", "count": len(points)}, points, colors)
 
-
-class MapLayer(Layer):
-    """Occupied cells of the map."""
-
-    period = 0.5
-
-    def __init__(self, node: Node) -> None:
-        super().__init__(node)
-        self._map = self._subscribe(Octomap, "/octomap_binary", QOS_LATCHED)
-
-    def update(self) -> Items:
-        """Cells of the newest map."""
-        message = self._map.newest()
-        self.fault = self._map.silence(5.0)
-        if message is not None:
-            leaves = decode(np.frombuffer(message.data, np.uint8), message.resolution, binary=message.binary)
-            cells = wire.occupied_cells(leaves)
-            yield "map", wire.frame({"kind": "map", "count": len(cells)}, cells)
+    return show
 
 
-class DetectionsLayer(Layer):
+def _show_map(maps: list[Octomap]) -> Items:
+    """Occupied cells of the newest map."""
+    if maps:
+        leaves = decode(np.frombuffer(maps[-1].data, np.uint8), maps[-1].resolution, binary=maps[-1].binary)
+        cells = wire.occupied_cells(leaves)
+        yield "map", wire.frame({"kind": "map", "count": len(cells)}, cells)
+
+
+def _show_detections(messages: list[Detection3DArray]) -> Items:
     """Objects as they are detected now."""
-
-    def __init__(self, node: Node) -> None:
-        super().__init__(node)
-        self._detections = self._subscribe(Detection3DArray, "/detections_3d")
-
-    def update(self) -> Items:
-        """The newest detections."""
-        message = self._detections.newest()
-        self.fault = self._detections.silence(3.0)
-        if message is not None:
-            yield "detections", _text("detections", boxes=[_detection_box(d) for d in message.detections if d.results])
+    if messages:
+        boxes = [_detection_box(detection) for detection in messages[-1].detections if detection.results]
+        yield "detections", _text("detections", boxes=boxes)
 
 
-class PlanLayer(Layer):
+def _show_plan(previews: list[MarkerArray]) -> Items:
     """Paths of the tools on the newest plan."""
-
-    def __init__(self, node: Node) -> None:
-        super().__init__(node)
-        self._preview = self._subscribe(MarkerArray, "/motion/preview", QOS_LATCHED)
-
-    def update(self) -> Items:
-        """The lines of the newest plan."""
-        message = self._preview.newest()
-        if message is not None:
-            lines = [marker for marker in message.markers if marker.type == Marker.LINE_STRIP]
-            paths = [np.round([xyz(p) for p in line.points], 4).tolist() for line in lines if line.points]
-            yield "plan", _text("plan", ways=paths)
+    if previews:
+        lines = [marker for marker in previews[-1].markers if marker.type == Marker.LINE_STRIP]
+        paths = [np.round([xyz(p) for p in line.points], 4).tolist() for line in lines if line.points]
+        yield "plan", _text("plan", ways=paths)
 
 
 def makers(
@@ -293,16 +252,30 @@ def makers(
         cloud: Name of the camera whose cloud is shown.
     """
     (eye,) = (camera for camera in cameras if camera.name == cloud)
-    fixed: dict[str, Callable[[Node], Layer]] = {
-        "states": StatesLayer,
-        "robot": lambda node: RobotLayer(node, description),
-        "detections": DetectionsLayer,
-        "plan": PlanLayer,
-        "map": MapLayer,
-        "cloud": lambda node: CloudLayer(node, description, eye),
+    status = Source(GraspStatus, "/grasp/status", QoSProfile(depth=20, durability=QOS_LATCHED.durability))
+    diagnostics = Source(DiagnosticArray, "/diagnostics", QoSProfile(depth=100))
+    joints = Source(JointState, "/joint_states", silence=1.0)
+    static = Source(TFMessage, "/tf_static", QOS_STATIC_TF)
+    depth = Source(Image, f"/{cloud}/depth/image_raw", silence=3.0)
+    info = Source(CameraInfo, f"/{cloud}/depth/camera_info")
+    images = {camera.name: Source(Image, f"/{camera.name}/color/image_raw", silence=3.0) for camera in cameras}
+
+    def maker(make: Callable[[], Show], *sources: Source, period: float = 0.2) -> Callable[[Node], Layer]:
+        return lambda node: Layer(node, sources, make(), period)
+
+    fixed = {
+        "states": maker(_show_states, status, diagnostics, Source(Float64, "/sim/real_time_factor")),
+        "robot": maker(
+            lambda: _show_robot(description),
+            *(joints, Source(MarkerArray, "/motion/attached_objects", QOS_LATCHED)),
+            period=0.04,
+        ),
+        "detections": maker(lambda: _show_detections, Source(Detection3DArray, "/detections_3d", silence=3.0)),
+        "plan": maker(lambda: _show_plan, Source(MarkerArray, "/motion/preview", QOS_LATCHED)),
+        "map": maker(lambda: _show_map, Source(Octomap, "/octomap_binary", QOS_LATCHED, silence=5.0), period=0.5),
+        "cloud": maker(lambda: _show_cloud(description, eye), *(static, depth, images[cloud], info), period=0.25),
     }
-    images = {f"image:{c.name}": (lambda node, name=c.name: ImageLayer(node, name)) for c in cameras}
-    return fixed | images
+    return fixed | {f"image:{name}": maker(lambda name=name: _show_image(name), images[name]) for name in images}
 
 
 def _unused(_: object) -> None:
