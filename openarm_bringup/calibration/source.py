@@ -120,7 +120,7 @@ def _from_session(path: Path, source: Source) -> tuple[SampleSet, str]:
 
 def _from_bag(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str, Any]], str]:
     from openarm_bringup.bags.bag import open_bag
-    from openarm_bringup.calibration.ros.samples import BagOptions, samples_of
+    from openarm_bringup.calibration.ros.samples import samples_of
     from openarm_calibration.sampling import stills
 
     session = source.session
@@ -128,9 +128,9 @@ def _from_bag(path: Path, source: Source) -> tuple[SampleSet, str, list[dict[str
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--session {session}: expected a name that ends in .npz")
     if source.mount_seed is not None and source.mount_seed < 0:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--mount-seed {source.mount_seed}: expected 0 or more")
-    options = BagOptions(source.camera, _board(source.board), source.carrier, source.mount_seed)
+    board = _board(source.board)
     with open_bag(path) as bag:
-        samples, found = samples_of(bag, options)
+        samples, found = samples_of(bag, source.camera, board, source.carrier, source.mount_seed)
     digest = samples.save(session) if session is not None else samples.digest()
     return samples, digest, stills.rows(found), stills.summary(found)
 

@@ -200,16 +200,13 @@ def find_graph(name: str) -> Path:
     )
 
 
-def load_graph(
-    name: str, *, overrides: Mapping[str, Any] | None = None, sets: Sequence[str] = (), only: Sequence[str] = ()
-) -> Graph:
+def load_graph(name: str, *, overrides: Mapping[str, Any] | None = None, sets: Sequence[str] = ()) -> Graph:
     """Read a graph, apply overrides, substitute variables, and check it as a whole.
 
     Args:
         name: Name of a graph of the suite, or path of a file.
         overrides: Top-level values (scene, seed, mount_seed, domain, discovery); None leaves the file's value.
         sets: `node.param=value`, the value as YAML.
-        only: Names of nodes to keep; empty keeps all.
 
     Raises:
         OpenArmError: CONFIG_INVALID for a fault in a file (named as file:key); INVALID_ARGUMENT for one in `sets`,
@@ -219,8 +216,6 @@ def load_graph(
     data = _read(path, ())
     given = {key: value for key, value in (overrides or {}).items() if value is not None}
     data.update(given)
-    if only:
-        _keep(data, only, str(path))
     where = f"{path} with {given}" if given else str(path)
     graph = validate(Graph, data, where)
     _check_needs(graph, str(path))

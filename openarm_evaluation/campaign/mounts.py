@@ -44,21 +44,18 @@ _SPREAD = 0.4  # rad, of each joint around the middle of the postures
 _MAX_MISSED = 200
 
 
-def with_mounts(
-    task: Task, mount_seeds: Sequence[int], folder: Path, names: Sequence[str] = ("overhead", "wrist")
-) -> tuple[Task, Mapping[str, Array]]:
+def with_mounts(task: Task, mount_seeds: Sequence[int], folder: Path) -> tuple[Task, Mapping[str, Array]]:
     """The task with true mounts of one of the seeds (each in turn), and T_parent_link by camera as calibrated.
 
     Args:
         task: The task.
         mount_seeds: To go through.
         folder: Of calibrations; those that it lacks are made.
-        names: Cameras that the grasp uses.
     """
     seed = mount_seeds[task.seed % len(mount_seeds)]
     store = CalibrationStore(folder / str(seed))
     mounts: dict[str, Array] = {}
-    for camera in (load_cameras()[name] for name in names):
+    for camera in (load_cameras()[name] for name in ("overhead", "wrist")):
         if store.find(camera.name) is None:
             store.save(calibrated(camera, seed).calibration)
         found = store.find(camera.name)

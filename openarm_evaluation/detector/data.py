@@ -19,6 +19,7 @@ import numpy as np
 from cv2.typing import MatLike
 from pydantic import Field
 
+from openarm_bringup.view.wire import jpeg
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import SHAPES
@@ -71,7 +72,7 @@ def make_data(folder: Path, config: DataConfig, progress: Callable[[str, int], N
                     views = views or RandomViews()
                     # the set is part of the seed: no picture of one set can be one of another
                     picture = views.draw(np.random.default_rng([config.seed, index, number]))
-                    _write(image, _jpeg(picture.rgb))
+                    _write(image, jpeg(picture.rgb, _QUALITY))
                     height, width = picture.rgb.shape[:2]
                     _write(label, write_labels(picture.classes, picture.boxes, width, height).encode())
                     made[name] += 1
@@ -139,11 +140,6 @@ def _summarise(folder: Path, config: DataConfig) -> None:
             "labels_sha256": digest(folder, name),
         }
     _write(folder / "summary.json", json.dumps({"seed": config.seed, "sets": sets}, indent=1).encode())
-
-
-def _jpeg(rgb: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> bytes:
-    _, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    return data.tobytes()
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -11,23 +11,22 @@ from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from tf2_msgs.msg import TFMessage
 
 from openarm_bringup.bags.bag import Bag
-from openarm_calibration.board.board import Board, CircleGrid
+from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.board.detect import detect
-from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
+from openarm_calibration.ros.image_capture import grey
+from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
-from openarm_common.ros.convert import image_to_array, intrinsics_from_info, stamp_to_ns, transform_to_matrix
+from openarm_common.ros.convert import depth_image, intrinsics_from_info, rgb_image, stamp_to_ns, transform_to_matrix
 from openarm_common.ros.node import BASE_FRAME
 from openarm_common.scene.scene import load_scene
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
@@ -68,7 +67,6 @@ def numbers_of(
     bag: Bag,
     *,
     scene: str = "demo",
-    board: Board | None = None,
     on_progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, float]:
     """Run detection, localisation, map and board detection on a bag.
@@ -76,7 +74,6 @@ def numbers_of(
     Args:
         bag: Open; with colour and depth of a camera of the suite, /joint_states and /tf_static.
         scene: Scene whose table the objects stand on.
-        board: Calibration board to detect; None is that of the suite.
         on_progress: Called with the number of frames done, and of all.
 
     Returns:
@@ -103,7 +100,7 @@ def numbers_of(
             found.skipped += 1
         if shot.t_ns - searched_ns.get(shot.camera.name, shot.t_ns - _BOARD_PERIOD_NS) >= _BOARD_PERIOD_NS:
             searched_ns[shot.camera.name] = shot.t_ns
-            _detect_board(board or CircleGrid(), shot, found)
+            _detect_board(shot, found)
     on_progress(len(shots), len(shots))
     if not found.frames:
         raise OpenArmError(
@@ -144,22 +141,20 @@ def _work(shot: _Shot, states: RobotStateBuffer, pipeline: Pipeline, mapper: Map
         raise OpenArmError(Code.BAD_IMAGE, "colour, depth or camera_info of a stamp is missing")
     T_base_camera = states.lookup(BASE_FRAME, shot.camera.optical_frame, shot.t_ns)
     joints = states.joints_at(shot.t_ns)
-    intrinsics: Intrinsics = intrinsics_from_info(shot.info)
-    depth: NDArray[np.uint16] = image_to_array(shot.depth)  # type: ignore[assignment]
-    rgb: NDArray[np.uint8] = image_to_array(shot.color)  # type: ignore[assignment]
-    for located in pipeline.run(rgb, depth, intrinsics, T_base_camera).located:
+    intrinsics = intrinsics_from_info(shot.info)
+    depth = depth_image(shot.depth)
+    for located in pipeline.run(rgb_image(shot.color), depth, intrinsics, T_base_camera).located:
         found.objects[f"{shot.camera.name}/{located.label}"].append(located)
     scan = DepthScan(depth, intrinsics, T_base_camera, shot.camera.near, shot.camera.far)
     mapper.update([Frame(shot.camera.name, shot.t_ns, scan, joints)])
     found.frames += 1
 
 
-def _detect_board(board: Board, shot: _Shot, found: _Found) -> None:
+def _detect_board(shot: _Shot, found: _Found) -> None:
     if shot.color is None:
         return
-    rgb: NDArray[np.uint8] = image_to_array(shot.color)  # type: ignore[assignment]
     try:
-        residual = detect(board, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.uint8)).residual
+        residual = detect(CircleGrid(), grey(shot.color)).residual
     except OpenArmError:
         return  # most frames show none
     found.boards[shot.camera.name].append(residual)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import yaml
@@ -14,7 +14,7 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from openarm_bringup.bags.bag import Bag
-from openarm_calibration.board.board import Board, CircleGrid
+from openarm_calibration.board.board import Board
 from openarm_calibration.config import CalibrationConfig
 from openarm_calibration.ros.image_capture import grey
 from openarm_calibration.sampling.gate import GateConfig
@@ -30,25 +30,6 @@ _IMAGES = "/color/image_raw"
 _INFOS = "/color/camera_info"
 
 
-@dataclass(frozen=True)
-class BagOptions:
-    """What a bag does not say.
-
-    Args:
-        camera: Camera whose images are used; empty: the only one.
-        board: Board to detect; None is the suite's.
-        carrier: Link that holds the board when the camera is fixed; empty is the node's parameter.
-        mount_seed: Of simulated mounts; None is what the bag says of itself.
-        gate: When the robot is at rest.
-    """
-
-    camera: str = ""
-    board: Board | None = None
-    carrier: str = ""
-    mount_seed: int | None = None
-    gate: GateConfig = field(default_factory=GateConfig)
-
-
 @dataclass
 class _Small:
     """All of a bag but its images."""
@@ -59,8 +40,17 @@ class _Small:
     optics: dict[int, Intrinsics]
 
 
-def samples_of(bag: Bag, options: BagOptions) -> tuple[SampleSet, list[Stretch]]:
+def samples_of(
+    bag: Bag, camera: str, board: Board, carrier: str, mount_seed: int | None
+) -> tuple[SampleSet, list[Stretch]]:
     """Take a sample of each posture in which the robot rests.
+
+    Args:
+        bag: Open.
+        camera: Camera whose images are used; empty: the only one.
+        board: Board to detect.
+        carrier: Link that holds the board when the camera is fixed; empty is the node's parameter.
+        mount_seed: Of simulated mounts; None is what the bag says of itself.
 
     Returns:
         The samples, and what became of all images.
@@ -69,15 +59,26 @@ def samples_of(bag: Bag, options: BagOptions) -> tuple[SampleSet, list[Stretch]]
         OpenArmError: INVALID_ARGUMENT, when the bag lacks a topic or the camera; BAD_IMAGE, for a camera that is not
             rectified; NO_TRANSFORM, when nothing says which link carries the camera.
     """
-    camera = _camera(bag, options.camera)
+    camera = _camera(bag, camera)
     small = _small(bag, camera)
     optics = next(iter(small.optics.values()))
-    head = _head(bag, camera, optics, small, options)
+    configured = load_cameras()
+    base = BASE_FRAME if BASE_FRAME in small.robot.links else small.robot.root
+    parent = _parent(small, camera, base, configured)
+    setup = setup_of(small.robot, parent)
+    simulated = camera not in configured or configured[camera].mount_error
+    seed = mount_seed if mount_seed is not None else _seed(bag)
+    head = SessionHead(
+        camera=camera, setup=setup, parent=parent, base=base,
+        carrier=(carrier or CalibrationConfig().carrier) if setup == "to_hand" else parent,
+        intrinsics=(optics.width, optics.height, optics.fx, optics.fy, optics.cx, optics.cy),
+        board=board.model_dump(), mount_seed=seed if simulated else None,
+    )  # fmt: skip
     samples = SampleSet(head, small.robot)
     images = f"/{camera}{_IMAGES}"
     # The first bytes of a message are its stamp; the pixels are read in a second pass, where they are needed.
     stamps = [_stamp(record.data) for record in bag.records([images])]
-    found = stretches(stamps, small.states, samples.joint_names, small.robot, options.gate)
+    found = stretches(stamps, small.states, samples.joint_names, small.robot, GateConfig())
     picker = Picker(samples, found)
     for record in bag.records([images]):
         t_ns = _stamp(record.data)
@@ -132,21 +133,6 @@ def _small(bag: Bag, camera: str) -> _Small:
     # what the bag says of the robot holds, also where this suite knows the robot otherwise
     robot = RobotDescription.from_urdf(urdf) if urdf else RobotDescription.load()
     return _Small(robot, parents, states, optics)
-
-
-def _head(bag: Bag, camera: str, optics: Intrinsics, small: _Small, options: BagOptions) -> SessionHead:
-    configured = load_cameras()
-    base = BASE_FRAME if BASE_FRAME in small.robot.links else small.robot.root
-    parent = _parent(small, camera, base, configured)
-    setup = setup_of(small.robot, parent)
-    simulated = camera not in configured or configured[camera].mount_error
-    seed = options.mount_seed if options.mount_seed is not None else _seed(bag)
-    return SessionHead(
-        camera=camera, setup=setup, parent=parent, base=base,
-        carrier=(options.carrier or CalibrationConfig().carrier) if setup == "to_hand" else parent,
-        intrinsics=(optics.width, optics.height, optics.fx, optics.fy, optics.cx, optics.cy),
-        board=(options.board or CircleGrid()).model_dump(), mount_seed=seed if simulated else None,
-    )  # fmt: skip
 
 
 def _parent(small: _Small, camera: str, base: str, configured: Mapping[str, CameraConfig]) -> str:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from openarm_bringup.view.wire import jpeg
 from openarm_common.figures import data_uri, render_figure, render_page, sheet
 from openarm_evaluation.detector.training.samples import Sample, Samples
 from openarm_evaluation.detector.training.scores import SHOWN, Scores, score
@@ -87,7 +88,7 @@ def write_page(
         shown=SHOWN,
         curves=_curves(curve) if curve else None,
         batches=int(curve[-1]["step"]) if curve else 0,
-        failures=[(samples.paths[i].name, _jpeg(_drawn(samples[i], last.found[i], names))) for _, i in faults[:_WORST]],
+        failures=[(samples.paths[i].name, _picture(samples[i], last.found[i], names)) for _, i in faults[:_WORST]],
     )
     path.write_text(page, encoding="utf-8")
 
@@ -106,7 +107,7 @@ def _fault(sample: Sample, found: Candidates) -> float:
     return fault
 
 
-def _drawn(sample: Sample, found: Candidates, names: Sequence[str]) -> NDArray[np.uint8]:
+def _picture(sample: Sample, found: Candidates, names: Sequence[str]) -> str:
     picture = sample.rgb.copy()
     for kind, box in zip(sample.classes, sample.boxes.round().astype(int).tolist(), strict=True):
         cv2.rectangle(picture, box[:2], box[2:], _COLORS[kind % len(_COLORS)], 3)
@@ -116,12 +117,7 @@ def _drawn(sample: Sample, found: Candidates, names: Sequence[str]) -> NDArray[n
             text = f"{names[kind]} {certain:.2f}"
             at = (box[0], max(box[1] - 3, 10))
             cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, _COLORS[kind % len(_COLORS)], 1, cv2.LINE_AA)
-    return picture
-
-
-def _jpeg(rgb: NDArray[np.uint8]) -> str:
-    _, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])
-    return data_uri(data.tobytes(), "image/jpeg")
+    return data_uri(jpeg(picture), "image/jpeg")
 
 
 def _curves(curve: Sequence[dict[str, float]]) -> str:

@@ -18,7 +18,7 @@ from sensor_msgs.msg import Image, JointState
 from openarm_bringup.ros.simulation import reset_world
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
-from openarm_common.ros.convert import image_to_array, stamp_to_ns
+from openarm_common.ros.convert import rgb_image, stamp_to_ns, xyz
 from openarm_common.ros.node import reliable
 from openarm_evaluation.judging.film import Picture
 from openarm_evaluation.judging.judge import Sample
@@ -33,11 +33,10 @@ _LATCHED = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE, durabili
 
 @dataclass(frozen=True)
 class Truth:
-    """All objects at one time, by name; `labels` says what each is called."""
+    """All objects at one time, by name."""
 
     t_ns: int
     objects: Mapping[str, Sample]
-    labels: Mapping[str, str]
 
 
 class Observer(BackgroundNode):
@@ -109,7 +108,7 @@ class Observer(BackgroundNode):
 
         def receive(message: Image) -> None:
             try:
-                picture = np.array(image_to_array(message), dtype=np.uint8)
+                picture = rgb_image(message).copy()
             except OpenArmError as error:
                 self._node.get_logger().warning(str(error), throttle_duration_sec=5.0)
                 return
@@ -145,7 +144,7 @@ class Observer(BackgroundNode):
         t_ns = stamp_to_ns(message.header.stamp)
         samples = {state.name: _sample(t_ns, state) for state in message.objects}
         with self._changed:
-            self._truth = Truth(t_ns, samples, {state.name: state.label for state in message.objects})
+            self._truth = Truth(t_ns, samples)
             for name, sample in samples.items():
                 self._tracks.setdefault(name, []).append(sample)
             self._changed.notify_all()
@@ -175,11 +174,5 @@ class Observer(BackgroundNode):
 
 
 def _sample(t_ns: int, state: ObjectState) -> Sample:
-    p, q, v, w = state.pose.position, state.pose.orientation, state.twist.linear, state.twist.angular
-    return Sample(
-        t_ns,
-        np.array([p.x, p.y, p.z]),
-        np.array([q.x, q.y, q.z, q.w]),
-        np.array([v.x, v.y, v.z]),
-        np.array([w.x, w.y, w.z]),
-    )
+    q, twist = state.pose.orientation, state.twist
+    return Sample(t_ns, xyz(state.pose.position), np.array([q.x, q.y, q.z, q.w]), xyz(twist.linear), xyz(twist.angular))
