@@ -21,7 +21,7 @@ from openarm_evaluation.campaign.arm_clearance import LEAST_CLEARANCE, watch_cle
 from openarm_evaluation.campaign.link import DirectLink
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import MISSES, PLAN_FAILS, Task
-from openarm_evaluation.judging.judge import JudgeConfig, Sample, Verdict, at_rest, judge
+from openarm_evaluation.judging.judge import RULES, Verdict, at_rest, end_of, judge
 from openarm_evaluation.judging.provenance import scene_hash
 from openarm_evaluation.judging.trial import Step, Trial
 from openarm_grasp.config import GraspConfig
@@ -74,7 +74,6 @@ class Trials:
         self.skills = Skills(self.link, config)
         self.session = GraspSession(GraspContext.of(config, task.scene.table, self.robot.description))
         self.steps: list[Step] = []
-        self._rules = JudgeConfig()
         self._keep = record.Keeper(self.robot, folder) if folder is not None else None
         self._faulty = False
         self._stands: tuple[float, ...] = ()
@@ -218,19 +217,16 @@ class Trials:
         where = outcome.place_position
         xy = (where[0], where[1]) if any(where) else (math.nan, math.nan)
         name = max(names, key=lambda n: max(float(s.p_world[2]) for s in robot.tracks[n]))
-        return name, judge(robot.tracks[name], xy, claimed=outcome.success, config=self._rules)
+        return name, judge(robot.tracks[name], xy, claimed=outcome.success)
 
     def _rest(self, names: list[str]) -> None:
         end_ns = self.robot.t_ns + round(_REST_LIMIT_S * 1e9)
-        least_ns = self.robot.t_ns + round(1.2 * self._rules.rest * 1e9)
+        least_ns = self.robot.t_ns + round(1.2 * RULES.rest * 1e9)
         while self.robot.t_ns < end_ns:
             self.robot.tick()
-            ends = [self._end(self.robot.tracks[name]) for name in names]
-            if self.robot.t_ns > least_ns and all(at_rest(s, self._rules) for end in ends for s in end):
+            ends = [end_of(self.robot.tracks[name]) for name in names]
+            if self.robot.t_ns > least_ns and all(at_rest(sample) for end in ends for sample in end):
                 return
-
-    def _end(self, track: list[Sample]) -> list[Sample]:
-        return [sample for sample in track if track[-1].t_ns - sample.t_ns <= self._rules.rest * 1e9]
 
 
 def row_of(task: Task, trials: list[Trial], wall_s: float) -> dict[str, Any]:

@@ -33,6 +33,9 @@ class JudgeConfig(Config):
     rest: float = Field(default=0.5, gt=0, description="s of simulated time at rest at the end")
 
 
+RULES = JudgeConfig()
+
+
 @dataclass(frozen=True)
 class Sample:
     """One object at one time."""
@@ -68,7 +71,7 @@ class Verdict:
 
 
 def judge(
-    track: Sequence[Sample], target_xy: tuple[float, float], *, claimed: bool, config: JudgeConfig | None = None
+    track: Sequence[Sample], target_xy: tuple[float, float], *, claimed: bool, rules: JudgeConfig = RULES
 ) -> Verdict:
     """Judge one object's track from before the grasp to after it.
 
@@ -76,19 +79,18 @@ def judge(
         track: Samples in the order of time, the first from before anything moved.
         target_xy: Where the footprint centre should be, m, world; NaN when no place was chosen.
         claimed: Whether the run reported success.
-        config: Tolerances.
+        rules: Tolerances.
 
     Raises:
         ValueError: The track is empty or not in the order of time.
     """
-    rules = config or JudgeConfig()
     if not track or any(later.t_ns < earlier.t_ns for earlier, later in itertools.pairwise(track)):
         raise ValueError(f"a track needs samples in the order of time, got {len(track)}")
     first, last = track[0], track[-1]
     error = math.hypot(last.p_world[0] - target_xy[0], last.p_world[1] - target_xy[1])
     rise = float(max(sample.p_world[2] for sample in track) - first.p_world[2])
     tilt = _tilt(first.q_xyzw, last.q_xyzw)
-    end = [sample for sample in track if last.t_ns - sample.t_ns <= rules.rest * 1e9]
+    end = end_of(track, rules)
     speed = max(float(np.linalg.norm(sample.linear)) for sample in end)
     turn = max(float(np.linalg.norm(sample.angular)) for sample in end)
     sink = float(last.p_world[2] - first.p_world[2])
@@ -111,9 +113,13 @@ def judge(
     return Verdict(placed, tuple(reasons), error, rise, tilt, speed, claimed and not placed)
 
 
-def at_rest(sample: Sample, config: JudgeConfig | None = None) -> bool:
+def end_of(track: Sequence[Sample], rules: JudgeConfig = RULES) -> list[Sample]:
+    """Return the samples of the time at the end in which an object must be at rest."""
+    return [sample for sample in track if track[-1].t_ns - sample.t_ns <= rules.rest * 1e9]
+
+
+def at_rest(sample: Sample, rules: JudgeConfig = RULES) -> bool:
     """Return whether an object moves no more than in resting contact."""
-    rules = config or JudgeConfig()
     return bool(np.linalg.norm(sample.linear) <= rules.speed and np.linalg.norm(sample.angular) <= rules.turn)
 
 

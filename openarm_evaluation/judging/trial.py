@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, SceneObject
-from openarm_evaluation.judging.judge import JudgeConfig, Sample, Verdict, at_rest, judge
+from openarm_evaluation.judging.judge import RULES, Sample, Verdict, at_rest, end_of, judge
 from openarm_evaluation.judging.provenance import scene_hash
 
 if TYPE_CHECKING:
@@ -148,18 +148,18 @@ def choose_target(scene: Scene, label: str | None) -> SceneObject:
     raise OpenArmError(Code.UNKNOWN_OBJECT, f"scene {scene.name} has no object {label or ''!r}; it has {labels}")
 
 
-def shows(scene: Scene, positions: dict[str, Sample], rules: JudgeConfig) -> bool:
+def shows(scene: Scene, positions: Mapping[str, Sample]) -> bool:
     """Return whether ground truth is of this scene, untouched and at rest."""
     if set(positions) != {item.name for item in scene.objects}:
         return False
     return all(
-        at_rest(positions[item.name], rules)
+        at_rest(positions[item.name])
         and float(np.hypot(*(positions[item.name].p_world[:2] - np.array(item.position[:2])))) < _SAME_PLACE
         for item in scene.objects
     )
 
 
-def wait_scene(observer: Observer, scene: Scene, after_ns: int, rules: JudgeConfig) -> None:
+def wait_scene(observer: Observer, scene: Scene, after_ns: int) -> None:
     """Wait until ground truth shows the scene at rest, later than `after_ns`.
 
     Raises:
@@ -168,7 +168,7 @@ def wait_scene(observer: Observer, scene: Scene, after_ns: int, rules: JudgeConf
 
     def there() -> bool | None:
         truth = observer.truth()
-        return truth is not None and truth.t_ns > after_ns and shows(scene, dict(truth.objects), rules)
+        return truth is not None and truth.t_ns > after_ns and shows(scene, truth.objects)
 
     observer.wait(there, SETTLE_TIMEOUT_S, f"ground truth of scene {scene.name} at rest")
 
@@ -181,7 +181,6 @@ def run_trial(
     *,
     seed: int | None = None,
     after_ns: int = 0,
-    rules: JudgeConfig | None = None,
     before: Callable[[], None] | None = None,
     moved: bool = False,
 ) -> Trial:
@@ -194,30 +193,24 @@ def run_trial(
         ask: What to grasp and where to place it.
         seed: Of the scene, for the report.
         after_ns: Ground truth up to this time is of an earlier scene.
-        rules: Of the judge.
         before: Called when the scene is at rest, before the grasp is requested.
         moved: Earlier grasps have moved its objects, so it is not waited for.
 
     Raises:
         OpenArmError: TIMEOUT, when the scene does not show; UNKNOWN_OBJECT.
     """
-    rules = rules or JudgeConfig()
     item = choose_target(scene, ask.label)
     if not moved:
-        wait_scene(observer, scene, after_ns, rules)
+        wait_scene(observer, scene, after_ns)
     if before is not None:
         before()
     observer.forget()
-    _wait_track(observer, item.name)
-    began = time.monotonic()
-    try:
-        result = client.pick(item.label, arm=ask.arm, place=ask.place)
-    except OpenArmError as error:
-        result = _failed(error, item.label)
-    wall_s = time.monotonic() - began
-    _wait_rest(observer, item.name, rules)
-    _wait_idle(observer)
-    return _judged(observer, scene, item, result, observer.steps(), wall_s, seed, rules, ask.place)
+
+    def request() -> Sequence[GraspResult]:
+        return [client.pick(item.label, arm=ask.arm, place=ask.place)]
+
+    (trial,) = _observed(observer, scene, seed, [item], request, ask.place)
+    return trial
 
 
 def run_pair(
@@ -228,30 +221,47 @@ def run_pair(
     *,
     seed: int | None = None,
     after_ns: int = 0,
-    rules: JudgeConfig | None = None,
 ) -> list[Trial]:
     """As `run_trial`, for two objects that are requested simultaneously; the observer keeps joint states meanwhile."""
-    rules = rules or JudgeConfig()
     first, second = items = [choose_target(scene, label) for label in labels]
-    wait_scene(observer, scene, after_ns, rules)
+    wait_scene(observer, scene, after_ns)
     observer.forget()
     observer.wait(lambda: observer.joints() or None, SETTLE_TIMEOUT_S, "/joint_states")
+
+    def request() -> Sequence[GraspResult]:
+        both = client.pick_two(first.label, second.label)
+        return both.results or [_failed(OpenArmError(both.code, both.message), item.label) for item in items]
+
+    return _observed(observer, scene, seed, items, request)
+
+
+def _observed(
+    observer: Observer,
+    scene: Scene,
+    seed: int | None,
+    items: Sequence[SceneObject],
+    request: Callable[[], Sequence[GraspResult]],
+    place: tuple[float, float] | None = None,
+) -> list[Trial]:
+    """Request grasps of objects and judge each by where it was to be placed: as requested, else as the grasp chose."""
     for item in items:
-        _wait_track(observer, item.name)
+        observer.wait(lambda n=item.name: observer.track(n) or None, SETTLE_TIMEOUT_S, f"ground truth of {item.name}")
     began = time.monotonic()
     try:
-        both = client.pick_two(first.label, second.label)
-        results = both.results or [_failed(OpenArmError(both.code, both.message), item.label) for item in items]
+        results = request()
     except OpenArmError as error:
         results = [_failed(error, item.label) for item in items]
-    wall_s = 0.5 * (time.monotonic() - began)
+    wall_s = (time.monotonic() - began) / len(items)
     for item in items:
-        _wait_rest(observer, item.name, rules)
-    _wait_idle(observer)
+        _wait_rest(observer, item.name)
+    # also after a request whose answer never came: the next trial resets
+    observer.wait(lambda: not observer.steps() or observer.steps()[-1].state == "IDLE", 90.0, "the end of the grasp")
     trials: list[Trial] = []
     for item, result in zip(items, results, strict=True):
-        steps = [step for step in observer.steps() if step.label == item.label]
-        trials.append(_judged(observer, scene, item, result, steps, wall_s, seed, rules))
+        chosen = result.place_position if any(result.place_position) else (math.nan, math.nan)
+        verdict = judge(observer.track(item.name), place or chosen[:2], claimed=result.success)
+        steps = [step for step in observer.steps() if len(items) == 1 or step.label == item.label]
+        trials.append(Trial(scene, seed, item.name, result, verdict, steps, wall_s))
     return trials
 
 
@@ -262,40 +272,13 @@ def _failed(error: OpenArmError, label: str) -> GraspResult:
     return GraspResult(False, error.code, error.message, "FAILED", label, "", 0, (0.0, 0.0, 0.0), 0.0)
 
 
-def _judged(
-    observer: Observer,
-    scene: Scene,
-    item: SceneObject,
-    result: GraspResult,
-    steps: Sequence[Step],
-    wall_s: float,
-    seed: int | None,
-    rules: JudgeConfig,
-    place: tuple[float, float] | None = None,
-) -> Trial:
-    """Judge an object by where it was to be placed: as requested, else as the grasp chose."""
-    chosen = result.place_position if any(result.place_position) else (math.nan, math.nan)
-    verdict = judge(observer.track(item.name), place or chosen[:2], claimed=result.success, config=rules)
-    return Trial(scene, seed, item.name, result, verdict, steps, wall_s)
-
-
-def _wait_track(observer: Observer, name: str) -> None:
-    observer.wait(lambda: observer.track(name) or None, SETTLE_TIMEOUT_S, f"ground truth of {name}")
-
-
-def _wait_idle(observer: Observer) -> None:
-    """Wait until no grasp runs any more, also after a request whose answer never came: the next trial resets."""
-    observer.wait(lambda: not observer.steps() or observer.steps()[-1].state == "IDLE", 90.0, "the end of the grasp")
-
-
-def _wait_rest(observer: Observer, name: str, rules: JudgeConfig) -> None:
+def _wait_rest(observer: Observer, name: str) -> None:
     """Wait until the object has been at rest for as long as the judge requires; one that never rests is judged so."""
 
     def resting() -> bool:
         track = observer.track(name)
-        end = [sample for sample in track if track[-1].t_ns - sample.t_ns <= rules.rest * 1e9]
-        long_enough = bool(track) and track[-1].t_ns - track[0].t_ns > rules.rest * 1e9
-        return long_enough and all(at_rest(sample, rules) for sample in end)
+        long_enough = bool(track) and track[-1].t_ns - track[0].t_ns > RULES.rest * 1e9
+        return long_enough and all(map(at_rest, end_of(track)))
 
     try:
         observer.wait(resting, 5.0, f"{name} at rest")

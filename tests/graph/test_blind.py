@@ -14,7 +14,6 @@ import pytest
 
 from openarm_common.errors import Code
 from openarm_common.scene.scene import load_scene
-from openarm_evaluation.judging.judge import JudgeConfig
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import wait_scene
 from openarm_grasp.ros.client import GraspClient
@@ -43,7 +42,7 @@ def test_a_detector_that_dies_during_a_grasp_leaves_the_arm_at_rest_and_the_serv
     pids = {name: node["pid"] for name, node in up.wait_ready()["nodes"].items()}
     monkeypatch.setenv("ROS_DOMAIN_ID", str(up.domain))
     with Observer(up.domain) as observer, GraspClient() as client, MotionClient() as motion:
-        wait_scene(observer, load_scene("demo"), 0, JudgeConfig())
+        wait_scene(observer, load_scene("demo"), 0)
         request = Asked(observer, lambda: client.pick("red"))
         request.wait_state("MOVE_TO_PREGRASP")
         for eye in ("detector", "wrist_detector"):

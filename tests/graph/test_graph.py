@@ -22,7 +22,7 @@ from openarm_bringup.supervision.shm import ports_of, unused
 from openarm_common.errors import Code
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.campaign.arm_clearance import LEAST_CLEARANCE, least_clearance
-from openarm_evaluation.judging.judge import JudgeConfig, judge
+from openarm_evaluation.judging.judge import judge
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import run_pair, wait_scene
 from openarm_grasp.ros.client import GraspClient
@@ -99,7 +99,7 @@ def test_unknown_object_is_refused_with_what_is_in_view(domain: int) -> None:
 
 def test_dry_run_plans_and_moves_nothing(up: Any, observer: Observer) -> None:
     scene = load_scene("demo")
-    wait_scene(observer, scene, 0, JudgeConfig())
+    wait_scene(observer, scene, 0)
     observer.forget()
     done = up.openarm("pick", "red", "--dry-run", "--json")
     assert done.returncode == 0, done.stdout + done.stderr
@@ -112,7 +112,7 @@ def test_dry_run_plans_and_moves_nothing(up: Any, observer: Observer) -> None:
 def test_grasp_by_service_lifts_and_places_and_a_second_one_is_refused_at_once(
     domain: int, observer: Observer, client: GraspClient
 ) -> None:
-    wait_scene(observer, load_scene("demo"), 0, JudgeConfig())
+    wait_scene(observer, load_scene("demo"), 0)
     observer.forget()
     observer.wait(lambda: observer.track("red_cube") or None, 5.0, "ground truth")
     request = Asked(observer, lambda: call_grasp(domain, label="red"))
@@ -151,7 +151,7 @@ def test_bridge_killed_during_a_grasp_is_a_named_code_and_the_graph_comes_back(
     up: Any, observer: Observer, client: GraspClient
 ) -> None:
     after_ns = observer.reset_world("demo", 0)
-    wait_scene(observer, load_scene("demo"), after_ns, JudgeConfig())
+    wait_scene(observer, load_scene("demo"), after_ns)
     observer.forget()
     bridge = up.record()["nodes"]["mujoco_bridge"]["pid"]
     request = Asked(observer, lambda: client.pick("red"))
@@ -171,7 +171,7 @@ def test_bridge_killed_during_a_grasp_is_a_named_code_and_the_graph_comes_back(
 
 def test_graph_that_has_come_back_grasps_again(observer: Observer, client: GraspClient) -> None:
     after_ns = observer.reset_world("demo", 0)
-    wait_scene(observer, load_scene("demo"), after_ns, JudgeConfig())
+    wait_scene(observer, load_scene("demo"), after_ns)
     result = client.pick("red")
     assert result.success, f"{result.code}: {result.message}"
 

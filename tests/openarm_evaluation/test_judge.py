@@ -72,8 +72,8 @@ def test_object_that_was_already_at_the_target_must_have_been_lifted() -> None:
 
 
 def test_motion_before_the_last_half_second_does_not_count() -> None:
-    assert judge(good_track(), TARGET, claimed=True, config=JudgeConfig(rest=0.9)).placed
-    assert not judge(good_track(), TARGET, claimed=True, config=JudgeConfig(rest=2.0)).placed
+    assert judge(good_track(), TARGET, claimed=True, rules=JudgeConfig(rest=0.9)).placed
+    assert not judge(good_track(), TARGET, claimed=True, rules=JudgeConfig(rest=2.0)).placed
 
 
 @given(yaw=st.floats(-math.pi, math.pi), dx=st.floats(-0.1, 0.1))

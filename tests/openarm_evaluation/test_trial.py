@@ -10,7 +10,7 @@ import pytest
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, load_scene
-from openarm_evaluation.judging.judge import JudgeConfig, Sample, judge
+from openarm_evaluation.judging.judge import Sample, judge
 from openarm_evaluation.judging.provenance import machine, scene_hash, versions
 from openarm_evaluation.judging.statistics import summarise, wilson_low
 from openarm_evaluation.judging.trial import Step, Trial, choose_target, shows
@@ -40,12 +40,12 @@ def test_target_is_the_first_object_or_the_labelled_one() -> None:
 
 
 def test_scene_is_recognised_only_when_all_its_objects_rest_at_their_places() -> None:
-    scene, rules = load_scene("random", 3), JudgeConfig()
-    assert shows(scene, standing(scene), rules)
-    assert not shows(scene, standing(scene, shift=0.03), rules)
-    assert not shows(scene, standing(scene, speed=0.1), rules)
-    assert not shows(scene, standing(load_scene("random", 4)), rules)
-    assert not shows(scene, {}, rules)
+    scene = load_scene("random", 3)
+    assert shows(scene, standing(scene))
+    assert not shows(scene, standing(scene, shift=0.03))
+    assert not shows(scene, standing(scene, speed=0.1))
+    assert not shows(scene, standing(load_scene("random", 4)))
+    assert not shows(scene, {})
 
 
 def test_scene_hash_tells_scenes_apart_and_is_stable() -> None:
