@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from openarm_evaluation.campaign.options import CampaignOptions
     from openarm_evaluation.campaign.tasks.suites import make_task
     from openarm_evaluation.campaign.tasks.task import Task
-    from openarm_evaluation.demo.demo import DemoOptions, run_demo
+    from openarm_evaluation.demo.demo import run_demo
+    from openarm_evaluation.demo.options import DemoOptions
     from openarm_evaluation.judging.judge import JudgeConfig, Verdict, judge
     from openarm_evaluation.judging.statistics import summarise
 

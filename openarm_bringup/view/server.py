@@ -71,11 +71,6 @@ class Item(NamedTuple):
     key: str
     payload: str | bytes
 
-    @classmethod
-    def of_fault(cls, layer: str, text: str) -> Item:
-        """What keeps a layer from being shown; nothing when it is shown again."""
-        return cls(layer, f"fault:{layer}", json.dumps({"kind": "fault", "layer": layer, "text": text}))
-
 
 class _Page:
     """One open page."""

@@ -12,7 +12,7 @@ import json
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -89,10 +89,25 @@ def run_campaign(
 
 
 def run_in_processes(options: CampaignOptions, seeds: Sequence[int], folder: Path, keep: Callable[[Row], None]) -> None:
-    """Run seeds without DDS, in this process or in several; see `Runner`."""
-    with contextlib.closing(_rows(options, seeds, folder)) as rows:
-        for row in rows:
-            keep(row)
+    """Run seeds without DDS, in this process or in several; see `Runner`. With one worker, in the order of seeds."""
+    if options.ray:
+        with contextlib.closing(cluster.rows(options, seeds, folder)) as rows:
+            for row in rows:
+                keep(row)
+        return
+    if options.workers == 1:
+        for seed in seeds:
+            keep(run_one(options, seed, folder))
+        return
+    # Spawned, not forked: OpenGL and numba's threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(options.workers, mp_context=context, initializer=_quiet_worker) as pool:
+        futures = [pool.submit(run_one, options, seed, folder) for seed in seeds]
+        try:
+            for future in as_completed(futures):
+                keep(future.result())
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def read_rows(folder: Path, options: CampaignOptions) -> list[Row]:
@@ -120,26 +135,6 @@ def read_rows(folder: Path, options: CampaignOptions) -> list[Row]:
         path.write_text("".join(whole), encoding="utf-8")
     rows = [json.loads(line) for line in whole]
     return [row for row in rows if row["seed"] in set(options.seeds)]
-
-
-def _rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Generator[Row, None, None]:
-    """Rows as they come; the order of seeds with one worker."""
-    if options.ray:
-        yield from cluster.rows(options, seeds, folder)
-        return
-    if options.workers == 1:
-        for seed in seeds:
-            yield run_one(options, seed, folder)
-        return
-    # Spawned, not forked: OpenGL and numba's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.workers, mp_context=context, initializer=_quiet_worker) as pool:
-        futures = [pool.submit(run_one, options, seed, folder) for seed in seeds]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _quiet_worker() -> None:

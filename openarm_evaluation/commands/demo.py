@@ -4,72 +4,32 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from cyclopts import Parameter
-
-from openarm_bringup.commands.connect import Sets
 from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code
-from openarm_evaluation.campaign.options import Seeds
+from openarm_evaluation.demo.options import DemoOptions
 
 if TYPE_CHECKING:
     from openarm_bringup.supervision.supervisor import Event
     from openarm_evaluation.demo.demo import DemoResult
     from openarm_evaluation.judging.trial import Step, Trial
 
+DEFAULTS = DemoOptions()
 
-def demo(
-    *,
-    seeds: Seeds = (),
-    label: str | None = None,
-    arm: Literal["auto", "left", "right"] = "auto",
-    place: tuple[float, float, float] | None = None,
-    scene: str | None = None,
-    graph: str = "sim",
-    set_: Sets = (),
-    video: Annotated[bool | None, Parameter(negative="--no-video")] = None,
-    mount_seed: str | None = None,
-    uncalibrated: bool = False,
-    domain: int | None = None,
-    accept: float = 0.9,
-) -> Outcome:
+
+def demo(*, options: DemoOptions = DEFAULTS, accept: float = 0.9) -> Outcome:
     """Start a graph of its own without a display, grasp and place an object, judge it by ground truth, and stop.
 
     Leaves a folder below runs/ with report.json, the logs of all nodes, pictures and a video.
 
     Args:
-        seeds: Random scenes one after the other, such as 0-19; in each the first object is grasped.
-        label: What to grasp; the first object of the scene when not given.
-        arm: Which arm.
-        place: Where to place it: x y z of the footprint centre, base frame, m (z is not read); seeds when not given.
-        scene: Name or path of a scene, or "random".
-        graph: Name of a graph, or a file.
-        video: Pictures and a video; by default for a single grasp only.
-        mount_seed: Of the true camera mounts, or "none" for those of the configuration. Mounts of a seed that was never
-            calibrated are calibrated first, once.
-        uncalibrated: Use the mounts of the configuration, to see what that does.
-        domain: ROS_DOMAIN_ID; a free one when not given.
         accept: With seeds: the share of objects placed that counts as success.
     """
-    from openarm_evaluation.demo.demo import DemoOptions, Listeners, run_demo
-    from openarm_evaluation.judging.trial import Ask
+    from openarm_evaluation.demo.demo import Listeners, run_demo
 
-    options = DemoOptions(
-        graph=graph,
-        scene=scene,
-        seeds=seeds,
-        ask=Ask(label, arm, place[:2] if place is not None else None),
-        film=not seeds if video is None else video,
-        domain=domain,
-        sets=tuple(set_),
-        mount_seed=mount_seed,
-        uncalibrated=uncalibrated,
-    )
-    show = _Show(quiet_steps=bool(seeds))
-    listeners = Listeners(
-        on_event=show.event, on_ready=show.ready, on_step=show.step, on_trial=show.trial, on_note=show.note
-    )
+    show = _Show(quiet_steps=bool(options.seeds))
+    listeners = Listeners(show.event, show.ready, show.step, show.trial, show.note)
     return _outcome(run_demo(options, listeners), options.seeds, accept)
 
 

@@ -16,6 +16,7 @@ from openarm_common.domain import reserve_domain
 from openarm_common.errors import OpenArmError
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.demo import mounts
+from openarm_evaluation.demo.options import DemoOptions
 from openarm_evaluation.judging import provenance
 from openarm_evaluation.judging.statistics import summarise
 from openarm_evaluation.judging.trial import Ask, Step, Trial, choose_target, run_trial
@@ -27,28 +28,6 @@ if TYPE_CHECKING:
 
 SPECTATOR = "/spectator/color/image_raw"
 DETECTION = "/detection_image"
-
-
-@dataclass(frozen=True)
-class DemoOptions:
-    """What to demonstrate.
-
-    Args:
-        seeds: Random scenes, one after the other; empty: one grasp in `scene`.
-        film: Pictures and a video.
-        mount_seed: Of the true camera mounts, or "none"; None is the graph's.
-        uncalibrated: Use the mounts of the configuration, to see what that does.
-    """
-
-    graph: str = "sim"
-    scene: str | None = None
-    seeds: tuple[int, ...] = ()
-    ask: Ask = field(default_factory=Ask)
-    film: bool = True
-    domain: int | None = None
-    sets: tuple[str, ...] = ()
-    mount_seed: str | None = None
-    uncalibrated: bool = False
 
 
 @dataclass
@@ -93,7 +72,7 @@ def run_demo(options: DemoOptions, listeners: Listeners | None = None) -> DemoRe
     graph = load_graph(options.graph, overrides=overrides, sets=sets)
     # Faults of the call show before anything is started.
     for seed in options.seeds or (graph.seed,):
-        choose_target(load_scene(graph.scene, seed), options.ask.label)
+        choose_target(load_scene(graph.scene, seed), options.label)
     result = DemoResult(runs.new_run_dir())
     listeners = listeners or Listeners()
     try:
@@ -115,7 +94,7 @@ async def _demo(options: DemoOptions, graph: Graph, result: DemoResult, listener
         from openarm_evaluation.judging.ros.observer import Observer
         from openarm_grasp.ros.client import GraspClient
 
-        studio = Studio(result) if options.film else None
+        studio: Studio | None = None
 
         def on_step(step: Step) -> None:
             listeners.on_step(step)
@@ -123,8 +102,7 @@ async def _demo(options: DemoOptions, graph: Graph, result: DemoResult, listener
                 studio.on_step(step)
 
         with Observer(environment.domain_id(graph), on_step) as observer, GraspClient() as client:
-            if studio is not None:
-                studio.observer = observer
+            studio = Studio(result, observer) if options.film else None
             try:
                 await work_until_stopped(
                     supervisor,
@@ -149,13 +127,14 @@ def _trials(
         rounds: list[tuple[str, int | None]] = [("random", seed) for seed in options.seeds]
     else:
         rounds = [(graph.scene, graph.seed if graph.scene == "random" else None)]
+    ask = Ask(options.label, options.arm, options.place[:2] if options.place is not None else None)
     for name, seed in rounds:
         after_ns = observer.reset_world(name, seed or 0) if options.seeds else 0
         trial = run_trial(
             observer,
             client,
             load_scene(name, graph.seed if seed is None else seed),
-            options.ask,
+            ask,
             seed=seed,
             after_ns=after_ns,
             before=studio.begin if studio is not None else None,
@@ -167,26 +146,24 @@ def _trials(
 class Studio:
     """Takes the pictures of a run: before, what was detected, held, after; and a film of all of it."""
 
-    def __init__(self, result: DemoResult) -> None:
+    def __init__(self, result: DemoResult, observer: Observer) -> None:
         from openarm_common.camera.cameras import load_cameras
         from openarm_evaluation.judging.film import Film
 
         self._result = result
         self._folder = result.run_dir
         self._film = Film(result.run_dir / "grasp.mp4", load_cameras()["spectator"].rate)
-        self.observer: Observer | None = None
+        self._observer = observer
         self._filming = False
 
     def begin(self) -> None:
         """Start filming and take the picture before; called in the thread of the trials."""
-        if self.observer is None:
-            return
         self._filming = True
-        self.observer.watch_camera(SPECTATOR, self._film.add)
+        self._observer.watch_camera(SPECTATOR, self._film.add)
         self._save_next(SPECTATOR, "before.png")
-        self.observer.watch_camera(DETECTION)
+        self._observer.watch_camera(DETECTION)
         self._save_next(DETECTION, "detection.png")
-        self.observer.unwatch_camera(DETECTION)
+        self._observer.unwatch_camera(DETECTION)
 
     def on_step(self, step: Step) -> None:
         """Take the picture of the held object when it has been lifted."""
@@ -195,9 +172,9 @@ class Studio:
 
     def finish(self) -> None:
         """Take the last picture and finish the film."""
-        if self.observer is not None and self._filming:
+        if self._filming:
             self._save_newest("after.png")
-            self.observer.unwatch_camera(SPECTATOR)
+            self._observer.unwatch_camera(SPECTATOR)
         if self._film.close():
             self._result.pictures.append("grasp.mp4")
         if self._film.save_animation(self._folder / "grasp.webp"):
@@ -206,16 +183,13 @@ class Studio:
             self._result.warnings.append(f"the film lost {self._film.dropped} frames")
 
     def _save_next(self, topic: str, name: str) -> None:
-        observer = self.observer
-        if observer is None:
-            return
         try:
-            self._save(name, observer.wait(lambda: observer.frame(topic), 10.0, f"an image of {topic}")[1])
+            self._save(name, self._observer.wait(lambda: self._observer.frame(topic), 10.0, f"an image of {topic}")[1])
         except OpenArmError as error:
             self._result.warnings.append(f"{name}: {error.message}")
 
     def _save_newest(self, name: str) -> None:
-        frame = self.observer.frame(SPECTATOR) if self.observer is not None else None
+        frame = self._observer.frame(SPECTATOR)
         if frame is None:
             self._result.warnings.append(f"{name}: no image of {SPECTATOR}")
         else:

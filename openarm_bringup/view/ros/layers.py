@@ -121,11 +121,13 @@ class Layer:
 
     Attributes:
         fault: What keeps it from being shown; empty when nothing does.
+        due: When it is updated next, s of the monotonic clock.
     """
 
     def __init__(self, node: Node, sources: Sequence[Source], show: Show, period: float = 0.2) -> None:
         self.fault = ""
         self.period = period
+        self.due = 0.0
         self._show = show
         self._polled = [(Polled(node, source.kind, source.topic, source.qos), source.silence) for source in sources]
 

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from action_msgs.srv import CancelGoal
@@ -108,40 +108,32 @@ class GraphView(ContextNode):
         return answer.success, answer.message
 
     def _run(self) -> None:
-        open_layers: dict[str, _Open] = {}
+        open_layers: dict[str, Layer] = {}
         try:
             while not self._ended.wait(_TICK_S):
                 wanted = self._wanted
                 for name in open_layers.keys() - wanted:
-                    open_layers.pop(name).layer.close()
+                    open_layers.pop(name).close()
                 for name in wanted - open_layers.keys():
-                    open_layers[name] = _Open(self._makers[name](self._node))
+                    open_layers[name] = self._makers[name](self._node)
                 now = time.monotonic()
-                for name, one in open_layers.items():
-                    if now >= one.due:
-                        one.due = now + one.layer.period
-                        self._poll(name, one)
+                for name, layer in open_layers.items():
+                    if now >= layer.due:
+                        layer.due = now + layer.period
+                        self._poll(name, layer)
         except BaseException as error:  # handed to the server, which ends with it
             self._on_end(error)
         finally:
-            for one in open_layers.values():
-                one.layer.close()
+            for layer in open_layers.values():
+                layer.close()
 
-    def _poll(self, name: str, one: _Open) -> None:
-        fault = ""
+    def _poll(self, name: str, layer: Layer) -> None:
+        before = layer.fault
         try:
-            for key, payload in one.layer.update():
+            for key, payload in layer.update():
                 self._on_item(Item(name, key, payload))
         except OpenArmError as error:  # one message that can't be shown
-            fault = error.message
-        fault = fault or one.layer.fault
-        if fault != one.fault:
-            one.fault = fault
-            self._on_item(Item.of_fault(name, fault))
-
-
-@dataclass
-class _Open:
-    layer: Layer
-    due: float = 0.0
-    fault: str = ""
+            layer.fault = error.message
+        if layer.fault != before:  # none: it is shown again
+            text = json.dumps({"kind": "fault", "layer": name, "text": layer.fault})
+            self._on_item(Item(name, f"fault:{name}", text))
