@@ -68,46 +68,40 @@ def occupied_cells(leaves: Leaves) -> Floats:
     return np.column_stack([centre, edge]).astype(np.float32)
 
 
-class CloudMaker:
-    """Makes a thin, coloured cloud of a depth image.
+def thin_cloud(
+    deprojector: Deprojector,
+    depth: NDArray[Any],
+    rgb: Bytes,
+    intrinsics: Intrinsics,
+    T_base_optical: NDArray[np.float64],
+    edge: float = 0.01,
+    stride: int = 2,
+) -> tuple[Floats, Bytes]:
+    """Points (n, 3) of a depth image in the base frame, thinned, and their colours (n, 3).
 
     Args:
         deprojector: With the limits of the camera.
+        depth: (h, w), uint16 mm or float32 m.
+        rgb: (h, w, 3) of the same frame.
+        intrinsics: Of both.
+        T_base_optical: Where the camera is.
         edge: One point is kept for each cell of this edge, m.
         stride: Every so many-th pixel of a row and column is used.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, when sizes differ or the depth has an unknown type.
     """
-
-    def __init__(self, deprojector: Deprojector, edge: float = 0.01, stride: int = 2) -> None:
-        self._deprojector = deprojector
-        self._edge, self._stride = edge, stride
-
-    def make(
-        self, depth: NDArray[Any], rgb: Bytes, intrinsics: Intrinsics, T_base_optical: NDArray[np.float64]
-    ) -> tuple[Floats, Bytes]:
-        """Points (n, 3) in the base frame and their colours (n, 3).
-
-        Args:
-            depth: (h, w), uint16 mm or float32 m.
-            rgb: (h, w, 3) of the same frame.
-            intrinsics: Of both.
-            T_base_optical: Where the camera is.
-
-        Raises:
-            OpenArmError: BAD_IMAGE, when sizes differ or the depth has an unknown type.
-        """
-        if rgb.shape[:2] != depth.shape:
-            raise OpenArmError(Code.BAD_IMAGE, f"colour is {rgb.shape[:2]}, depth {depth.shape}; expected one size")
-        s = self._stride
-        few, colors = np.ascontiguousarray(depth[::s, ::s]), rgb[::s, ::s]
-        k = intrinsics
-        thin = Intrinsics(few.shape[1], few.shape[0], k.fx / s, k.fy / s, k.cx / s, k.cy / s)
-        points = self._deprojector.organised(few, thin)
-        valid = np.isfinite(points[..., 2])
-        T = T_base_optical.astype(np.float32)
-        base = points[valid] @ T[:3, :3].T + T[:3, 3]
-        cell = np.floor(base / np.float32(self._edge)).astype(np.int64) + _OFFSET
-        _, first = np.unique((cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2], return_index=True)
-        return base[first], colors[valid][first]
+    if rgb.shape[:2] != depth.shape:
+        raise OpenArmError(Code.BAD_IMAGE, f"colour is {rgb.shape[:2]}, depth {depth.shape}; expected one size")
+    few, colors = np.ascontiguousarray(depth[::stride, ::stride]), rgb[::stride, ::stride]
+    optics = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
+    points = deprojector.organised(few, Intrinsics(few.shape[1], few.shape[0], *(value / stride for value in optics)))
+    valid = np.isfinite(points[..., 2])
+    T = T_base_optical.astype(np.float32)
+    base = points[valid] @ T[:3, :3].T + T[:3, 3]
+    cell = np.floor(base / np.float32(edge)).astype(np.int64) + _OFFSET
+    _, first = np.unique((cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2], return_index=True)
+    return base[first], colors[valid][first]
 
 
 def jpeg(rgb: NDArray[Any], quality: int = 80) -> bytes:

@@ -70,8 +70,7 @@ def test_a_cloud_is_thin_coloured_and_in_the_base_frame() -> None:
     rgb[60:, :, 1] = 250  # the lower half is green
     intrinsics = Intrinsics.from_fovy(160, 120, 60.0)
     T_base_optical = se3.make(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), (1.0, 0.0, 0.5))
-    maker = wire.CloudMaker(Deprojector(DepthLimits()), edge=0.02, stride=2)
-    points, colors = maker.make(depth, rgb, intrinsics, T_base_optical)
+    points, colors = wire.thin_cloud(Deprojector(DepthLimits()), depth, rgb, intrinsics, T_base_optical, edge=0.02)
     np.testing.assert_allclose(points[:, 0], 1.8, atol=1e-4)
     assert 500 < len(points) == len(colors) < 50 * 60
     cells = np.floor(points[:, 1:] / 0.02).astype(int)
@@ -85,9 +84,9 @@ def test_a_cloud_is_thin_coloured_and_in_the_base_frame() -> None:
 
 
 def test_a_colour_image_of_another_size_is_refused() -> None:
-    maker = wire.CloudMaker(Deprojector(DepthLimits()))
+    depth, rgb = np.ones((8, 8), np.float32), np.zeros((4, 4, 3), np.uint8)
     with pytest.raises(OpenArmError, match=r"\(4, 4\), depth \(8, 8\)"):
-        maker.make(np.ones((8, 8), np.float32), np.zeros((4, 4, 3), np.uint8), Intrinsics(8, 8, 4, 4, 4, 4), np.eye(4))
+        wire.thin_cloud(Deprojector(DepthLimits()), depth, rgb, Intrinsics(8, 8, 4, 4, 4, 4), np.eye(4))
 
 
 def test_a_picture_keeps_its_colours() -> None:

@@ -31,10 +31,11 @@ from openarm_common.octree.codec import decode
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import (
+    depth_image,
     held_from_msg,
-    image_to_array,
     intrinsics_from_info,
     pose_to_matrix,
+    rgb_image,
     stamp_to_ns,
     transform_to_matrix,
     xyz,
@@ -193,7 +194,7 @@ def _show_image(camera: str) -> Show:
     def show(images: list[Image]) -> Items:
         if images:
             head = {"kind": "image", "camera": camera}
-            yield f"image:{camera}", wire.frame(head, wire.jpeg(_rgb(images[-1])))
+            yield f"image:{camera}", wire.frame(head, wire.jpeg(rgb_image(images[-1])))
 
     return show
 
@@ -201,7 +202,7 @@ def _show_image(camera: str) -> Show:
 def _show_cloud(description: RobotDescription, camera: CameraConfig) -> Show:
     """The cloud of the newest frame with both depth and colour, one point a centimetre."""
     states = RobotStateBuffer(description)
-    maker = wire.CloudMaker(Deprojector(DepthLimits(near=camera.near, far=camera.far)))
+    deprojector = Deprojector(DepthLimits(near=camera.near, far=camera.far))
     newest: list[Any] = [None, None, None]
 
     def show(static: list[TFMessage], *images: list[Any]) -> Items:
@@ -213,7 +214,8 @@ def _show_cloud(description: RobotDescription, camera: CameraConfig) -> Show:
         if depth is None or color is None or info is None or depth.header.stamp != color.header.stamp:
             return  # the other half of the frame comes soon
         T_base_optical = states.lookup(BASE_FRAME, camera.optical_frame, stamp_to_ns(depth.header.stamp))
-        points, colors = maker.make(image_to_array(depth), _rgb(color), intrinsics_from_info(info), T_base_optical)
+        optics = intrinsics_from_info(info)
+        points, colors = wire.thin_cloud(deprojector, depth_image(depth), rgb_image(color), optics, T_base_optical)
         newest[0] = None  # shown
         yield "cloud", wire.frame({"kind": "cloud", "count": len(points)}, points, colors)
 
@@ -286,11 +288,6 @@ def _unused(_: object) -> None:
 
 def _text(kind: str, **values: Any) -> str:
     return json.dumps({"kind": kind, **values})
-
-
-def _rgb(message: Image) -> Any:
-    pixels = image_to_array(message)
-    return pixels[..., ::-1] if message.encoding == "bgr8" else pixels
 
 
 def _step(message: GraspStatus) -> dict[str, Any]:
