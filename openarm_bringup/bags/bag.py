@@ -12,13 +12,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from openarm_bringup.bags.definitions import definition, nested_types
 from openarm_bringup.bags.mcap import DAMAGE, is_closed, mend
@@ -39,26 +37,6 @@ class Record:
     data: bytes
 
 
-class Types:
-    """Definitions of the messages that are met, by name such as `sensor_msgs/msg/Image`."""
-
-    def __init__(self) -> None:
-        self.store: Typestore = get_typestore(Stores.ROS2_JAZZY)
-
-    def add(self, name: str) -> None:
-        """Learn a type and all that it is made of.
-
-        Raises:
-            OpenArmError: INVALID_ARGUMENT, when no installed package has it.
-        """
-        if name in self.store.types:
-            return
-        message = interface(name)
-        for inner in nested_types(message):
-            self.add(inner)
-        self.store.register(get_types_from_msg(definition(message), name))
-
-
 class BagWriter:
     """Writes a bag; a context manager.
 
@@ -72,12 +50,12 @@ class BagWriter:
     """
 
     def __init__(self, path: Path, custom: Mapping[str, str], *, compress: bool = True) -> None:
-        self._types = Types()
-        self._writer = (
-            Writer(path, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
-            if not (path.exists())
-            else _refuse(path)
-        )
+        if path.exists():
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"{path} exists; give the bag another name, a bag is never overwritten"
+            )
+        self._types = get_typestore(Stores.ROS2_JAZZY)
+        self._writer = Writer(path, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
         if compress:
             self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._compress = compress
@@ -107,11 +85,23 @@ class BagWriter:
         self._writer.set_custom_data(key, value)
 
     def add_topic(self, topic: str, kind: str, qos: Qos) -> None:
-        """Say what a topic is, before its first message."""
-        self._types.add(kind)
+        """Say what a topic is, before its first message.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when no installed package has its type.
+        """
+        self._learn(kind)
         self._connections[topic] = self._writer.add_connection(
-            topic, kind, typestore=self._types.store, offered_qos_profiles=[qos]
+            topic, kind, typestore=self._types, offered_qos_profiles=[qos]
         )
+
+    def _learn(self, kind: str) -> None:
+        """Register a type, such as `sensor_msgs/msg/Image`, and all that it is made of."""
+        if kind not in self._types.types:
+            message = interface(kind)
+            for inner in nested_types(message):
+                self._learn(inner)
+            self._types.register(get_types_from_msg(definition(message), kind))
 
     def hasten(self, now: bool) -> None:
         """Leave out compression from here on, or take it up again; a file may hold chunks of both kinds."""
@@ -130,10 +120,6 @@ class BagWriter:
             OSError: When the disk is full.
         """
         self._writer.write(self._connections[topic], t_ns, data)
-
-
-def _refuse(path: Path) -> Any:
-    raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} exists; give the bag another name, a bag is never overwritten")
 
 
 class Bag:

@@ -112,26 +112,23 @@ class Supervisor:
             OpenArmError: what kept a node from it (with the end of its log); CANCELLED when asked to stop meanwhile.
         """
         ready = asyncio.create_task(self._all_ready())
-        stopping = asyncio.create_task(self.stop_asked.wait())
-        await asyncio.wait([ready, stopping, self._trouble], return_when=asyncio.FIRST_COMPLETED)
-        done = ready.done()
-        stopping.cancel()
-        ready.cancel()
-        if self._trouble.done():
-            self._trouble.result()
-        if not done:
-            raise OpenArmError(Code.CANCELLED, "asked to stop before the graph was ready")
+        try:
+            await self.wait_stop_asked(ready)
+            if not ready.done():
+                raise OpenArmError(Code.CANCELLED, "asked to stop before the graph was ready")
+        finally:
+            ready.cancel()
         self._record()
         return time.monotonic() - self._began
 
-    async def wait_stop_asked(self) -> None:
-        """Wait for `ask_stop`, or until a node was given up.
+    async def wait_stop_asked(self, *others: asyncio.Task[None]) -> None:
+        """Wait for `ask_stop`, the end of another task, or until a node was given up.
 
         Raises:
             OpenArmError: why a node was given up that the graph can't do without.
         """
         stopping = asyncio.create_task(self.stop_asked.wait())
-        await asyncio.wait([stopping, self._trouble], return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait([stopping, self._trouble, *others], return_when=asyncio.FIRST_COMPLETED)
         stopping.cancel()
         if self._trouble.done():
             self._trouble.result()

@@ -19,7 +19,8 @@ from openarm_evaluation.demo import mounts
 from openarm_evaluation.demo.options import DemoOptions
 from openarm_evaluation.judging import provenance
 from openarm_evaluation.judging.statistics import summarise
-from openarm_evaluation.judging.trial import Ask, Step, Trial, choose_target, run_trial
+from openarm_evaluation.judging.trial import Step, Trial, choose_target, run_trial
+from openarm_grasp.strategies.request import GraspRequest
 
 if TYPE_CHECKING:
     from openarm_bringup.supervision.supervisor import Event
@@ -127,14 +128,14 @@ def _trials(
         rounds: list[tuple[str, int | None]] = [("random", seed) for seed in options.seeds]
     else:
         rounds = [(graph.scene, graph.seed if graph.scene == "random" else None)]
-    ask = Ask(options.label, options.arm, options.place[:2] if options.place is not None else None)
+    wanted = GraspRequest(options.label or "", options.arm, options.place)
     for name, seed in rounds:
         after_ns = observer.reset_world(name, seed or 0) if options.seeds else 0
         trial = run_trial(
             observer,
             client,
             load_scene(name, graph.seed if seed is None else seed),
-            ask,
+            wanted,
             seed=seed,
             after_ns=after_ns,
             before=studio.begin if studio is not None else None,

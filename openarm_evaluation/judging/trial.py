@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from openarm_evaluation.judging.ros.observer import Observer
     from openarm_grasp.ros.answers import GraspResult
     from openarm_grasp.ros.client import GraspClient
-    from openarm_grasp.strategies.request import GraspOutcome
+    from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
 
 #: How near an object must be to its place in the scene file to be that scene's, m.
 _SAME_PLACE = 0.02
@@ -38,21 +38,6 @@ class Step:
     attempt: int
     label: str
     arm: str
-
-
-@dataclass(frozen=True)
-class Ask:
-    """Request of a grasp.
-
-    Args:
-        label: Of the object; None takes the first of the scene.
-        arm: auto, left or right.
-        place: (x, y) of the footprint centre, base frame, m; None lets the suite choose.
-    """
-
-    label: str | None = None
-    arm: str = "auto"
-    place: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -177,7 +162,7 @@ def run_trial(
     observer: Observer,
     client: GraspClient,
     scene: Scene,
-    ask: Ask,
+    wanted: GraspRequest,
     *,
     seed: int | None = None,
     after_ns: int = 0,
@@ -190,7 +175,7 @@ def run_trial(
         observer: Observes the graph.
         client: Requests the grasp.
         scene: What is on the table now.
-        ask: What to grasp and where to place it.
+        wanted: What to grasp and where to place it; without a label, the first object of the scene.
         seed: Of the scene, for the report.
         after_ns: Ground truth up to this time is of an earlier scene.
         before: Called when the scene is at rest, before the grasp is requested.
@@ -199,7 +184,7 @@ def run_trial(
     Raises:
         OpenArmError: TIMEOUT, when the scene does not show; UNKNOWN_OBJECT.
     """
-    item = choose_target(scene, ask.label)
+    item = choose_target(scene, wanted.label or None)
     if not moved:
         wait_scene(observer, scene, after_ns)
     if before is not None:
@@ -207,9 +192,9 @@ def run_trial(
     observer.forget()
 
     def request() -> Sequence[GraspResult]:
-        return [client.pick(item.label, arm=ask.arm, place=ask.place)]
+        return [client.pick(item.label, arm=wanted.arm, place=wanted.place)]
 
-    (trial,) = _observed(observer, scene, seed, [item], request, ask.place)
+    (trial,) = _observed(observer, scene, seed, [item], request, wanted.place)
     return trial
 
 
@@ -241,7 +226,7 @@ def _observed(
     seed: int | None,
     items: Sequence[SceneObject],
     request: Callable[[], Sequence[GraspResult]],
-    place: tuple[float, float] | None = None,
+    place: tuple[float, ...] | None = None,
 ) -> list[Trial]:
     """Request grasps of objects and judge each by where it was to be placed: as requested, else as the grasp chose."""
     for item in items:
@@ -259,7 +244,8 @@ def _observed(
     trials: list[Trial] = []
     for item, result in zip(items, results, strict=True):
         chosen = result.place_position if any(result.place_position) else (math.nan, math.nan)
-        verdict = judge(observer.track(item.name), place or chosen[:2], claimed=result.success)
+        x, y = (place or chosen)[:2]
+        verdict = judge(observer.track(item.name), (x, y), claimed=result.success)
         steps = [step for step in observer.steps() if len(items) == 1 or step.label == item.label]
         trials.append(Trial(scene, seed, item.name, result, verdict, steps, wall_s))
     return trials

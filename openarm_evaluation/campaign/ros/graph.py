@@ -21,7 +21,8 @@ from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import add_clearance, crashed_row, row_of
-from openarm_evaluation.judging.trial import Ask, run_pair, run_trial
+from openarm_evaluation.judging.trial import run_pair, run_trial
+from openarm_grasp.strategies.request import GraspRequest
 
 if TYPE_CHECKING:
     from openarm_evaluation.judging.ros.observer import Observer
@@ -84,7 +85,7 @@ def _row(observer: Observer, client: GraspClient, task: Task, scenes: Path) -> R
         if task.together:
             trials = run_pair(observer, client, task.scene, task.labels, seed=task.seed, after_ns=after_ns)
         else:
-            asks = [Ask(label, task.arm, task.place) for label in task.labels]
+            asks = [GraspRequest(label, task.arm, task.place) for label in task.labels]
             trials = [
                 run_trial(observer, client, task.scene, ask, seed=task.seed, after_ns=after_ns, moved=k > 0)
                 for k, ask in enumerate(asks)
