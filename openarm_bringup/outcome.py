@@ -13,6 +13,7 @@ from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 #: Whether stdout is for people, not for the one JSON document of `--json`.
 FOR_PEOPLE: ContextVar[bool] = ContextVar("FOR_PEOPLE", default=True)
@@ -58,6 +59,16 @@ def console() -> Console:
     from rich.console import Console
 
     return Console(stderr=True, highlight=False)
+
+
+def as_text(table: Table, width: int | None = None) -> str:
+    """Return a table as text; without colours where a width is given."""
+    from rich.console import Console
+
+    page = Console(highlight=False) if width is None else Console(width=width, color_system=None)
+    with page.capture() as shown:
+        page.print(table)
+    return shown.get()
 
 
 def failure(error: OpenArmError, **data: Any) -> Outcome:

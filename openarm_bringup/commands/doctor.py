@@ -17,7 +17,7 @@ from pathlib import Path
 
 from openarm_bringup.doctor import checks, graph
 from openarm_bringup.doctor.checks import Finding
-from openarm_bringup.outcome import Outcome
+from openarm_bringup.outcome import Outcome, as_text
 from openarm_common.errors import Code
 
 MARKS = {"ok": "[green]ok[/green]", "note": "[yellow]note[/yellow]", "error": "[bold red]error[/bold red]"}
@@ -86,7 +86,6 @@ def gather(graph: str) -> list[Finding]:
 
 
 def _table(findings: list[Finding]) -> str:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -96,10 +95,7 @@ def _table(findings: list[Finding]) -> str:
     for finding in findings:
         advice = f"\n→ {finding.advice}" if finding.advice else ""
         table.add_row(MARKS[finding.level], finding.name, Text(finding.observed + advice))
-    console = Console(highlight=False)
-    with console.capture() as capture:
-        console.print(table)
-    return capture.get()
+    return as_text(table)
 
 
 def _graph_findings(name: str) -> list[Finding]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from openarm_bringup.commands.connect import Domain, join_graph, requires_node
-from openarm_bringup.outcome import Outcome, console
+from openarm_bringup.outcome import Outcome, as_text, console
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
@@ -161,7 +161,6 @@ def _option_row(option: Option) -> dict[str, Any]:
 
 def _options_table(options: Sequence[Option]) -> str:
     """Return a table of the candidates that were rated: the terms of each score, and why it was not chosen."""
-    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
@@ -180,10 +179,7 @@ def _options_table(options: Sequence[Option]) -> str:
         score = f"{option.score:+.2f}" if option.parts else ""
         code = f"{option.code}: " if option.code not in ("", Code.OK) else ""
         table.add_row(option.id, option.arm, score, *values, margin, escape(f"{code}{option.message}"))
-    page = Console(width=160, color_system=None)
-    with page.capture() as shown:
-        page.print(table)
-    lines = (line.rstrip() for line in shown.get().splitlines())
+    lines = (line.rstrip() for line in as_text(table, width=160).splitlines())
     return "\n".join(lines) + "\n(margin: to the nearest joint limit, on the approach and the retreat)\n"
 
 

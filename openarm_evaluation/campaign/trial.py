@@ -21,7 +21,7 @@ from openarm_evaluation.campaign.arm_clearance import LEAST_CLEARANCE, watch_cle
 from openarm_evaluation.campaign.link import DirectLink
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import MISSES, PLAN_FAILS, Task
-from openarm_evaluation.judging.judge import RULES, Verdict, at_rest, end_of, judge
+from openarm_evaluation.judging.judge import RULES, at_rest, end_of, judge
 from openarm_evaluation.judging.provenance import scene_hash
 from openarm_evaluation.judging.trial import Step, Trial
 from openarm_grasp.config import GraspConfig
@@ -156,12 +156,6 @@ class Trials:
         """A request, to be carried out by a strategy."""
         return GraspTask(self.session, self.skills, request, self._report)
 
-    def _trial(self, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
-        """Judge a request."""
-        end_ns = self.robot.t_ns
-        target, verdict = self._judge(outcome)
-        return Trial(self._task.scene, self._task.seed, target, outcome, verdict, steps, wall_s, end_ns)
-
     # --- while it runs
     def _report(self, status: Status) -> None:
         step = Step(
@@ -207,17 +201,18 @@ class Trials:
         # Something stands on every side: it is not pushed, and the task is a nominal one.
 
     # --- after it
-    def _judge(self, outcome: GraspOutcome) -> tuple[str, Verdict | None]:
-        """The verdict on the object of that label; where there are several, on the one that went highest."""
-        robot = self.robot
-        names = [item.name for item in self._task.scene.objects if item.label == outcome.label]
+    def _trial(self, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
+        """Judge the object of that label; where there are several, the one that went highest."""
+        robot, task, end_ns = self.robot, self._task, self.robot.t_ns
+        names = [item.name for item in task.scene.objects if item.label == outcome.label]
         if not names:
-            return "", None
+            return Trial(task.scene, task.seed, "", outcome, None, steps, wall_s, end_ns)
         self._rest(names)
         where = outcome.place_position
         xy = (where[0], where[1]) if any(where) else (math.nan, math.nan)
         name = max(names, key=lambda n: max(float(s.p_world[2]) for s in robot.tracks[n]))
-        return name, judge(robot.tracks[name], xy, claimed=outcome.success)
+        verdict = judge(robot.tracks[name], xy, claimed=outcome.success)
+        return Trial(task.scene, task.seed, name, outcome, verdict, steps, wall_s, end_ns)
 
     def _rest(self, names: list[str]) -> None:
         end_ns = self.robot.t_ns + round(_REST_LIMIT_S * 1e9)

@@ -34,14 +34,14 @@ from openarm_common.ros.client import ContextNode
 from openarm_common.ros.node import offered_qos
 
 #: What the profiles record: regular expressions of whole topic names.
+_CAMERA = (
+    r"/(overhead|wrist)/(color|depth)/(image_raw|camera_info)",
+    "/joint_states|/tf|/tf_static|/clock|/robot_description",
+)
 PROFILES: Mapping[str, tuple[str, ...]] = {
-    "camera": (
-        r"/(overhead|wrist)/(color|depth)/(image_raw|camera_info)",
-        "/joint_states|/tf|/tf_static|/clock|/robot_description",
-    ),
+    "camera": _CAMERA,
     "grasp": (
-        r"/(overhead|wrist)/(color|depth)/(image_raw|camera_info)",
-        "/joint_states|/tf|/tf_static|/clock|/robot_description",
+        *_CAMERA,
         r"/detections_2d|/detections_3d|/grasp/.*|/motion/.*|/.*/controller_state|/diagnostics|/sim/ground_truth/.*",
     ),
     "all": (".*",),

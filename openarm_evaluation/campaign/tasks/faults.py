@@ -50,8 +50,7 @@ def _fault(name: str, *codes: Code, when: str = "", until_attempt: int = 0, **pa
 
 def _nudged(when: str) -> Maker:
     def make(task: Task, rng: np.random.Generator) -> Task:
-        target = next(item.name for item in task.scene.objects if item.label == task.labels[0])
-        return _fault("object_nudged", when=when, object=target, mm=(20.0, 50.0))(task, rng)
+        return _fault("object_nudged", when=when, object=_target(task).name, mm=(20.0, 50.0))(task, rng)
 
     return make
 
