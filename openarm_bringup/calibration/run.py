@@ -107,46 +107,39 @@ def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners
     listeners = listeners or CalibrationListeners()
     stop = threading.Event()
 
+    def calibrate_all() -> None:
+        from openarm_bringup.ros.simulation import reset_world
+        from openarm_calibration.ros.client import CalibrationClient
+
+        with CalibrationClient() as client:
+            for k, camera in enumerate(cameras):
+                listeners.on_camera(camera)
+                if k:
+                    reset_world(client, scene_of(camera))
+                run.results[camera] = client.auto(
+                    camera,
+                    poses=options.poses,
+                    sigma=options.enough,
+                    measure_delay=options.delay,
+                    save=options.save,
+                    session=str((run.run_dir / f"{camera}.npz").absolute()),
+                    on_feedback=listeners.on_feedback,
+                    stop=stop,
+                )
+                if stop.is_set():
+                    return
+
     async def work() -> None:
         async with running_graph(graph, run.run_dir, listeners.on_event) as supervisor:
             run.ready_s = await supervisor.wait_ready()
             listeners.on_ready(run.ready_s)
-            await work_until_stopped(supervisor, lambda: _all(options, cameras, run, listeners, stop), stop.set)
+            await work_until_stopped(supervisor, calibrate_all, stop.set)
 
     try:
         asyncio.run(work())
     except OpenArmError as error:
         run.error = error
     return run
-
-
-def _all(
-    options: CalibrationOptions,
-    cameras: Sequence[str],
-    run: CalibrationRun,
-    listeners: CalibrationListeners,
-    stop: threading.Event,
-) -> None:
-    from openarm_bringup.ros.simulation import reset_world
-    from openarm_calibration.ros.client import CalibrationClient
-
-    with CalibrationClient() as client:
-        for k, camera in enumerate(cameras):
-            listeners.on_camera(camera)
-            if k:
-                reset_world(client, scene_of(camera))
-            run.results[camera] = client.auto(
-                camera,
-                poses=options.poses,
-                sigma=options.enough,
-                measure_delay=options.delay,
-                save=options.save,
-                session=str((run.run_dir / f"{camera}.npz").absolute()),
-                on_feedback=listeners.on_feedback,
-                stop=stop,
-            )
-            if stop.is_set():
-                return
 
 
 def as_row(result: AutoResult) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from openarm_grasp.strategies.request import GraspRequest
 if TYPE_CHECKING:
     from openarm_bringup.supervision.supervisor import Event
     from openarm_evaluation.judging.ros.observer import Observer
-    from openarm_grasp.ros.client import GraspClient
 
 SPECTATOR = "/spectator/color/image_raw"
 DETECTION = "/detection_image"
@@ -104,44 +103,23 @@ async def _demo(options: DemoOptions, graph: Graph, result: DemoResult, listener
 
         with Observer(environment.domain_id(graph), on_step) as observer, GraspClient() as client:
             studio = Studio(result, observer) if options.film else None
+            wanted = GraspRequest(options.label or "", options.arm, options.place)
+            before = studio.begin if studio is not None else None
+            rounds: list[tuple[str, int | None]] = [("random", seed) for seed in options.seeds]
+
+            def work() -> None:
+                for name, seed in rounds or [(graph.scene, graph.seed if graph.scene == "random" else None)]:
+                    after_ns = observer.reset_world(name, seed or 0) if options.seeds else 0
+                    scene = load_scene(name, graph.seed if seed is None else seed)
+                    trial = run_trial(observer, client, scene, wanted, seed=seed, after_ns=after_ns, before=before)
+                    result.trials.append(trial)
+                    listeners.on_trial(trial)
+
             try:
-                await work_until_stopped(
-                    supervisor,
-                    lambda: _trials(options, graph, observer, client, studio, result, listeners),
-                    client.cancel,
-                )
+                await work_until_stopped(supervisor, work, client.cancel)
             finally:
                 if studio is not None:
                     studio.finish()
-
-
-def _trials(
-    options: DemoOptions,
-    graph: Graph,
-    observer: Observer,
-    client: GraspClient,
-    studio: Studio | None,
-    result: DemoResult,
-    listeners: Listeners,
-) -> None:
-    if options.seeds:
-        rounds: list[tuple[str, int | None]] = [("random", seed) for seed in options.seeds]
-    else:
-        rounds = [(graph.scene, graph.seed if graph.scene == "random" else None)]
-    wanted = GraspRequest(options.label or "", options.arm, options.place)
-    for name, seed in rounds:
-        after_ns = observer.reset_world(name, seed or 0) if options.seeds else 0
-        trial = run_trial(
-            observer,
-            client,
-            load_scene(name, graph.seed if seed is None else seed),
-            wanted,
-            seed=seed,
-            after_ns=after_ns,
-            before=studio.begin if studio is not None else None,
-        )
-        result.trials.append(trial)
-        listeners.on_trial(trial)
 
 
 class Studio:
