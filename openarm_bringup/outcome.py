@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from openarm_bringup.supervision.supervisor import Event
+
 #: Whether stdout is for people, not for the one JSON document of `--json`.
 FOR_PEOPLE: ContextVar[bool] = ContextVar("FOR_PEOPLE", default=True)
 
@@ -59,6 +61,22 @@ def console() -> Console:
     from rich.console import Console
 
     return Console(stderr=True, highlight=False)
+
+
+class GraphReport:
+    """Prints on stderr what becomes of a graph while it starts and runs."""
+
+    def __init__(self) -> None:
+        self._console = console()
+
+    def event(self, event: Event) -> None:
+        """A node has changed; shown when that is a fault."""
+        if event.state in ("failed", "backoff"):
+            self._console.print(f"{event.node}: {event.state}: {event.detail}", style="red", markup=False)
+
+    def ready(self, seconds: float) -> None:
+        """All nodes are ready, after a time in s."""
+        self._console.print(f"[green]the graph is ready[/green] after {seconds:.1f} s")
 
 
 def as_text(table: Table, width: int | None = None) -> str:

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from openarm_bringup.calibration.source import store_in
 from openarm_bringup.commands.connect import Domain, Sets, join_graph, requires_node
-from openarm_bringup.outcome import Outcome, console
+from openarm_bringup.outcome import GraphReport, Outcome
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
     from openarm_interfaces.action import AutoCalibrate
 
-    from openarm_bringup.supervision.supervisor import Event
     from openarm_calibration.ros.client import AutoResult
 
 #: Of the node's parameter auto.poses.
@@ -132,19 +131,10 @@ def _running(camera: str, poses: int, save: bool, delay: bool, domain: int | Non
     return _outcome({camera: result}, None, None)
 
 
-class _Show:
+class _Show(GraphReport):
     """Prints what happens, on stderr."""
 
-    def __init__(self) -> None:
-        self._console = console()
-        self._last = ""
-
-    def event(self, event: Event) -> None:
-        if event.state in ("failed", "backoff"):
-            self._console.print(f"{event.node}: {event.state}: {event.detail}", style="red", markup=False)
-
-    def ready(self, seconds: float) -> None:
-        self._console.print(f"[green]the graph is ready[/green] after {seconds:.1f} s")
+    _last = ""
 
     def camera(self, camera: str) -> None:
         self._console.print(f"{camera}", style="bold")

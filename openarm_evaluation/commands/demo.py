@@ -6,12 +6,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from openarm_bringup.outcome import Outcome, console
+from openarm_bringup.outcome import GraphReport, Outcome
 from openarm_common.errors import Code
 from openarm_evaluation.demo.options import DemoOptions
 
 if TYPE_CHECKING:
-    from openarm_bringup.supervision.supervisor import Event
     from openarm_evaluation.demo.demo import DemoResult
     from openarm_evaluation.judging.trial import Step, Trial
 
@@ -33,24 +32,19 @@ def demo(*, options: DemoOptions = DEFAULTS, accept: float = 0.9) -> Outcome:
     return _outcome(run_demo(options, listeners), options.seeds, accept)
 
 
-class _Show:
+class _Show(GraphReport):
     """Prints what happens, on stderr."""
 
     def __init__(self, *, quiet_steps: bool) -> None:
-        self._console = console()
+        super().__init__()
         self._quiet = quiet_steps
         self._first_ns: int | None = None
-        self._rows = 0
 
     def note(self, note: str) -> None:
         self._console.print(note, style="yellow", markup=False)
 
-    def event(self, event: Event) -> None:
-        if event.state in ("failed", "backoff"):
-            self._console.print(f"{event.node}: {event.state}: {event.detail}", style="red", markup=False)
-
     def ready(self, seconds: float) -> None:
-        self._console.print(f"[green]the graph is ready[/green] after {seconds:.1f} s")
+        super().ready(seconds)
         if self._quiet:
             head = f"{'seed':>4} {'target':<17}{'arm':<6}{'att.':>4}  {'outcome':<18}{'mm':>6}{'sim s':>7}{'wall s':>7}"
         else:
