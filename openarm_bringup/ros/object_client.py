@@ -35,9 +35,10 @@ class DetectionListener(BackgroundNode):
         found: list[Detection] | None = None
         while not found and (left := deadline - time.monotonic()) > 0.0:
             try:
-                found = objects(self._received.get(timeout=left))
+                message = self._received.get(timeout=left)
             except queue.Empty:
                 break
+            found = [detection for detection in detections_from_msg(message) if detection.measured]
         if found is None:
             raise OpenArmError(
                 Code.TIMEOUT, f"no answer of the detector within {timeout:g} s; is the graph up, and its camera?"
@@ -55,8 +56,3 @@ def find(requests: Sequence[str], timeout: float = 20.0) -> list[Detection]:
         observed = listener.next(timeout)
     labels = [item.label for item in observed]
     return [resolve(parse(request, labels), observed) for request in requests]
-
-
-def objects(message: Detection3DArray) -> list[Detection]:
-    """Return the objects of a message that were measured."""
-    return [detection for detection in detections_from_msg(message) if detection.measured]
