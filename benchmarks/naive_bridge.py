@@ -51,7 +51,7 @@ class NaiveBridge(Node):
 
     def tick(self) -> None:
         """Step, publish, draw."""
-        self.world.step_tick()
+        self.world.step(self.world.steps_per_tick)
         state = self.world.read_joints()
         stamp = ns_to_stamp(state.t_ns)
         message = JointState(name=list(self.world.joint_names))

@@ -149,8 +149,9 @@ class Simulation:
         self._steps_left, self._stepped = steps, Future()
         return self._stepped
 
-    def restart(self) -> None:
-        """Continue after the world was reset or exchanged: forget goals and a divergence. For `call`."""
+    def restart(self, change: Callable[[], None]) -> None:
+        """Reset or exchange the world and continue: forget goals and a divergence. For `call`."""
+        change()
         self.fault = ""
         self._history.clear()
         self._end_stepping("the world was reset")

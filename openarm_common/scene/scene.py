@@ -206,13 +206,13 @@ class Scene(Config):
         """Return the object of that name.
 
         Raises:
-            OpenArmError: UNKNOWN_OBJECT, listing the objects there are.
+            OpenArmError: INVALID_ARGUMENT, listing the objects there are.
         """
         for item in self.objects:
             if item.name == name:
                 return item
         there = ", ".join(item.name for item in self.objects) or "none"
-        raise OpenArmError(Code.UNKNOWN_OBJECT, f"no object {name!r} in scene {self.name!r}; objects: {there}")
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {there}")
 
 
 ModelT = TypeVar("ModelT", Scene, SceneObject)

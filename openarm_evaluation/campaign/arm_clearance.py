@@ -17,9 +17,9 @@ from openarm_common.camera.cameras import load_cameras
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.campaign.robot import SimRobot
-from openarm_sim_bridge.world.compiled import start_qpos
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
+from openarm_sim_bridge.world.world import start_qpos
 
 #: Two arms that move simultaneously are never nearer than this, m.
 LEAST_CLEARANCE = 0.020

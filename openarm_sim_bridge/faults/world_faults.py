@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES
 from openarm_common.types import Array
 from openarm_sim_bridge.faults.faults import (
@@ -156,11 +155,7 @@ def nudge(world: World, parameters: ObjectNudged, seed: int) -> None:
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the objects there are; SCENE_INVALID, when it would overlap something.
     """
-    there = {readout.object.name: readout for readout in world.objects()}
-    if parameters.object not in there:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT, f"no object {parameters.object!r}; objects: {', '.join(there) or 'none'}"
-        )
+    T_world_object = world.objects()[world.object_index(parameters.object)].T_world_object
     heading = np.random.default_rng(seed).uniform(-math.pi, math.pi)
     shift = 1e-3 * parameters.mm * np.array([math.cos(heading), math.sin(heading), 0.0])
-    world.move_object(parameters.object, se3.make(None, shift) @ there[parameters.object].T_world_object)
+    world.move_object(parameters.object, se3.make(None, shift) @ T_world_object)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, TypeVar
 
@@ -23,7 +23,6 @@ from openarm_common.scene.scene import Scene, load_scene
 from openarm_common.types import Array
 from openarm_sim_bridge.ros.state_publisher import WORLD_FRAME
 from openarm_sim_bridge.simulation import Simulation
-from openarm_sim_bridge.world.compiled import CompiledWorld
 from openarm_sim_bridge.world.stage import Stage, with_object, without_object
 
 T = TypeVar("T")
@@ -109,11 +108,12 @@ class SimulationServer:
                 raise OpenArmError(Code.SCENE_INVALID, f"seed is {request.seed}, expected 0 or more")
             scene = load_scene(request.scene, request.seed) if request.scene else self._loaded
             joints, objects = self._start_of(request, scene)
+            world = self._simulation.world
             if scene == self._present:
-                between_ticks(self._simulation, lambda: self._reset_world(joints, objects))
+                change = partial(world.reset, joints, objects)
             else:
-                compiled = self._stage.compile(self._simulation.world, scene)
-                between_ticks(self._simulation, lambda: self._exchange(compiled, joints, objects))
+                change = partial(world.exchange, self._stage.compile(world, scene), joints, objects)
+            between_ticks(self._simulation, lambda: self._simulation.restart(change))
             self._loaded = self._present = scene
         self._on_scene(scene)
         return f"scene {scene.name!r} with {len(scene.objects)} objects"
@@ -168,15 +168,6 @@ class SimulationServer:
             between_ticks(self._simulation, lambda: self._simulation.world.move_object(request.name, T))
         return f"{request.name!r} is at ({', '.join(f'{v:.3f}' for v in T[:3, 3])}) m in {WORLD_FRAME}"
 
-    # --- between two ticks
-    def _reset_world(self, joints: Mapping[str, float], objects: Mapping[str, Array]) -> None:
-        self._simulation.world.reset(joints, objects)
-        self._simulation.restart()
-
-    def _exchange(self, compiled: CompiledWorld, joints: Mapping[str, float], objects: Mapping[str, Array]) -> None:
-        self._simulation.world.exchange(compiled, joints, objects)
-        self._simulation.restart()
-
 
 def _pose_of(name: str, pose: PoseStamped, scene: Scene) -> Array:
     """Return T_world_object of an object of a scene.
@@ -184,12 +175,10 @@ def _pose_of(name: str, pose: PoseStamped, scene: Scene) -> Array:
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the objects that exist; as `_pose_in_world`.
     """
-    there = {item.name: item for item in scene.objects}
-    if name not in there:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {', '.join(there) or 'none'}")
+    item = scene.object(name)
     T, on_table = _pose_in_world(pose, scene.table.top_z)
     if on_table:
-        T[2, 3] += 0.5 * there[name].size[2]
+        T[2, 3] += 0.5 * item.size[2]
     return T
 
 

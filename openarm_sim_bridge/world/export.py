@@ -15,8 +15,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES, RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Bytes
-from openarm_sim_bridge.world.compiled import start_qpos
 from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, robot_spec
+from openarm_sim_bridge.world.world import start_qpos
 
 Kind = Literal["urdf", "mjcf", "srdf"]
 #: Views: point looked at (m, world), distance (m), azimuth and elevation (degrees) as MuJoCo counts them.

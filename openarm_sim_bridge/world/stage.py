@@ -13,9 +13,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES, RobotDescription
 from openarm_common.scene.scene import Scene, SceneObject, parse_object
 from openarm_sim_bridge.control.trajectory import JointGroup
-from openarm_sim_bridge.world.compiled import CompiledWorld, TrackedObject
 from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, robot_spec
-from openarm_sim_bridge.world.world import World
+from openarm_sim_bridge.world.world import CompiledWorld, World
 
 
 class Stage:
@@ -61,7 +60,7 @@ class Stage:
         Raises:
             OpenArmError: CONFIG_INVALID, when the model can't be built.
         """
-        return World(self._spec(scene), joint_names=self.joint_names, home=self.home, objects=tracked(scene))
+        return World(self._spec(scene), joint_names=self.joint_names, home=self.home, objects=scene.objects)
 
     def compile(self, world: World, scene: Scene) -> CompiledWorld:
         """Compile another scene for `World.exchange` or `World.extend`; slow, changes nothing.
@@ -69,7 +68,7 @@ class Stage:
         Raises:
             OpenArmError: CONFIG_INVALID, when the model can't be built.
         """
-        return world.compile(self._spec(scene), tracked(scene))
+        return world.compile(self._spec(scene), scene.objects)
 
     def posture(self, keyframe: str) -> dict[str, float]:
         """Return joint positions of a keyframe, rad: a state of that name in the SRDF of either arm, else home.
@@ -93,22 +92,14 @@ class Stage:
         return JointGroup(names, lower, upper, self._description.velocity_limits(names))
 
 
-def tracked(scene: Scene) -> tuple[TrackedObject, ...]:
-    """Return the objects of a scene whose true poses are reported."""
-    return tuple(TrackedObject(item.name, item.label, item.size) for item in scene.objects)
-
-
 def without_object(scene: Scene, name: str) -> Scene:
     """Return the scene without an object.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the objects that exist.
     """
-    rest = tuple(item for item in scene.objects if item.name != name)
-    if len(rest) == len(scene.objects):
-        names = ", ".join(item.name for item in scene.objects) or "none"
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {names}")
-    return scene.model_copy(update={"objects": rest})
+    gone = scene.object(name)
+    return scene.model_copy(update={"objects": tuple(item for item in scene.objects if item is not gone)})
 
 
 def with_object(scene: Scene, data: Mapping[str, Any]) -> Scene:

@@ -6,7 +6,8 @@ Frame `world` (x forward, y left, z up, m). Joint vectors are in the order of `W
 
 Commands go to the actuators (`data.ctrl`) and to nothing else; `qpos` is written in one place, `World._place`, which
 is used when the world is made, reset or exchanged. Simulated time is an integer number of nanoseconds and never goes
-back, not even when the world is reset.
+back, not even when the world is reset. Free objects shift the addresses of joints in `qpos` and `qvel`, so every
+address is looked up by name, never assumed.
 """
 
 from __future__ import annotations
@@ -16,12 +17,15 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene.scene import SceneObject
 from openarm_common.types import Array
-from openarm_sim_bridge.world.compiled import CompiledWorld, TrackedObject, compile_world, joint_slices, start_qpos
 from openarm_sim_bridge.world.touch import contact_wrench, wrist_wrench
+
+Index = NDArray[np.intp]
 
 _DIVERGED = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
@@ -31,6 +35,22 @@ _DIVERGED = (
 )
 #: Something that is put into a running world may touch what is there by this much, m.
 _OVERLAP_ALLOWED = 1e-3
+
+
+@dataclass(frozen=True)
+class CompiledWorld:
+    """Model and addresses; joint vectors (n,) are in the order of the requested actuated joints."""
+
+    model: mujoco.MjModel
+    timestep_ns: int
+    qpos: Index  # (n,) address of each actuated joint in qpos
+    dof: Index  # (n,) address in qvel
+    actuator: Index  # (n,) index in ctrl
+    effort_limit: Array  # (n,) N m or N, infinite where there is none
+    start_qpos: Array  # (nq,) home posture, objects at their start
+    objects: tuple[SceneObject, ...]
+    object_qpos: tuple[int, ...]
+    object_dof: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -47,7 +67,7 @@ class JointReadout:
 class ObjectReadout:
     """Where a tracked object is: pose, linear (m/s) and angular (rad/s) velocity (3,) in the frame `world`."""
 
-    object: TrackedObject
+    object: SceneObject
     T_world_object: Array
     linear: Array
     angular: Array
@@ -74,7 +94,7 @@ class World:
         period_ns: Length of a control tick.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, as `compile_world`.
+        OpenArmError: CONFIG_INVALID, as `compile`.
     """
 
     def __init__(
@@ -83,7 +103,7 @@ class World:
         *,
         joint_names: Sequence[str],
         home: Mapping[str, float],
-        objects: Sequence[TrackedObject] = (),
+        objects: Sequence[SceneObject] = (),
         period_ns: int = 10_000_000,
     ) -> None:
         self.joint_names = tuple(joint_names)
@@ -103,14 +123,6 @@ class World:
     def steps_per_tick(self) -> int:
         """Physics steps of a control tick."""
         return self.period_ns // self._compiled.timestep_ns
-
-    def step_tick(self) -> None:
-        """Advance by one control tick.
-
-        Raises:
-            OpenArmError: INTERNAL, when the physics diverged.
-        """
-        self.step(self.steps_per_tick)
 
     def step(self, steps: int) -> None:
         """Advance by a number of physics steps.
@@ -156,19 +168,6 @@ class World:
         """Return the effort limits (n,) of the actuators in the model, N m or N; infinite where there is none."""
         return self._compiled.effort_limit.copy()
 
-    def body_pose(self, name: str) -> Array:
-        """Return T_world_body, (4, 4), at the present time. For tests and judges.
-
-        Raises:
-            OpenArmError: INVALID_ARGUMENT, naming the bodies that exist.
-        """
-        body = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, name)
-        if body < 0:
-            known = ", ".join(self.model.body(b).name for b in range(self.model.nbody))
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"no body {name!r} in the world; bodies: {known}")
-        mujoco.mj_kinematics(self.model, self.data)  # after a step, xpos is that of the step's beginning
-        return se3.make(self.data.xmat[body].reshape(3, 3), self.data.xpos[body])
-
     def objects(self) -> tuple[ObjectReadout, ...]:
         """Return pose and twist of every tracked object: ground truth, for judges alone, not for controllers."""
         c, d = self._compiled, self.data
@@ -208,7 +207,7 @@ class World:
         c, d = self._compiled, self.data
         start = start_qpos(self.model, self._home | dict(joints or {}))
         for name, T in (objects or {}).items():
-            self._set_free_pose(start, c.object_qpos[self._object(name)], T)
+            self._set_free_pose(start, c.object_qpos[self.object_index(name)], T)
         ctrl = np.zeros(self.model.nu)
         ctrl[c.actuator] = start[c.qpos]
         before = d.qpos.copy(), d.qvel.copy(), d.ctrl.copy()
@@ -220,14 +219,42 @@ class World:
         self._effort_limits.clear()
         self._apply_effort_limits()
 
-    def compile(self, spec: mujoco.MjSpec, objects: Sequence[TrackedObject]) -> CompiledWorld:
-        """Compile a world for `exchange`. Slow (tens of ms), changes nothing, may run in any thread.
+    def compile(self, spec: mujoco.MjSpec, objects: Sequence[SceneObject]) -> CompiledWorld:
+        """Compile a world for `exchange` or `extend`. Slow (tens of ms), changes nothing, may run in any thread.
+
+        Args:
+            spec: The model. Its automatic reset is switched off: a diverged simulation that silently restarts would be
+                a teleport; the world reports it instead.
+            objects: Free bodies to report, by their body names.
 
         Raises:
-            OpenArmError: CONFIG_INVALID, as `compile_world`.
+            OpenArmError: CONFIG_INVALID, when MuJoCo refuses the model, the tick is not a whole number of time steps,
+                or a joint, actuator or body is missing.
         """
-        return compile_world(
-            spec, joint_names=self.joint_names, home=self._home, objects=objects, period_ns=self.period_ns
+        spec.option.disableflags = int(spec.option.disableflags) | int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            raise OpenArmError(Code.CONFIG_INVALID, f"MuJoCo refuses the model: {error}") from error
+        try:
+            joints = [model.joint(name).id for name in self.joint_names]
+            free = [_free_joint(model, item.name) for item in objects]
+            start = start_qpos(model, self._home)
+        except KeyError as error:  # MuJoCo's message lists the valid names
+            raise OpenArmError(Code.CONFIG_INVALID, f"the model lacks a joint or body: {error.args[0]}") from error
+        actuator = _actuators(model, self.joint_names, joints)
+        limited = model.actuator_forcelimited[actuator].astype(bool)
+        return CompiledWorld(
+            model=model,
+            timestep_ns=_timestep_ns(model.opt.timestep, self.period_ns),
+            qpos=model.jnt_qposadr[joints].astype(np.intp),
+            dof=model.jnt_dofadr[joints].astype(np.intp),
+            actuator=actuator,
+            effort_limit=np.where(limited, model.actuator_forcerange[actuator, 1], np.inf),
+            start_qpos=start,
+            objects=tuple(objects),
+            object_qpos=tuple(int(model.jnt_qposadr[j]) for j in free),
+            object_dof=tuple(int(model.jnt_dofadr[j]) for j in free),
         )
 
     def exchange(
@@ -262,9 +289,9 @@ class World:
             if old_joint < 0:
                 continue
             known.add(int(self.model.jnt_bodyid[joint]))
-            q, v = joint_slices(self.model, joint)
-            old_q, old_v = joint_slices(old_model, old_joint)
-            qpos[q], qvel[v] = old.qpos[old_q], old.qvel[old_v]
+            q, v, state = self.model.jnt_qposadr[joint], self.model.jnt_dofadr[joint], old.joint(old_joint)
+            qpos[q : q + len(state.qpos)] = state.qpos
+            qvel[v : v + len(state.qvel)] = state.qvel
         ctrl[compiled.actuator] = old.ctrl[before.actuator]
         self._apply_effort_limits()
         self._place(qpos, qvel, ctrl)
@@ -282,7 +309,7 @@ class World:
                 (the object then stays where it was).
         """
         c, d = self._compiled, self.data
-        at = self._object(name)
+        at = self.object_index(name)
         q, v = c.object_qpos[at], c.object_dof[at]
         before = d.qpos.copy(), d.qvel.copy(), d.ctrl.copy()
         qpos, qvel, ctrl = (part.copy() for part in before)
@@ -294,8 +321,13 @@ class World:
             self._place(*before)
             raise OpenArmError(Code.SCENE_INVALID, overlap)
 
-    def _object(self, name: str) -> int:
-        names = [tracked.name for tracked in self._compiled.objects]
+    def object_index(self, name: str) -> int:
+        """Return the place of a tracked object in `objects`.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, naming the objects that exist.
+        """
+        names = [item.name for item in self._compiled.objects]
         if name not in names:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {', '.join(names) or 'none'}")
         return names.index(name)
@@ -338,3 +370,51 @@ class World:
             limit = min(self._effort_limits.get(joint, np.inf), float(self._compiled.effort_limit[joint]))
             if np.isfinite(limit):
                 self.model.actuator_forcerange[actuator] = (-limit, limit)
+
+
+def _timestep_ns(timestep: float, period_ns: int) -> int:
+    timestep_ns = round(timestep * 1e9)
+    if timestep_ns <= 0 or period_ns % timestep_ns or abs(timestep_ns - timestep * 1e9) > 1e-3:
+        raise OpenArmError(
+            Code.CONFIG_INVALID,
+            f"a control tick of {period_ns / 1e6:g} ms is not a whole number of physics steps of {timestep * 1e3:g} ms;"
+            " choose a time step that divides it, for example 2 or 1 ms",
+        )
+    return timestep_ns
+
+
+def _actuators(model: mujoco.MjModel, names: Sequence[str], joints: Sequence[int]) -> Index:
+    by_joint = {
+        int(model.actuator_trnid[i, 0]): i
+        for i in range(model.nu)
+        if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
+    }
+    idle = [name for name, joint in zip(names, joints, strict=True) if joint not in by_joint]
+    if idle:
+        raise OpenArmError(Code.CONFIG_INVALID, f"the model has no actuator for the joints {', '.join(idle)}")
+    return np.array([by_joint[joint] for joint in joints], dtype=np.intp)
+
+
+def _free_joint(model: mujoco.MjModel, body_name: str) -> int:
+    joint = int(model.body(body_name).jntadr[0])
+    if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
+        raise OpenArmError(Code.CONFIG_INVALID, f"object {body_name!r} is not a body with a free joint in the model")
+    return joint
+
+
+def start_qpos(model: mujoco.MjModel, home: Mapping[str, float]) -> Array:
+    """Return the configuration (nq,) with some joints at given positions, and those coupled to them.
+
+    Raises:
+        KeyError: When a joint is missing.
+    """
+    start = model.qpos0.copy()
+    for name, value in home.items():
+        start[model.joint(name).qposadr[0]] = value
+    for equality in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+        follower, leader = int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])
+        if leader >= 0:
+            f, x = model.jnt_qposadr[follower], model.jnt_qposadr[leader]
+            offset = np.polynomial.polynomial.polyval(start[x] - model.qpos0[x], model.eq_data[equality, :5])
+            start[f] = model.qpos0[f] + offset
+    return start

@@ -131,6 +131,12 @@ class Bench:
         assert handle.accepted
         return self.ros.result(future, 15.0)
 
+    def tcp_pose(self) -> np.ndarray:
+        """T_world_tcp, (4, 4), of the simulated arm now."""
+        world = self.node._simulation.world
+        joints = dict(zip(world.joint_names, world.read_joints().position, strict=True))
+        return self.node.description.link_pose(self.TCP, joints)
+
     def posture(self, residual: Callable[[np.ndarray], list[float]]) -> list[float]:
         """Joint positions near home that make a function of the TCP's pose (4, 4) zero."""
         from scipy.optimize import least_squares

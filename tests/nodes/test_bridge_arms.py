@@ -138,7 +138,7 @@ def test_a_blocked_arm_ends_with_its_tolerance_and_holds(bench) -> None:
     assert answer.result.error_code == FollowJointTrajectory.Result.PATH_TOLERANCE_VIOLATED
     assert "openarm_right_joint" in answer.result.error_string
     bench.spin_sim(0.5)
-    assert bench.node._simulation.world.body_pose(bench.TCP)[2, 3] > 0.38
+    assert bench.tcp_pose()[2, 3] > 0.38
     efforts = np.abs(bench.joints[-1].effort)
     assert efforts.max() < 5.0  # it does not go on pushing
 

@@ -36,7 +36,7 @@ def test_a_gripper_stalls_on_an_object_and_says_so(bench) -> None:
     bench.ros.result(bench.follow(bench.goal((1.5, level)))[1], 15.0)
     assert bench.grip(0.016).result.reached_goal
     assert bench.call(SetPause, "/sim/set_pause", paused=True).success
-    T = bench.node._simulation.world.body_pose(bench.TCP)
+    T = bench.tcp_pose()
     pose = PoseStamped()
     pose.header.frame_id = "world"
     pose.pose.position = point(T[:3, 3] - 0.017 * T[:3, 2])

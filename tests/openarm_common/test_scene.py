@@ -181,7 +181,7 @@ def test_unknown_scenes_and_objects_list_what_there_is(tmp_path: Path) -> None:
     assert caught.value.code is Code.SCENE_INVALID
     with pytest.raises(OpenArmError, match=r"no object 'cup'.*red_cube, green_cylinder, blue_can") as caught:
         load_scene("demo").object("cup")
-    assert caught.value.code is Code.UNKNOWN_OBJECT
+    assert caught.value.code is Code.INVALID_ARGUMENT
 
 
 def test_scenes_are_frozen() -> None:

@@ -160,11 +160,7 @@ def test_a_diverged_world_stands_until_it_is_reset(
         assert len(data["t_ns"]) == len(data["position"]) == len(data["target"]) > 30
         assert np.all(np.diff(data["t_ns"]) == 10_000_000)
 
-    def reset() -> None:
-        bench.world.reset()
-        bench.simulation.restart()
-
-    bench.simulation.call(reset).result(1.0)
+    bench.simulation.call(lambda: bench.simulation.restart(bench.world.reset)).result(1.0)
     t_ns = bench.world.t_ns
     bench.wait(lambda: bench.t_ns > t_ns + 50_000_000)
     assert np.all(np.isfinite(bench.states[-1][1].position))
@@ -232,7 +228,7 @@ def test_commands_for_a_joint_that_follows_a_goal_are_told() -> None:
     controller.command(command)
     for _ in range(150):
         world.set_targets(controller.update(world.read_joints(), world.period_ns))
-        world.step_tick()
+        world.step(world.steps_per_tick)
     np.testing.assert_allclose(world.read_joints().position, [0.6, 0.02], atol=0.01)
 
 
@@ -249,7 +245,7 @@ def test_stale_commands_hold() -> None:
             if i == 0 or (again and i % 20 == 0):
                 controller.command(controller.check_command(["j1", "f1"], [0.9, 0.04]))
             world.set_targets(controller.update(world.read_joints(), world.period_ns))
-            world.step_tick()
+            world.step(world.steps_per_tick)
             out.append(float(world.read_joints().position[0]))
         return out
 
@@ -269,7 +265,7 @@ def test_a_trajectory_needs_no_stream() -> None:
     arm.start(arm.check(Trajectory(("j1",), np.array([1.5]), np.array([[0.6]]))), 0, np.zeros(1), lambda _o: None)
     for _ in range(180):
         world.set_targets(controller.update(world.read_joints(), world.period_ns))
-        world.step_tick()
+        world.step(world.steps_per_tick)
     assert world.read_joints().position[0] == pytest.approx(0.6, abs=0.01)
 
 

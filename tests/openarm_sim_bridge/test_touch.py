@@ -76,7 +76,7 @@ def test_the_robot_has_the_sensors() -> None:
     stage = Stage(RobotDescription.load(), load_cameras(), None, PhysicsConfig())
     world = stage.world(load_scene("empty"))
     for _ in range(30):
-        world.step_tick()
+        world.step(world.steps_per_tick)
     for side in ("left", "right"):
         model, body = world.model, world.model.body(hand_link(side))
         force, _ = world.wrist_wrench(hand_link(side))

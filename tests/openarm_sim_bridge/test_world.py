@@ -13,7 +13,7 @@ import pytest
 import openarm_sim_bridge
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.world.compiled import TrackedObject
+from openarm_common.scene.scene import SceneObject
 from openarm_sim_bridge.world.world import World
 
 BALL = """<body name="ball" pos="0.5 0 {z}"><freejoint name="ball"/>
@@ -40,14 +40,17 @@ MODEL = """
 <position name="a" joint="shoulder" kp="200" kv="3" forcerange="-40 40"/></actuator></mujoco>"""
 JOINTS = ("shoulder", "elbow", "finger")
 HOME = {"shoulder": -0.3, "elbow": 0.8, "finger": 0.02}
-BALL_OBJECT = TrackedObject("ball", "red", (0.1, 0.1, 0.1))
+BALL_OBJECT, CUBE_OBJECT, UPPER_OBJECT = (
+    SceneObject(name=name, shape="box", size=(0.1, 0.1, 0.1), color="red", position=(0.0, 0.0))
+    for name in ("ball", "cube", "upper")
+)
 
 
 def spec(extra: str = BALL.format(z=0.05), timestep: float = 0.002) -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(MODEL.format(extra=extra, timestep=timestep))
 
 
-def make(extra: str = BALL.format(z=0.05), objects: tuple[TrackedObject, ...] = (BALL_OBJECT,), **kwargs) -> World:
+def make(extra: str = BALL.format(z=0.05), objects: tuple[SceneObject, ...] = (BALL_OBJECT,), **kwargs) -> World:
     return World(spec(extra), joint_names=JOINTS, home=HOME, objects=objects, **kwargs)
 
 
@@ -67,7 +70,7 @@ def test_a_tick_is_ten_milliseconds_whatever_the_time_step(timestep: float, step
     world = World(spec(timestep=timestep), joint_names=JOINTS, home=HOME)
     assert world.steps_per_tick == steps
     for _ in range(7):
-        world.step_tick()
+        world.step(world.steps_per_tick)
     assert world.t_ns == 70_000_000
     assert world.data.time == pytest.approx(0.07)
 
@@ -162,14 +165,14 @@ def test_reset_puts_everything_back_and_time_goes_on() -> None:
     world = make(BALL.format(z=0.3))
     world.set_targets(np.array([1.0, 0.0, 0.0]))
     for _ in range(20):
-        world.step_tick()
+        world.step(world.steps_per_tick)
     t_ns = world.t_ns
     world.reset()
     assert world.t_ns == t_ns
     np.testing.assert_allclose(world.read_joints().position, [-0.3, 0.8, 0.02])
     np.testing.assert_allclose(world.read_joints().velocity, 0.0)
     assert world.objects()[0].T_world_object[2, 3] == pytest.approx(0.3)
-    world.step_tick()
+    world.step(world.steps_per_tick)
     assert world.t_ns == t_ns + 10_000_000
     np.testing.assert_allclose(world.read_joints().position, [-0.3, 0.8, 0.02], atol=0.05)
 
@@ -192,10 +195,10 @@ def test_a_reset_may_start_elsewhere_and_the_next_one_is_at_home_again() -> None
 def test_a_start_that_overlaps_leaves_the_world_as_it_was() -> None:
     world = make()
     for _ in range(3):
-        world.step_tick()
+        world.step(world.steps_per_tick)
     model, qpos, qvel = world.model, world.data.qpos.copy(), world.data.qvel.copy()
     cube = CUBE.format(pos="0 1 .05") + BALL.format(z=0.05)
-    other = world.compile(spec(extra=cube), (TrackedObject("cube", "blue", (0.06,) * 3), BALL_OBJECT))
+    other = world.compile(spec(extra=cube), (CUBE_OBJECT, BALL_OBJECT))
     into_the_floor, into_the_ball = se3.make(None, (0.5, 0.0, 0.01)), se3.make(None, (0.5, 0.02, 0.05))
     with pytest.raises(OpenArmError, match="'ball' would overlap 'world' by 40 mm"):
         world.reset(objects={"ball": into_the_floor})
@@ -210,7 +213,7 @@ def test_a_start_that_overlaps_leaves_the_world_as_it_was() -> None:
 
 def test_exchange_loads_another_world_and_time_goes_on() -> None:
     world = make()
-    world.step_tick()
+    world.step(world.steps_per_tick)
     world.exchange(world.compile(spec(extra=""), ()))
     assert world.t_ns == 10_000_000
     assert world.objects() == ()
@@ -222,12 +225,10 @@ def test_extend_keeps_the_state_of_everything_that_was_there() -> None:
     target = np.array([0.4, 0.1, 0.03])
     world.set_targets(target)
     for _ in range(30):
-        world.step_tick()
+        world.step(world.steps_per_tick)
     before, pose, t_ns = world.read_joints(), world.objects()[0].T_world_object, world.t_ns
     cube = CUBE.format(pos="0 1 .05")
-    world.extend(
-        world.compile(spec(extra=cube + BALL.format(z=0.05)), (TrackedObject("cube", "blue", (0.06,) * 3), BALL_OBJECT))
-    )
+    world.extend(world.compile(spec(extra=cube + BALL.format(z=0.05)), (CUBE_OBJECT, BALL_OBJECT)))
     after = world.read_joints()
     np.testing.assert_array_equal(after.position, before.position)
     np.testing.assert_array_equal(after.velocity, before.velocity)
@@ -239,7 +240,7 @@ def test_extend_keeps_the_state_of_everything_that_was_there() -> None:
 
 def test_extend_refuses_what_overlaps_and_leaves_the_world_as_it_was() -> None:
     world = make()
-    world.step_tick()
+    world.step(world.steps_per_tick)
     model, position = world.model, world.read_joints().position
     cube = CUBE.format(pos="0.5 0.06 .05")
     with pytest.raises(OpenArmError, match=r"'cube' would overlap 'ball' by \d+ mm at \(0\.5") as caught:
@@ -256,14 +257,14 @@ def test_a_diverged_simulation_is_reported_and_a_reset_mends_it(
     world = make()
     world.data.qvel[8] = np.nan
     with pytest.raises(OpenArmError, match=r"diverged at 0\.010 s") as caught:
-        world.step_tick()
+        world.step(world.steps_per_tick)
     assert caught.value.code is Code.INTERNAL
     world.reset()
-    world.step_tick()
+    world.step(world.steps_per_tick)
     assert np.all(np.isfinite(world.read_joints().position))
     world.set_targets(np.array([np.nan, 0.0, 0.0]))
     with pytest.raises(OpenArmError, match="diverged"):
-        world.step_tick()
+        world.step(world.steps_per_tick)
 
 
 @pytest.mark.parametrize(
@@ -274,22 +275,10 @@ def test_a_diverged_simulation_is_reported_and_a_reset_mends_it(
             "lacks a joint or body: Invalid name 'wrist'. Valid names: .*ball",
         ),
         ({"joint_names": ("mimic",)}, "no actuator for the joints mimic"),
-        ({"objects": (TrackedObject("upper", "x", (1, 1, 1)),)}, "'upper' is not a body with a free joint"),
+        ({"objects": (UPPER_OBJECT,)}, "'upper' is not a body with a free joint"),
         ({"home": {"knee": 0.0}}, "lacks a joint or body: Invalid name 'knee'"),
     ],
 )
 def test_what_the_model_lacks_is_named(kwargs: dict, message: str) -> None:
     with pytest.raises(OpenArmError, match=message):
         World(spec(), **({"joint_names": JOINTS, "home": HOME} | kwargs))
-
-
-def test_body_pose_is_that_of_now_and_unknown_bodies_are_named() -> None:
-    world = make()
-    world.set_targets(np.array([1.0, 0.0, 0.0]))
-    world.step_tick()
-    fresh = mujoco.MjData(world.model)
-    fresh.qpos[:] = world.data.qpos
-    mujoco.mj_kinematics(world.model, fresh)
-    np.testing.assert_array_equal(world.body_pose("lower")[:3, 3], fresh.body("lower").xpos)
-    with pytest.raises(OpenArmError, match="no body 'hand' in the world; bodies: world, ball, upper"):
-        world.body_pose("hand")
