@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -21,6 +21,9 @@ T = TypeVar("T")
 
 #: Stamps of which some streams have come and others not.
 _INCOMPLETE = 5
+
+
+_NOWHERE = Posture(np.eye(4), {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +40,7 @@ class Frame(Generic[T]):
     t_ns: int
     frame_id: str
     items: Mapping[str, T]
-    posture: Posture
-
-
-@dataclass(frozen=True, eq=False)
-class _Waiting(Generic[T]):
-    t_ns: int
-    frame_id: str
-    items: dict[str, T]
-    since: float
+    posture: Posture = _NOWHERE
 
 
 class FrameStream(Generic[T]):
@@ -88,12 +83,13 @@ class FrameStream(Generic[T]):
         self._last_ns: int | None = None
         self.received: set[str] = set()
         self._partial: dict[int, dict[str, T]] = {}
-        self._waiting: deque[_Waiting[T]] = deque()
+        #: With the moment when each arrived, s.
+        self._waiting: deque[tuple[Frame[T], float]] = deque()
 
     @property
     def waiting_ns(self) -> int | None:
         """Stamp of the newest frame that waits; None without one."""
-        return self._waiting[-1].t_ns if self._waiting else None
+        return self._waiting[-1][0].t_ns if self._waiting else None
 
     @property
     def silent(self) -> list[str]:
@@ -130,25 +126,25 @@ class FrameStream(Generic[T]):
             self.counts["incomplete"] += sum(1 for t in self._partial if t < t_ns)
             # later stamps are kept unless time went back, in which case they fall to the limit below
             self._partial = {t: partial for t, partial in self._partial.items() if t > t_ns}
-            self._enqueue(_Waiting(t_ns, frame_id, items, now))
+            self._enqueue(Frame(t_ns, frame_id, items), now)
         while len(self._partial) > _INCOMPLETE:
             # the first in order of arrival, not of stamps: a restarted simulation starts again from zero
             del self._partial[next(iter(self._partial))]
             self.counts["incomplete"] += 1
 
-    def _enqueue(self, frame: _Waiting[T]) -> None:
+    def _enqueue(self, frame: Frame[T], now: float) -> None:
         # a stamp before the last one is a restarted simulation, not a frame that came too early
         if self._last_ns is not None and 0 <= frame.t_ns - self._last_ns < self._period_ns:
             return
         self._last_ns = frame.t_ns
-        if self._waiting and self._waiting[-1].t_ns == frame.t_ns:
+        if self._waiting and self._waiting[-1][0].t_ns == frame.t_ns:
             return
         if len(self._waiting) == self._capacity:
             self.counts["overrun"] += 1
-            if self._pending(self._waiting[0], frame.since):
+            if self._pending(*self._waiting[0], now):
                 return
             self._waiting.popleft()
-        self._waiting.append(frame)
+        self._waiting.append((frame, now))
 
     def take(self, now: float) -> Frame[T] | None:
         """Take the newest frame whose posture is known; older ones are given up. None while all of them wait.
@@ -161,9 +157,9 @@ class FrameStream(Generic[T]):
         """
         refusal: OpenArmError | None = None
         for i in range(len(self._waiting) - 1, -1, -1):
-            frame = self._waiting[i]
+            frame, since = self._waiting[i]
             try:
-                posture = self._posture(frame, now)
+                posture = self._posture(frame, since, now)
             except OpenArmError as error:
                 del self._waiting[i]
                 early = error.code is Code.STALE_DATA and self._tracker is not None and self._tracker.starting(now)
@@ -176,7 +172,7 @@ class FrameStream(Generic[T]):
                 self._waiting.popleft()
             self.counts["superseded"] += i
             self.counts["taken"] += 1
-            return Frame(frame.t_ns, frame.frame_id, frame.items, posture)
+            return replace(frame, posture=posture)
         if refusal is not None:
             raise refusal
         return None
@@ -188,11 +184,11 @@ class FrameStream(Generic[T]):
         self.received.clear()
         self._last_ns = None
 
-    def _pending(self, frame: _Waiting[T], now: float) -> bool:
+    def _pending(self, frame: Frame[T], since: float, now: float) -> bool:
         name = self._pose_of or frame.frame_id
-        return self._tracker is not None and self._tracker.pending(name, frame.t_ns, frame.since, now, self._joints)
+        return self._tracker is not None and self._tracker.pending(name, frame.t_ns, since, now, self._joints)
 
-    def _posture(self, frame: _Waiting[T], now: float) -> Posture | None:
+    def _posture(self, frame: Frame[T], since: float, now: float) -> Posture | None:
         if self._tracker is None:
-            return Posture(np.eye(4), {})
-        return self._tracker.posture(self._pose_of or frame.frame_id, frame.t_ns, frame.since, now, self._joints)
+            return frame.posture
+        return self._tracker.posture(self._pose_of or frame.frame_id, frame.t_ns, since, now, self._joints)

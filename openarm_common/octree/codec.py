@@ -105,7 +105,7 @@ class OctreeEncoder:
         if not self._values.size:
             self._values = np.zeros(self._states.size, np.float32)
         values = [self._view(self._values, level) for level in range(DEPTH + 1)]
-        kernels.start_values(log_odds, self._levels[0], values[0])
+        self._levels[0][...], values[0][...] = ~np.isnan(log_odds), log_odds
         for level in range(DEPTH):
             above = level + 1
             kernels.merge_values(

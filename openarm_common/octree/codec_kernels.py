@@ -124,25 +124,8 @@ def read_states(data: Bytes, leaves: Ints) -> tuple[int, int, int]:
 
 
 @njit(cache=True, nogil=True)
-def start_values(log_odds: Floats, states: Bytes, values: Floats) -> None:
-    """Fill level 0 of the tree with values: cells (nx, ny, nz) with NaN for unknown; state 1 is a leaf.
-
-    Args:
-        log_odds: (nx, ny, nz), NaN for unknown.
-        states: (nx, ny, nz), filled.
-        values: (nx, ny, nz), filled.
-    """
-    for i in range(log_odds.shape[0]):
-        for j in range(log_odds.shape[1]):
-            for k in range(log_odds.shape[2]):
-                v = log_odds[i, j, k]
-                values[i, j, k] = v
-                states[i, j, k] = 0 if np.isnan(v) else 1
-
-
-@njit(cache=True, nogil=True)
 def merge_values(below: Bytes, values: Floats, above: Bytes, above_values: Floats, shift: Ints) -> None:
-    """Merge as `merge_states`, for leaves (state 1) with a value; an inner node has the largest one.
+    """Merge as `merge_states`, for leaves (state 1; 0 is unknown) with a value; an inner node has the largest one.
 
     Args:
         below: (2 nx, 2 ny, 2 nz) states.

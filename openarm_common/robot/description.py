@@ -182,24 +182,6 @@ class RobotDescription:
                 poses[joint.child] = poses[joint.parent] @ self._joint_pose(joint, q)
         return {link: poses[link] for link in self.links}
 
-    def group_joints(self, group: str) -> tuple[str, ...]:
-        """Return the movable joints of an SRDF group: listed ones, of chains and of subgroups, without passive ones.
-
-        Raises:
-            OpenArmError: INVALID_ARGUMENT, listing the groups there are.
-        """
-        groups = self.semantics.groups
-        if group not in groups:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"no group {group!r}; groups: {', '.join(groups) or 'none'}")
-        names = list(groups[group].joints)
-        for base, tip in groups[group].chains:
-            above = {joint.name for joint in self.chain(base)}
-            names += [joint.name for joint in self.chain(tip) if joint.name not in above]
-        for subgroup in groups[group].groups:
-            names += self.group_joints(subgroup)
-        passive = self.semantics.passive_joints
-        return tuple(n for n in dict.fromkeys(names) if self.joints[n].type != "fixed" and n not in passive)
-
     def group_state(self, group: str, name: str) -> dict[str, float]:
         """Return the joint positions of a named posture, for example group "left_arm", state "home".
 
@@ -250,15 +232,8 @@ def _check_semantics(semantics: Semantics, links: Mapping[str, Link], joints: Ma
     for pair in semantics.allowed_collisions:
         for link in pair - links.keys():
             raise fault(f"SRDF disables collisions of link {link!r}, which the URDF does not have")
-    named = {joint for group in semantics.groups.values() for joint in group.joints} | semantics.passive_joints
-    named |= {joint for state in semantics.states.values() for joint in state}
-    for joint in sorted(named - joints.keys()):
+    for joint in sorted({joint for state in semantics.states.values() for joint in state} - joints.keys()):
         raise fault(f"SRDF speaks of joint {joint!r}, which the URDF does not have")
-    for group in semantics.groups.values():
-        for link in (link for chain in group.chains for link in chain if link not in links):
-            raise fault(f"SRDF group {group.name!r} speaks of link {link!r}, which the URDF does not have")
-        for other in (other for other in group.groups if other not in semantics.groups):
-            raise fault(f"SRDF group {group.name!r} speaks of group {other!r}, which does not exist")
     for group_name, state in semantics.states:
         if group_name not in semantics.groups:
             raise fault(f"SRDF state {state!r} belongs to group {group_name!r}, which does not exist")

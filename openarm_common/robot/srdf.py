@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read SRDF text into frozen data: groups, named postures, and the collisions that are not checked."""
+"""Read SRDF text into frozen data: named postures, and the collisions that are not checked."""
 
 from __future__ import annotations
 
@@ -12,23 +12,12 @@ from openarm_common.robot.xml_text import attribute, floats, parse_root, unique
 
 
 @dataclass(frozen=True)
-class Group:
-    """A planning group of the SRDF: joints by name, chains (base, tip), and other groups."""
-
-    name: str
-    joints: tuple[str, ...]
-    chains: tuple[tuple[str, str], ...]
-    groups: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class Semantics:
     """What the SRDF adds to the URDF. `states` is (group, state) → joint → position."""
 
-    groups: Mapping[str, Group]
+    groups: frozenset[str]
     states: Mapping[tuple[str, str], Mapping[str, float]]
     allowed_collisions: frozenset[frozenset[str]]
-    passive_joints: frozenset[str]
 
 
 def parse_srdf(text: str) -> Semantics:
@@ -38,16 +27,7 @@ def parse_srdf(text: str) -> Semantics:
         OpenArmError: CONFIG_INVALID, when it is not XML or an attribute is missing.
     """
     root = parse_root(text, "SRDF") if text else ET.Element("robot")
-    groups: dict[str, Group] = {}
-    for element in root.findall("group"):
-        name = attribute(element, "name")
-        unique("group", name, groups)
-        groups[name] = Group(
-            name=name,
-            joints=tuple(attribute(e, "name") for e in element.findall("joint")),
-            chains=tuple((attribute(e, "base_link"), attribute(e, "tip_link")) for e in element.findall("chain")),
-            groups=tuple(attribute(e, "name") for e in element.findall("group")),
-        )
+    groups = frozenset(attribute(e, "name") for e in root.findall("group"))
     states: dict[tuple[str, str], Mapping[str, float]] = {}
     for element in root.findall("group_state"):
         key = (attribute(element, "group"), attribute(element, "name"))
@@ -58,5 +38,4 @@ def parse_srdf(text: str) -> Semantics:
     pairs = frozenset(
         frozenset((attribute(e, "link1"), attribute(e, "link2"))) for e in root.findall("disable_collisions")
     )
-    passive = frozenset(attribute(e, "name") for e in root.findall("passive_joint"))
-    return Semantics(MappingProxyType(groups), MappingProxyType(states), pairs, passive)
+    return Semantics(groups, MappingProxyType(states), pairs)

@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import mujoco
-import numpy as np
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
@@ -140,12 +139,9 @@ class StateSender:
         socket.send_fds(self._end, [pickle.dumps(message)], files)
 
     def _send_model(self, model: mujoco.MjModel) -> None:
-        data = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-        mujoco.mj_saveModel(model, None, data)
         file = os.memfd_create("model")
         try:
-            with open(file, "wb", closefd=False) as out:
-                out.write(data.tobytes())
+            mujoco.mj_saveModel(model, f"/proc/self/fd/{file}", None)
             self._send(None, [file])
         finally:
             os.close(file)

@@ -6,7 +6,7 @@ Positions are rad, velocities rad/s, arrays (k,) in the order of the group's joi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,7 +21,6 @@ from openarm_sim_bridge.control.follower import End, Follower, Tracker
 from openarm_sim_bridge.control.trajectory import (
     JointGroup,
     JointSpline,
-    JointTolerance,
     Trajectory,
     TrajectoryError,
     TrajectoryResult,
@@ -281,9 +280,8 @@ class TrajectoryFollower(Follower):
                 TrajectoryResult.PATH_TOLERANCE_VIOLATED,
             )
 
-    def _tolerances(self, given: tuple[JointTolerance, ...], default: float) -> Array:
-        by_name = {tolerance.name: _or_default(tolerance.position, default) for tolerance in given}
-        return np.array([by_name.get(name, default) for name in self.group.names])
+    def _tolerances(self, given: Mapping[str, float], default: float) -> Array:
+        return np.array([_or_default(given.get(name, 0.0), default) for name in self.group.names])
 
     def _finish(self, end: End, result: TrajectoryResult, text: str) -> None:
         if self._goal is not None:

@@ -8,8 +8,8 @@ Times are seconds from the start of the trajectory; positions rad (m), velocitie
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
@@ -59,16 +59,8 @@ class JointGroup:
 
 
 @dataclass(frozen=True)
-class JointTolerance:
-    """Allowed deviation of one joint, rad or m: 0 is the controller's default, negative is unbounded."""
-
-    name: str
-    position: float
-
-
-@dataclass(frozen=True)
 class Trajectory:
-    """Points to pass, and how closely.
+    """Points to pass, and how closely: tolerances by joint, rad or m; 0 is the controller's default, below 0 no bound.
 
     Args:
         names: Joints, in any order.
@@ -88,8 +80,8 @@ class Trajectory:
     v: Array | None = None
     a: Array | None = None
     start_ns: int = 0
-    path_tolerance: tuple[JointTolerance, ...] = field(default=())
-    goal_tolerance: tuple[JointTolerance, ...] = field(default=())
+    path_tolerance: Mapping[str, float] = field(default_factory=dict[str, float])
+    goal_tolerance: Mapping[str, float] = field(default_factory=dict[str, float])
     goal_time_s: float = 0.0
 
 
@@ -112,16 +104,13 @@ def checked(trajectory: Trajectory, group: JointGroup) -> Trajectory:
     _check_limits(q, group)
     _check_speed(t, q, v, group)
     for what, tolerances in (("path", trajectory.path_tolerance), ("goal", trajectory.goal_tolerance)):
-        for tolerance in tolerances:
-            if tolerance.name not in group.names or not np.isfinite(tolerance.position):
+        for name, tolerance in tolerances.items():
+            if name not in group.names or not np.isfinite(tolerance):
                 raise TrajectoryError(
-                    f"{what} tolerance {tolerance.position} of joint {tolerance.name!r}: expected a number for one of"
+                    f"{what} tolerance {tolerance} of joint {name!r}: expected a number for one of"
                     f" {', '.join(group.names)}",
                 )
-    return Trajectory(
-        group.names, t, q, v, a, trajectory.start_ns, trajectory.path_tolerance, trajectory.goal_tolerance,
-        trajectory.goal_time_s,
-    )  # fmt: skip
+    return replace(trajectory, names=group.names, t=t, q=q, v=v, a=a)
 
 
 def _order(names: Sequence[str], group: JointGroup) -> list[int]:

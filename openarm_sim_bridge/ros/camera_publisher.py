@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import copy
 import math
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, Image
 
 from openarm_common.camera.cameras import CameraConfig
-from openarm_common.ros.convert import ENCODINGS, info_from_intrinsics, ns_to_stamp
+from openarm_common.ros.convert import ENCODINGS, array_to_image, image_to_array, info_from_intrinsics, ns_to_stamp
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_sim_bridge.cameras.cameras import SimulatedCameras
 from openarm_sim_bridge.cameras.handover import CameraSetup
@@ -50,19 +49,15 @@ class _Stream:
     @classmethod
     def make(cls, node: Node, setup: CameraSetup, camera: CameraConfig, stream: str, encoding: str) -> _Stream:
         dtype, channels = ENCODINGS[encoding]
-        message = Image(height=camera.height, width=camera.width, encoding=encoding)
-        message.is_bigendian = int(sys.byteorder == "big")
-        message.step = camera.width * channels * np.dtype(dtype).itemsize
-        message.header.frame_id = camera.optical_frame
-        message.data = bytes(message.step * camera.height)
         shape = (camera.height, camera.width, channels) if channels > 1 else (camera.height, camera.width)
+        message = array_to_image(np.zeros(shape, dtype), encoding, camera.optical_frame, 0)
         image, info = (setup.topics[f"/{camera.name}/{stream}/{kind}"] for kind in ("image_raw", "camera_info"))
         return cls(
             image=node.create_publisher(Image, image, QOS_SENSOR),
             info=node.create_publisher(CameraInfo, info, QOS_SENSOR),
             message=message,
             info_message=info_from_intrinsics(camera.intrinsics, camera.optical_frame, 0),
-            pixels=np.frombuffer(message.data, dtype=dtype).reshape(shape),
+            pixels=image_to_array(message),
         )
 
     def poll(self) -> bool:

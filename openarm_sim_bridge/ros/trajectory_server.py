@@ -20,7 +20,7 @@ from openarm_common.errors import OpenArmError
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_sim_bridge.control.arm import End, FollowerState, TrajectoryFollower, TrajectoryOutcome
-from openarm_sim_bridge.control.trajectory import JointTolerance, Trajectory, TrajectoryError, TrajectoryResult
+from openarm_sim_bridge.control.trajectory import Trajectory, TrajectoryError, TrajectoryResult
 from openarm_sim_bridge.ros.controller_server import ControllerServer
 from openarm_sim_bridge.simulation import Simulation
 
@@ -118,10 +118,6 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
 
 def _trajectory_of(goal: FollowJointTrajectory.Goal) -> Trajectory:
     names, t, q, v, a = trajectory_from_msg(goal.trajectory)
-
-    def tolerances(items: list[Any]) -> tuple[JointTolerance, ...]:
-        return tuple(JointTolerance(item.name, item.position) for item in items)
-
     return Trajectory(
         names=tuple(names),
         t=t,
@@ -129,8 +125,8 @@ def _trajectory_of(goal: FollowJointTrajectory.Goal) -> Trajectory:
         v=v,
         a=a,
         start_ns=stamp_to_ns(goal.trajectory.header.stamp),
-        path_tolerance=tolerances(goal.path_tolerance),
-        goal_tolerance=tolerances(goal.goal_tolerance),
+        path_tolerance={item.name: item.position for item in goal.path_tolerance},
+        goal_tolerance={item.name: item.position for item in goal.goal_tolerance},
         goal_time_s=stamp_to_ns(goal.goal_time_tolerance) * 1e-9,
     )
 

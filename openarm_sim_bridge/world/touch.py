@@ -6,8 +6,6 @@ Forces are N, torques N m, in the frame of the body that carries the sensor.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import mujoco
 import numpy as np
 
@@ -32,41 +30,32 @@ def add_wrist_sensor(spec: mujoco.MjSpec, body: str) -> None:
         spec.add_sensor(name=f"{body}_{what}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site)
 
 
-def wrist_wrench(model: mujoco.MjModel, data: mujoco.MjData, body: str) -> tuple[Array, Array]:
+def wrist_wrench(data: mujoco.MjData, body: str) -> tuple[Array, Array]:
     """Return force and torque (3,) by which the arm holds a body and all beyond it, in the body's frame.
 
     Args:
-        model: The model.
-        data: Its state after a step.
+        data: The state after a step.
         body: With a wrist sensor.
     """
-    out: list[Array] = []
-    for what in ("force", "torque"):
-        sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, f"{body}_{what}")
-        address = int(model.sensor_adr[sensor])
-        out.append(data.sensordata[address : address + 3].copy())
-    return out[0], out[1]
+    return data.sensor(f"{body}_force").data.copy(), data.sensor(f"{body}_torque").data.copy()
 
 
-def contact_wrench(model: mujoco.MjModel, data: mujoco.MjData, geoms: Iterable[int]) -> tuple[Array, Array]:
-    """Sum of the contact forces on geoms of one body, and their torque about its origin, (3,) in the body's frame.
+def contact_wrench(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[Array, Array]:
+    """Sum of the contact forces on a geom, and their torque about the origin of its body, (3,) in the body's frame.
 
     A contact names its two geoms in an order of MuJoCo's choice; its force is the one on the second.
 
     Args:
         model: The model.
         data: Its state after a step.
-        geoms: Ids of geoms of one body.
+        geom: Its id.
     """
-    wanted = set(geoms)
     force, torque, result = np.zeros(3), np.zeros(3), np.zeros(6)
-    if not wanted:
-        return force, torque
-    body = int(model.geom_bodyid[next(iter(wanted))])
+    body = int(model.geom_bodyid[geom])
     origin, rotation = data.xpos[body], data.xmat[body].reshape(3, 3)
     for i in range(data.ncon):
         contact = data.contact[i]
-        sign = float(contact.geom2 in wanted) - float(contact.geom1 in wanted)
+        sign = float(contact.geom2 == geom) - float(contact.geom1 == geom)
         if sign == 0.0:
             continue
         mujoco.mj_contactForce(model, data, i, result)

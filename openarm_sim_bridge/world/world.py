@@ -181,12 +181,11 @@ class World:
 
     def wrist_wrench(self, body: str) -> tuple[Array, Array]:
         """Return the force and torque (3,) of the wrist sensor of a body, in its frame; as `touch.wrist_wrench`."""
-        return wrist_wrench(self.model, self.data, body)
+        return wrist_wrench(self.data, body)
 
     def pad_wrench(self, link: str) -> tuple[Array, Array]:
         """Return contact force and torque (3,) on the pad of a finger link, in its frame: a simulated sensor."""
-        pad = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_GEOM, f"{link}_pad_collision")
-        return contact_wrench(self.model, self.data, (pad,))
+        return contact_wrench(self.model, self.data, self.model.geom(f"{link}_pad_collision").id)
 
     def snapshot(self) -> Snapshot:
         """Copy the configuration for a renderer."""

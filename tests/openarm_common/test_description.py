@@ -262,7 +262,5 @@ def test_questions_that_have_no_answer_list_what_there_is(description: RobotDesc
         description.link_pose("hand", {})
     with pytest.raises(OpenArmError, match="right_arm/wrist_look"):
         description.group_state("right_arm", "dance")
-    with pytest.raises(OpenArmError, match="groups: left_arm"):
-        description.group_joints("legs")
     with pytest.raises(OpenArmError, match="joints: openarm_body_world_joint"):
         description.limits(["joint1"])

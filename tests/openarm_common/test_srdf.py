@@ -25,7 +25,10 @@ def description() -> RobotDescription:
 
 @pytest.mark.parametrize("group", ["left_arm", "right_arm", "both_arms", "left_gripper", "right_gripper"])
 def test_srdf_states_cover_their_group_within_limits(description: RobotDescription, group: str) -> None:
-    names = description.group_joints(group)
+    side, part = group.split("_")
+    sides = ("left", "right") if side == "both" else (side,)
+    joints = RobotDescription.arm_joints if part.startswith("arm") else lambda side: (description.finger_joint(side),)
+    names = tuple(name for side in sides for name in joints(side))
     lower, upper = description.limits(names)
     states = [name for g, name in description.semantics.states if g == group]
     assert {"open", "closed"} <= set(states) or {"home", "official_home", "hands_up", "zero"} <= set(states)
@@ -81,9 +84,7 @@ def test_no_pair_that_is_said_never_to_touch_does(description: RobotDescription,
     ("srdf", "words"),
     [
         ('<disable_collisions link1="base" link2="x"/>', "link 'x'"),
-        ('<group name="g"><joint name="j7"/></group>', "joint 'j7'"),
-        ('<group name="g"><chain base_link="base" tip_link="tip"/></group>', "link 'tip'"),
-        ('<group name="g"><group name="h"/></group>', "group 'h'"),
+        ('<group name="g"/><group_state name="s" group="g"><joint name="j7" value="0"/></group_state>', "joint 'j7'"),
         ('<group_state name="s" group="g"><joint name="j1" value="0"/></group_state>', "group 'g'"),
     ],
 )

@@ -13,7 +13,6 @@ from openarm_sim_bridge.control.arm import End, TrajectoryConfig, TrajectoryFoll
 from openarm_sim_bridge.control.follower import Tracker
 from openarm_sim_bridge.control.trajectory import (
     JointGroup,
-    JointTolerance,
     Trajectory,
     TrajectoryError,
     TrajectoryResult,
@@ -159,10 +158,10 @@ def test_a_joint_that_is_held_back_ends_the_goal_and_the_arm_holds_there() -> No
     np.testing.assert_allclose(arm.history[-1], [0.2, 0.0])
 
 
-@pytest.mark.parametrize("tolerance", [JointTolerance("j1", -1.0), JointTolerance("j1", 0.5)])
-def test_path_tolerance_of_the_goal_replaces_the_default(tolerance: JointTolerance) -> None:
+@pytest.mark.parametrize("tolerance", [-1.0, 0.5])
+def test_path_tolerance_of_the_goal_replaces_the_default(tolerance: float) -> None:
     arm = Arm(plant=lambda q, target: np.minimum(target, 0.2))
-    arm.start(**(CUBIC | {"q": np.array([[0.0, 0.0], [0.5, 0.0]]), "path_tolerance": (tolerance,)}))
+    arm.start(**(CUBIC | {"q": np.array([[0.0, 0.0], [0.5, 0.0]]), "path_tolerance": {"j1": tolerance}}))
     outcome = arm.run()
     assert outcome.result is TrajectoryResult.GOAL_TOLERANCE_VIOLATED
     assert arm.t_ns - START == pytest.approx(2010 * MS, abs=30 * MS)  # one second of grace
@@ -175,7 +174,7 @@ def test_goal_tolerance_and_goal_time_of_the_goal_replace_the_defaults() -> None
     arm.start(**(CUBIC | {"goal_time_s": 0.2}))
     assert arm.run().result is TrajectoryResult.GOAL_TOLERANCE_VIOLATED
     assert arm.t_ns - START == pytest.approx(1210 * MS, abs=30 * MS)
-    loose = tuple(JointTolerance(name, 0.04) for name in GROUP.names)
+    loose = dict.fromkeys(GROUP.names, 0.04)
     arm.start(t=np.array([0.5]), q=np.array([[0.4, -0.4]]), goal_tolerance=loose)
     assert arm.run().result is TrajectoryResult.SUCCESSFUL
 

@@ -29,11 +29,11 @@ def test_contact_force_has_its_sign_in_both_orders_of_the_geoms(bodies: str) -> 
     mujoco.mj_step(model, data, nstep=1000)
     pad, box = (model.geom(name).id for name in ("pad", "box"))
     assert {(int(c.geom1), int(c.geom2)) for c in data.contact} == {(min(pad, box), max(pad, box))}
-    force, torque = contact_wrench(model, data, (pad,))
+    force, torque = contact_wrench(model, data, pad)
     np.testing.assert_allclose(force, [0.0, 0.0, -WEIGHT], atol=0.01)
     # The weight acts 2 cm along x from the pad's origin; the contact lies 5 cm above it.
     np.testing.assert_allclose(torque, [0.0, 0.02 * WEIGHT, 0.0], atol=0.003)
-    up, _ = contact_wrench(model, data, (box,))
+    up, _ = contact_wrench(model, data, box)
     np.testing.assert_allclose(up, -force, atol=1e-6)
 
 
@@ -43,7 +43,7 @@ def test_the_force_is_given_in_the_frame_of_the_body() -> None:
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{BOX}{turned}</worldbody></mujoco>")
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, nstep=1000)
-    force, _ = contact_wrench(model, data, (model.geom("pad").id,))
+    force, _ = contact_wrench(model, data, model.geom("pad").id)
     np.testing.assert_allclose(force, [0.0, 0.0, WEIGHT], atol=0.01)
 
 
@@ -51,7 +51,7 @@ def test_nothing_touches_nothing() -> None:
     model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{PAD}</worldbody></mujoco>")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    force, torque = contact_wrench(model, data, (model.geom("pad").id,))
+    force, torque = contact_wrench(model, data, model.geom("pad").id)
     assert not force.any()
     assert not torque.any()
 
@@ -66,7 +66,7 @@ def test_a_wrist_feels_the_weight_beyond_it() -> None:
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, nstep=10)
-    force, torque = wrist_wrench(model, data, "hand")
+    force, torque = wrist_wrench(data, "hand")
     np.testing.assert_allclose(force, [0.0, 0.0, WEIGHT], atol=1e-6)  # what holds it: the arm pushes up
     np.testing.assert_allclose(torque, [0.0, -0.1 * WEIGHT, 0.0], atol=1e-6)
 

@@ -12,7 +12,6 @@ from openarm_common.errors import Code
 from openarm_sim_bridge.control.trajectory import (
     JointGroup,
     JointSpline,
-    JointTolerance,
     Trajectory,
     TrajectoryError,
     TrajectoryResult,
@@ -102,7 +101,7 @@ def test_columns_are_put_in_the_order_of_the_joints() -> None:
             "velocity of j1 at the last point is 0.500",
         ),
         (
-            {"path_tolerance": (JointTolerance("j7", 0.1),)},
+            {"path_tolerance": {"j7": 0.1}},
             Code.INVALID_ARGUMENT,
             TrajectoryResult.INVALID_GOAL,
             "path tolerance 0.1 of joint 'j7'",
