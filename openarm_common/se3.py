@@ -15,11 +15,6 @@ from numpy.typing import ArrayLike
 from openarm_common.types import Array
 
 
-def identity() -> Array:
-    """Return the 4×4 identity."""
-    return np.eye(4)
-
-
 def make(R: ArrayLike | None = None, p: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     """Build a transform.
 
@@ -32,11 +27,6 @@ def make(R: ArrayLike | None = None, p: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         T[:3, :3] = R
     T[:3, 3] = p
     return T
-
-
-def rotation(T: Array) -> Array:
-    """Return a copy of the (3, 3) rotation of `T`."""
-    return T[:3, :3].copy()
 
 
 def inverse(T: Array) -> Array:

@@ -14,7 +14,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,22 +26,6 @@ from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.world import JointReadout
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class _Call:
-    fn: Callable[[], Any]
-    future: Future[Any]
-
-    def run(self) -> None:
-        if not self.future.set_running_or_notify_cancel():
-            return
-        try:
-            result = self.fn()
-        except BaseException as error:  # handed to the caller, never dropped
-            self.future.set_exception(error)
-        else:
-            self.future.set_result(result)
 
 
 class Simulation:
@@ -90,7 +73,7 @@ class Simulation:
         self._paused = False
         self._steps_left = 0
         self._stepped: Future[int] | None = None
-        self._calls: deque[_Call] = deque()
+        self._calls: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._wake = threading.Event()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="physics", daemon=True)
@@ -116,12 +99,12 @@ class Simulation:
         if self._thread.is_alive():
             self._thread.join()
         while self._calls:
-            self._calls.popleft().future.cancel()
+            self._calls.popleft()[1].cancel()
 
     def call(self, fn: Callable[[], T]) -> Future[T]:
         """Run a (short) function between two ticks; the future has its result within a tick or so."""
         future: Future[T] = Future()
-        self._calls.append(_Call(fn, future))
+        self._calls.append((fn, future))
         if self._paused:
             self._wake.set()
         return future
@@ -186,7 +169,15 @@ class Simulation:
 
     def _run_calls(self) -> None:
         while self._calls:
-            self._calls.popleft().run()
+            fn, future = self._calls.popleft()
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                result = fn()
+            except BaseException as error:  # handed to the caller, never dropped
+                future.set_exception(error)
+            else:
+                future.set_result(result)
 
     def _wait(self, seconds: float) -> None:
         if self._wake.wait(seconds):

@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -28,7 +28,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.lattice import Lattice
 from openarm_common.types import Array, Floats
 
-_MAGIC = b"OADIST01"
+_MAGIC = b"OADIST02"
 _MAX_CAMERAS = 8
 _SLOTS = 2
 _SLOT_HEAD = np.dtype(
@@ -36,8 +36,7 @@ _SLOT_HEAD = np.dtype(
         ("version", "<i8"),  # 0 while it is written
         ("t_ns", "<i8"),
         ("now_ns", "<i8"),
-        ("camera_t_ns", "<i8", (_MAX_CAMERAS,)),
-        ("camera_now_ns", "<i8", (_MAX_CAMERAS,)),
+        ("cameras", [("t_ns", "<i8"), ("now_ns", "<i8")], (_MAX_CAMERAS,)),
     ]
 )
 _HEAD = np.dtype(
@@ -56,8 +55,7 @@ _HEAD = np.dtype(
 _DATA_AT = 4096
 
 
-@dataclass(frozen=True)
-class CameraMoment:
+class CameraMoment(NamedTuple):
     """When a camera last contributed: stamp of its image, and the monotonic clock then (0: never)."""
 
     t_ns: int
@@ -213,8 +211,7 @@ class DistanceFieldWriter:
         head = self._head["slots"][slot]
         self._moments |= cameras
         head["t_ns"], head["now_ns"] = t_ns, now_ns
-        for i, name in enumerate(self._cameras):
-            head["camera_t_ns"][i], head["camera_now_ns"][i] = self._moments[name].t_ns, self._moments[name].now_ns
+        head["cameras"][: len(self._cameras)] = [self._moments[name] for name in self._cameras]
         self._version += 1
         head["version"] = self._version
         self._head["current"] = slot
@@ -267,10 +264,7 @@ class DistanceFieldReader:
             version=int(head["version"]),
             t_ns=int(head["t_ns"]),
             now_ns=int(head["now_ns"]),
-            cameras={
-                name: CameraMoment(int(head["camera_t_ns"][i]), int(head["camera_now_ns"][i]))
-                for i, name in enumerate(names)
-            },
+            cameras={name: CameraMoment(*head["cameras"][i].item()) for i, name in enumerate(names)},
         )
 
     def intact(self, field: DistanceField) -> bool:

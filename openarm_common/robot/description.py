@@ -127,10 +127,6 @@ class RobotDescription:
         found = [self.joint(name) for name in joint_names]
         return np.array([j.lower for j in found]), np.array([j.upper for j in found])
 
-    def velocity_limits(self, joint_names: Iterable[str]) -> Array:
-        """Return the velocity limits (n,) of joints: those of the motors, far above what a plan should use."""
-        return np.array([self.joint(name).velocity for name in joint_names])
-
     def joint(self, name: str) -> Joint:
         """Return a joint.
 

@@ -16,6 +16,7 @@ import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Vector3
 from numpy.typing import ArrayLike, NDArray
+from rclpy.duration import Duration as RclDuration
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
@@ -45,12 +46,6 @@ def stamp_to_ns(stamp: Time | Duration) -> int:
 def ns_to_stamp(t_ns: int) -> Time:
     """Convert nanoseconds to a stamp."""
     return Time(sec=t_ns // 1_000_000_000, nanosec=t_ns % 1_000_000_000)
-
-
-def seconds_to_duration(seconds: float) -> Duration:
-    """Convert seconds to a duration message."""
-    t_ns = round(seconds * 1e9)
-    return Duration(sec=t_ns // 1_000_000_000, nanosec=t_ns % 1_000_000_000)
 
 
 # --- geometry
@@ -302,7 +297,8 @@ def trajectory_to_msg(
     """
     message = JointTrajectory(joint_names=list(names))
     for i, seconds in enumerate(t):
-        sample = JointTrajectoryPoint(positions=q[i].tolist(), time_from_start=seconds_to_duration(float(seconds)))
+        since_start = RclDuration(nanoseconds=round(float(seconds) * 1e9)).to_msg()
+        sample = JointTrajectoryPoint(positions=q[i].tolist(), time_from_start=since_start)
         if v is not None:
             sample.velocities = v[i].tolist()
         if a is not None:

@@ -50,7 +50,6 @@ class RobotStateListener:
         self.tracker = PostureTracker(description, wait)
         self.buffer = self.tracker.buffer
         self.efforts: dict[str, float] = {}
-        self.velocities: dict[str, float] = {}
         self._node = node
         self._depth = depth
         self._users: set[object] = set()
@@ -84,7 +83,6 @@ class RobotStateListener:
     def _on_joints(self, message: JointState) -> None:
         self.tracker.add(stamp_to_ns(message.header.stamp), message.name, message.position, time.monotonic())
         self.efforts = dict(zip(message.name, message.effort, strict=False))
-        self.velocities = dict(zip(message.name, message.velocity, strict=False))
         self._notify()
 
     def _on_static(self, message: TFMessage) -> None:

@@ -37,6 +37,7 @@ class CameraFeed:
         speed: Simulated seconds per second of wall time. Above 1 the cameras keep their rates on the wall clock.
 
     Attributes:
+        rendered: Frames drawn so far, by camera.
         lost: Frames that could not be handed over.
         fault: Why there are no images.
         report: The newest report.
@@ -56,24 +57,13 @@ class CameraFeed:
         self._on_fault = on_fault
         self._ticks = {camera.name: RateDivider(camera.rate / max(1.0, speed)) for camera in setup.cameras}
         self._lock = threading.Lock()  # of the sender, which is exchanged when the process is started again
-        self._earlier: dict[str, int] = {camera.name: 0 for camera in setup.cameras}
-        self._drawn: dict[str, int] = dict(self._earlier)
+        self.rendered = self._earlier = {camera.name: 0 for camera in setup.cameras}
         self._died_at: float | None = None
         self._faults: tuple[Fault, ...] = ()
         self.lost = 0
         self.fault = ""
         self.report = CameraReport()
         self._start()
-
-    @property
-    def pid(self) -> int:
-        """Of the process that draws."""
-        return self._process.pid
-
-    @property
-    def rendered(self) -> dict[str, int]:
-        """Frames drawn so far, by camera."""
-        return dict(self._drawn)
 
     @property
     def dropped(self) -> int:
@@ -120,7 +110,7 @@ class CameraFeed:
         try:
             for report in self._sender.reports():
                 self.report = report
-                self._drawn = {name: n + report.rendered.get(name, 0) for name, n in self._earlier.items()}
+                self.rendered = {name: n + report.rendered.get(name, 0) for name, n in self._earlier.items()}
                 if report.fault != self.fault:
                     self.fault = report.fault
                     self._on_fault(report.fault)
@@ -152,7 +142,7 @@ class CameraFeed:
     def _on_death(self) -> None:
         with self._lock:
             self._sender.close()
-            self._earlier = dict(self._drawn)
+            self._earlier = self.rendered
             self.lost += self.report.dropped
             self.report = CameraReport()
         code = self._wait()

@@ -107,7 +107,11 @@ def build_spec(
     """
     settings = physics or PhysicsConfig()
     spec = robot_spec(description, settings) if robot is None else robot.copy()
-    contact = contact_of(settings)
+    contact: dict[str, Any] = {
+        "friction": settings.object_friction,
+        "solref": settings.contact_solref,
+        "solimp": settings.contact_solimp,
+    }
     scenery.add_environment(spec, contact)
     scenery.add_table(spec, scene.table, contact)
     for item in scene.objects:
@@ -131,15 +135,6 @@ def compile_model(
         return spec.compile()
     except ValueError as error:
         raise OpenArmError(Code.CONFIG_INVALID, f"MuJoCo refuses the model: {error}") from error
-
-
-def contact_of(physics: PhysicsConfig) -> dict[str, Any]:
-    """Return the geom attributes of objects, table and floor."""
-    return {
-        "friction": physics.object_friction,
-        "solref": physics.contact_solref,
-        "solimp": physics.contact_solimp,
-    }
 
 
 def robot_spec(description: RobotDescription, physics: PhysicsConfig) -> mujoco.MjSpec:

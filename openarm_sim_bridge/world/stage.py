@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import mujoco
+import numpy as np
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
@@ -89,7 +90,8 @@ class Stage:
 
     def _group(self, names: tuple[str, ...]) -> JointGroup:
         lower, upper = self._description.limits(names)
-        return JointGroup(names, lower, upper, self._description.velocity_limits(names))
+        speeds = np.array([self._description.joint(name).velocity for name in names])
+        return JointGroup(names, lower, upper, speeds)  # those of the motors, far above what a plan should use
 
 
 def without_object(scene: Scene, name: str) -> Scene:

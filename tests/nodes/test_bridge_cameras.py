@@ -158,7 +158,7 @@ def test_images_come_again_after_their_process_was_killed(seeing) -> None:
     states = seeing.collect(JointState, "/joint_states", reliable(2000))
     seeing.ros.spin_until(lambda: states, 20.0, "joint states")
     feed, before = seeing.node._images, seeing.t_ns
-    os.kill(feed.pid, signal.SIGKILL)
+    os.kill(feed._process.pid, signal.SIGKILL)
     seeing.ros.spin_until(lambda: "code -9" in feed.fault, 20.0, "its death to be told")
     n = len(images)
     seeing.ros.spin_until(lambda: len(images) > n + 3, 20.0, "images again")

@@ -175,7 +175,7 @@ def test_the_robot_and_what_it_holds_are_not_in_the_map(bench) -> None:
     assert bench.state(tuple(hand)) != "occupied"
     marker = Marker(ns="left/tray", type=Marker.CUBE, action=Marker.ADD)
     marker.header.frame_id = "openarm_left_hand_tcp"
-    marker.pose = matrix_to_pose(se3.identity())
+    marker.pose = matrix_to_pose(np.eye(4))
     marker.scale.x = marker.scale.y = marker.scale.z = 0.4
     bench.held.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL), marker]))
     bench.show(sheet(tool[2, 3]), lambda: bench.state(near) != "occupied", "the held tray is cut out")
