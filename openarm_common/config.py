@@ -22,22 +22,22 @@ class Config(BaseModel):
 ConfigT = TypeVar("ConfigT", bound=BaseModel)
 
 
-def load_yaml(path: Path) -> dict[str, Any]:
+def load_yaml(path: Path, code: Code = Code.CONFIG_INVALID) -> dict[str, Any]:
     """Read a YAML mapping.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, when the file is missing, is not YAML, or is not a mapping.
+        OpenArmError: With `code`, when the file is missing, is not YAML, or is not a mapping.
     """
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{path} does not exist") from error
+        raise OpenArmError(code, f"{path} does not exist") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{path} is not valid YAML: {error}") from error
+        raise OpenArmError(code, f"{path} is not valid YAML: {error}") from error
     if data is None:
         return {}
     if not isinstance(data, dict):
-        raise OpenArmError(Code.CONFIG_INVALID, f"{path} holds a {type(data).__name__}, expected a mapping of keys")
+        raise OpenArmError(code, f"{path} holds a {type(data).__name__}, expected a mapping of keys")
     return data  # pyright: ignore[reportUnknownVariableType]
 
 
@@ -71,21 +71,22 @@ def metres_by_name(items: Sequence[str], field: str, example: str, low: float, h
 AT_RUN_TIME: dict[str, JsonValue] = {"at_run_time": True}
 
 
-def validate(model: type[ConfigT], data: dict[str, Any], where: str) -> ConfigT:
+def validate(model: type[ConfigT], data: dict[str, Any], where: str, code: Code = Code.CONFIG_INVALID) -> ConfigT:
     """Validate a mapping; every wrong key is named at once.
 
     Args:
         model: Model of the data.
         data: The mapping.
         where: Begins each fault, such as the path of a file.
+        code: Of the error.
 
     Raises:
-        OpenArmError: CONFIG_INVALID, with `where`:key for each fault.
+        OpenArmError: With `code`, and `where`:key for each fault.
     """
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise OpenArmError(Code.CONFIG_INVALID, describe_faults(error, where, model)) from error
+        raise OpenArmError(code, describe_faults(error, where, model)) from error
 
 
 def describe_faults(error: ValidationError, where: str, model: type[BaseModel]) -> str:

@@ -9,7 +9,6 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
 from openarm_common.octree.codec import decode
-from openarm_common.octree.distance_field import sphere_clearance
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.self_filter import SelfFilter, SelfFilterConfig
 from openarm_octomap.config import GridConfig
@@ -39,7 +38,6 @@ def warm() -> None:
         decode(payload.data, grid.lattice.resolution, binary=payload.binary).on(grid.lattice)
     distances = np.empty(grid.lattice.shape, np.float32)
     DistanceTransform(grid.lattice, 0.1).compute(grid.states, distances)
-    sphere_clearance(distances, grid.lattice.lower, grid.lattice.resolution, np.zeros((1, 3)), np.zeros(1))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
@@ -101,7 +100,11 @@ class DistanceField:
             centres: (n, 3) in the frame, m.
             radii: (n,) m.
         """
-        return float(sphere_clearance(self.distances, self.lattice.lower, self.lattice.resolution, centres, radii))
+        index = self.lattice.indices(centres)
+        inside = self.lattice.contains(index)
+        # a sphere's centre is up to half a diagonal from that of its cell, and a surface as far from that of its own
+        gaps = self.distances[tuple(index[inside].T)] - radii[inside] - np.sqrt(3.0) * self.lattice.resolution
+        return float(gaps.min(initial=np.inf))
 
     def require_fresh(self, now_ns: int, limit_s: float, cameras: Sequence[str] | None = None) -> None:
         """Refuse a field that is too old to plan with.
@@ -304,27 +307,3 @@ def _slots(memory: mmap.mmap, lattice: Lattice) -> list[Floats]:
         np.frombuffer(memory, np.float32, count=n, offset=_DATA_AT + i * 4 * n).reshape(lattice.shape)
         for i in range(_SLOTS)
     ]
-
-
-@njit(cache=True, nogil=True)
-def sphere_clearance(distances: Floats, lower: Array, edge: float, centres: Array, radii: Array) -> float:
-    """Return the smallest clearance between spheres and occupied cells, m; see `DistanceField.clearance`.
-
-    Args:
-        distances: (nx, ny, nz), m.
-        lower: (3,) corner of the field, m.
-        edge: Of a cell, m.
-        centres: (n, 3) of the spheres, m.
-        radii: (n,) m.
-    """
-    nx, ny, nz = distances.shape
-    # a sphere's centre is up to half a diagonal from that of its cell, and a surface as far from that of its own
-    slack = np.sqrt(3.0) * edge
-    best = np.inf
-    for i in range(centres.shape[0]):
-        x = int(np.floor((centres[i, 0] - lower[0]) / edge))
-        y = int(np.floor((centres[i, 1] - lower[1]) / edge))
-        z = int(np.floor((centres[i, 2] - lower[2]) / edge))
-        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
-            best = min(best, distances[x, y, z] - radii[i] - slack)
-    return best

@@ -12,13 +12,13 @@ import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, FiniteFloat, ValidationError, field_validator, model_validator
+from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from openarm_common import se3
-from openarm_common.config import Config, describe_faults, load_yaml
+from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_common.types import Array
@@ -215,9 +215,6 @@ class Scene(Config):
         raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {there}")
 
 
-ModelT = TypeVar("ModelT", Scene, SceneObject)
-
-
 def parse_scene(data: Mapping[str, Any], where: str) -> Scene:
     """Validate a scene; `where` stands in front of every fault.
 
@@ -225,7 +222,7 @@ def parse_scene(data: Mapping[str, Any], where: str) -> Scene:
         OpenArmError: SCENE_INVALID, naming each wrong key, and each object that is not on the table, overlaps another,
             or has a name or label that is used twice.
     """
-    scene = _parse(Scene, data, where)
+    scene = validate(Scene, dict(data), where, Code.SCENE_INVALID)
     faults = [fault for item in scene.objects for fault in _off_table(item, scene.table)]
     faults += _duplicates("name", (item.name for item in (*scene.objects, *scene.fixtures)))
     faults += _duplicates("label", (item.label for item in scene.objects))
@@ -249,7 +246,7 @@ def parse_object(data: Mapping[str, Any], table: Table, where: str) -> SceneObje
     Raises:
         OpenArmError: SCENE_INVALID, naming each wrong key, or that it is not on the table.
     """
-    item = _parse(SceneObject, data, where)
+    item = validate(SceneObject, dict(data), where, Code.SCENE_INVALID)
     faults = _off_table(item, table)
     if faults:
         raise OpenArmError(Code.SCENE_INVALID, "; ".join(f"{where}: {fault}" for fault in faults))
@@ -278,11 +275,7 @@ def load_scene(source: str | Path, seed: int = 0) -> Scene:
             Code.SCENE_INVALID,
             f"no scene {str(source)!r}; scenes: {', '.join([*names, 'random'])}, or the path of a YAML",
         )
-    try:
-        data = load_yaml(path)
-    except OpenArmError as error:
-        raise OpenArmError(Code.SCENE_INVALID, error.message) from error
-    return parse_scene({"name": path.stem} | data, str(path))
+    return parse_scene({"name": path.stem} | load_yaml(path, Code.SCENE_INVALID), str(path))
 
 
 def random_scene(seed: int, count: int | None = None) -> Scene:
@@ -328,13 +321,6 @@ def _draw_size(rng: np.random.Generator, kind: str) -> tuple[float, float, float
         b = a
     # Not taller than twice the narrow side: a slimmer one tips over when a finger touches it first.
     return (a, b, round(float(rng.uniform(0.04, min(0.115, 2.0 * min(a, b)))), 3))
-
-
-def _parse(model: type[ModelT], data: Mapping[str, Any], where: str) -> ModelT:
-    try:
-        return model.model_validate(dict(data))
-    except ValidationError as error:
-        raise OpenArmError(Code.SCENE_INVALID, describe_faults(error, where, model)) from error
 
 
 def _place(item: SceneObject) -> str:

@@ -36,13 +36,12 @@ class MovingEdges:
         self._offset = np.array([joint.offset if joint.mimic else 0.0 for joint in joints])
         self._slides = np.array([joint.type == "prismatic" for joint in joints])
         self._origin = np.stack([joint.T_parent_joint[:3, 3] for joint in joints])
-        axes = [joint.axis / np.linalg.norm(joint.axis) for joint in joints]
-        turns = [joint.T_parent_joint[:3, :3] @ axis for joint, axis in zip(joints, axes, strict=True)]
+        turns = [joint.T_parent_joint[:3, :3] @ joint.axis for joint in joints]
         self._direction = np.stack(turns) * self._slides[:, None]
         # The fixed rotation times the half turn (axis sin, cos) is linear in sine and cosine.
         self._cosine = np.stack([se3.quat_xyzw_from_matrix(joint.T_parent_joint[:3, :3]) for joint in joints])
         v0, w0 = self._cosine[:, :3], self._cosine[:, 3:]
-        v1 = np.stack(axes)
+        v1 = np.stack([joint.axis for joint in joints])
         self._sine = np.hstack([w0 * v1 + np.cross(v0, v1), -np.sum(v0 * v1, axis=1, keepdims=True)])
 
     def poses(self, positions: Array) -> tuple[Array, Array]:
