@@ -153,8 +153,8 @@ class Simulation:
     def _loop(self) -> None:
         while not self._stopping:
             wait_s = self._turn()
-            if wait_s > 0.0 and not self._calls:
-                self._wait(wait_s)
+            if wait_s > 0.0 and not self._calls and self._wake.wait(wait_s):
+                self._wake.clear()
 
     def _turn(self) -> float:
         """Do what is due: calls, and a tick; return for how long there is nothing to do, s."""
@@ -178,10 +178,6 @@ class Simulation:
                 future.set_exception(error)
             else:
                 future.set_result(result)
-
-    def _wait(self, seconds: float) -> None:
-        if self._wake.wait(seconds):
-            self._wake.clear()
 
     def _idle(self) -> None:
         """Report the state while simulated time is paused."""

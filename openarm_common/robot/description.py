@@ -62,13 +62,23 @@ class RobotDescription:
     _chains: Mapping[str, tuple[Joint, ...]] = field(repr=False)
 
     @classmethod
+    @lru_cache(maxsize=1)
     def load(cls) -> RobotDescription:
         """Return the OpenArm description of `models/openarm`; expanded once a process.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the xacro or the SRDF is faulty; ENVIRONMENT, when the files are missing.
         """
-        return _load()
+        folder = models_dir() / "openarm"
+        source = folder / "openarm.urdf.xacro"
+        try:
+            document = xacro.process_file(str(source))
+        except xacro.XacroException as error:
+            raise OpenArmError(Code.CONFIG_INVALID, f"{source}: {error}") from error
+        root = ET.fromstring(document.toxml())  # drops xacro's comments, which name the folder it ran in
+        ET.indent(root)
+        urdf = ET.tostring(root, encoding="unicode") + "\n"
+        return cls.from_urdf(urdf, (folder / "openarm.srdf").read_text(encoding="utf-8"))
 
     @classmethod
     def from_urdf(cls, urdf: str, srdf: str = "") -> RobotDescription:
@@ -233,17 +243,3 @@ def _check_semantics(semantics: Semantics, links: Mapping[str, Link], joints: Ma
     for group_name, state in semantics.states:
         if group_name not in semantics.groups:
             raise fault(f"SRDF state {state!r} belongs to group {group_name!r}, which does not exist")
-
-
-@lru_cache(maxsize=1)
-def _load() -> RobotDescription:
-    folder = models_dir() / "openarm"
-    source = folder / "openarm.urdf.xacro"
-    try:
-        document = xacro.process_file(str(source))
-    except xacro.XacroException as error:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{source}: {error}") from error
-    root = ET.fromstring(document.toxml())  # drops xacro's comments, which name the folder it ran in
-    ET.indent(root)
-    urdf = ET.tostring(root, encoding="unicode") + "\n"
-    return RobotDescription.from_urdf(urdf, (folder / "openarm.srdf").read_text(encoding="utf-8"))
