@@ -193,8 +193,7 @@ class DirectLink:
         if answer.error is not None:
             raise NoWayError(answer.code, answer.message, refusals) from answer.error
         transfer, approach, retreat = answer.parts
-        took_s = self.robot.planning_s[-1]
-        return Planned(answer.chosen, transfer, approach, retreat, took_s, refusals, answer.limit_margins)
+        return Planned(answer.chosen, transfer, approach, retreat, refusals, answer.limit_margins)
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
         """How far the arm's TCP stays from a point, in any orientation."""

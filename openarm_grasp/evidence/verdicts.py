@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 
@@ -51,64 +49,6 @@ class Evidence:
     pads: tuple[float, ...] = ()
 
 
-class Grip(Enum):
-    """What the hand holds."""
-
-    HELD = "held"
-    EMPTY = "empty"
-    HAND_COLLISION = "hand_collision"
-    MOVING = "moving"
-    LOST = "lost"
-
-    @property
-    def code(self) -> Code:
-        """The code that a grasp failing on this ends with."""
-        return _GRIP_CODES[self]
-
-
-_GRIP_CODES = {
-    Grip.HELD: Code.OK,
-    Grip.EMPTY: Code.GRASP_MISSED,
-    Grip.HAND_COLLISION: Code.HAND_COLLISION,
-    Grip.MOVING: Code.GRASP_MISSED,
-    Grip.LOST: Code.GRASP_LOST,
-}
-
-
-class GripVerdict(NamedTuple):
-    """What the hand holds, and the reason with values and limits."""
-
-    grip: Grip
-    reason: str
-
-    @property
-    def ok(self) -> bool:
-        """Whether it holds the object."""
-        return self.grip is Grip.HELD
-
-
-class Sight(Enum):
-    """What the camera says of an object after its lift."""
-
-    RISEN = "risen"
-    GONE = "gone from its place"
-    STILL_THERE = "still there"
-    ASKEW = "held elsewhere than planned"
-    BLIND = "no frame"
-
-
-class SightVerdict(NamedTuple):
-    """What the camera says of an object after its lift, and the reason."""
-
-    sight: Sight
-    reason: str
-
-    @property
-    def ok(self) -> bool:
-        """Whether the object has left its place."""
-        return self.sight in (Sight.RISEN, Sight.GONE)
-
-
 @dataclass(frozen=True)
 class Verdict:
     """A judgement with its reason in a sentence; after a `final` one another try would not help."""
@@ -123,45 +63,36 @@ class Verdict:
         return self.code is Code.OK
 
 
-@dataclass(frozen=True)
-class PlaceVerdict(Verdict):
-    """What the camera says of an object that was put down."""
-
-
-def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> GripVerdict:
-    """Held, empty, moving, or the hand on top of the object.
+def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> Verdict:
+    """Whether the hand holds the object: GRASP_MISSED, when it is empty or moves; HAND_COLLISION; GRASP_LOST.
 
     Args:
         e: What the gripper says.
         config: Thresholds.
         was_held: The object was held before: an empty hand has lost it.
     """
-    empty = Grip.LOST if was_held else Grip.EMPTY
+    empty = Code.GRASP_LOST if was_held else Code.GRASP_MISSED
     gap, width = f"gap {e.gap * 1e3:.1f} mm", f"the object's {e.expected * 1e3:.1f} mm"
     if e.tcp_error > config.max_tcp_error:
         off, limit = e.tcp_error * 1e3, config.max_tcp_error * 1e3
-        return GripVerdict(
-            Grip.HAND_COLLISION, f"the hand is {off:.1f} mm from the grasp, expected at most {limit:.0f} mm"
-        )
+        return Verdict(Code.HAND_COLLISION, f"the hand is {off:.1f} mm from the grasp, expected at most {limit:.0f} mm")
     if e.gap <= config.closed_below:
-        return GripVerdict(empty, f"{gap}: the fingers are closed on nothing")
+        return Verdict(empty, f"{gap}: the fingers are closed on nothing")
     if e.gap > e.expected + config.width_tolerance:
-        return GripVerdict(Grip.HAND_COLLISION, f"{gap} is wider than {width}: the fingers are not around it")
+        return Verdict(Code.HAND_COLLISION, f"{gap} is wider than {width}: the fingers are not around it")
     if e.gap < e.expected - config.width_tolerance:
-        return GripVerdict(empty, f"{gap} is narrower than {width}: something else is between the fingers")
+        return Verdict(empty, f"{gap} is narrower than {width}: something else is between the fingers")
     if abs(e.speed) >= config.max_speed:
-        return GripVerdict(Grip.MOVING, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest")
+        return Verdict(Code.GRASP_MISSED, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest")
     if config.use_effort and abs(e.effort) <= config.min_effort:
-        return GripVerdict(
+        return Verdict(
             empty, f"{gap}, but the fingers press with {abs(e.effort):.1f} N, expected over {config.min_effort:g} N"
         )
     if config.use_finger_force and min(e.pads, default=0.0) < config.min_pad_force:
         felt = f"a finger pad feels {min(e.pads):.1f} N" if e.pads else "no sensor tells what the finger pads feel"
-        return GripVerdict(
-            empty, f"{gap}, but {felt}, expected {config.min_pad_force:g} N on each (held.use_finger_force)"
-        )
+        return Verdict(empty, f"{gap}, but {felt}, expected {config.min_pad_force:g} N on each (held.use_finger_force)")
     force = f", {abs(e.effort):.0f} N" if config.use_effort else ""
-    return GripVerdict(Grip.HELD, f"{gap} for {e.expected * 1e3:.1f} mm{force}: held")
+    return Verdict(Code.OK, f"{gap} for {e.expected * 1e3:.1f} mm{force}: held")
 
 
 def judge_sight(
@@ -171,8 +102,8 @@ def judge_sight(
     *,
     match_radius: float,
     others: Sequence[Detection] = (),
-) -> SightVerdict:
-    """Whether the camera still sees the object at its old place, sees it higher, or not there any more.
+) -> Verdict:
+    """Whether the object has left its place: GRASP_MISSED, when it is still there or held elsewhere; STALE_DATA.
 
     Args:
         before: The object as it was before the grasp.
@@ -182,7 +113,7 @@ def judge_sight(
         others: What else stood there; those like the object are not taken for it.
     """
     if not frames:
-        return SightVerdict(Sight.BLIND, "no camera frame after the lift")
+        return Verdict(Code.STALE_DATA, "no camera frame after the lift")
     twins = [d for d in others if d.label == before.label]
     same = [
         d
@@ -191,7 +122,7 @@ def judge_sight(
         if d.label == before.label and all(apart(d, twin) > match_radius for twin in twins)
     ]
     if not same:
-        return SightVerdict(Sight.GONE, f"{before.label!r} has gone from its place")
+        return Verdict(Code.OK, f"{before.label!r} has gone from its place")
     # The top counts: a detector may take the visible part of a lifted object for a box that reaches down to the table.
     highest = max(same, key=lambda d: d.top)
     risen = highest.top - before.top
@@ -200,16 +131,16 @@ def judge_sight(
         off = sticks_out(highest, before)
         if off > config.askew:
             limit = f"expected at most {config.askew * 1e3:.0f} mm"
-            return SightVerdict(
-                Sight.ASKEW, f"{text}, {off * 1e3:.0f} mm out of where the hand should hold it, {limit}"
+            return Verdict(
+                Code.GRASP_MISSED, f"{text}, {off * 1e3:.0f} mm out of where the hand should hold it, {limit}"
             )
-        return SightVerdict(Sight.RISEN, text)
+        return Verdict(Code.OK, text)
     distance = min(apart(d, before) for d in same)
     if distance <= match_radius:
-        return SightVerdict(
-            Sight.STILL_THERE, f"{before.label!r} still stands at its place ({distance * 1e3:.0f} mm from it)"
+        return Verdict(
+            Code.GRASP_MISSED, f"{before.label!r} still stands at its place ({distance * 1e3:.0f} mm from it)"
         )
-    return SightVerdict(Sight.GONE, f"{before.label!r} has left its place ({distance * 1e3:.0f} mm)")
+    return Verdict(Code.OK, f"{before.label!r} has left its place ({distance * 1e3:.0f} mm)")
 
 
 def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) -> tuple[bool, str]:
@@ -232,14 +163,11 @@ def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) 
     return True, f"{before.label!r} still stands there"
 
 
-def judge_lift(gripper: GripVerdict, camera: SightVerdict) -> Verdict:
+def judge_lift(gripper: Verdict, camera: Verdict) -> Verdict:
     """A lift counts only when gripper and camera agree."""
     if not gripper.ok:
-        return Verdict(gripper.grip.code, gripper.reason)
-    if camera.ok:
-        return Verdict(Code.OK, f"{gripper.reason}; {camera.reason}")
-    code = Code.STALE_DATA if camera.sight is Sight.BLIND else Code.GRASP_MISSED
-    return Verdict(code, f"{gripper.reason}, but {camera.reason}")
+        return gripper
+    return Verdict(camera.code, f"{gripper.reason}{'; ' if camera.ok else ', but '}{camera.reason}")
 
 
 def judge_place(
@@ -249,7 +177,7 @@ def judge_place(
     tolerance: float,
     yaw: float | None = None,
     height: float | None = None,
-) -> PlaceVerdict:
+) -> Verdict:
     """Whether the camera sees the object at the place target after the arm has left.
 
     Args:
@@ -261,24 +189,24 @@ def judge_place(
         height: Of the object as it stood, m: one of another height lies on its side. None: it is not judged.
     """
     if not frames:
-        return PlaceVerdict(Code.STALE_DATA, "no camera frame after the place")
+        return Verdict(Code.STALE_DATA, "no camera frame after the place")
     same = next(
         (found for frame in reversed(frames) if (found := [d for d in frame.detections if d.label == label])), ()
     )
     if not same:
-        return PlaceVerdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
+        return Verdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
     nearest = min(same, key=lambda d: float(np.linalg.norm((d.p_base - p_target)[:2])))
     distance = float(np.linalg.norm((nearest.p_base - p_target)[:2]))
     text = f"{label!r} stands {distance * 1e3:.0f} mm from its target"
     if distance > tolerance:
-        return PlaceVerdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
+        return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
     top = nearest.top - float(p_target[2])
     if height is not None and abs(top - height) > UPRIGHT_WITHIN:
         was = f"it is {top * 1e3:.0f} mm high there and was {height * 1e3:.0f} mm"
-        return PlaceVerdict(Code.PLACE_FAILED, f"{label!r} has fallen over: {was}", final=True)
+        return Verdict(Code.PLACE_FAILED, f"{label!r} has fallen over: {was}", final=True)
     if yaw is not None and abs(float(nearest.size[0] - nearest.size[1])) > SQUARE_WITHIN:
         off = abs((nearest.yaw - yaw + np.pi / 2.0) % np.pi - np.pi / 2.0)
         text += f", turned {np.degrees(off):.0f}° from what was asked"
         if off > YAW_TOLERANCE:
-            return PlaceVerdict(Code.PLACE_FAILED, f"{text}, expected at most {np.degrees(YAW_TOLERANCE):.0f}°")
-    return PlaceVerdict(Code.OK, text)
+            return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {np.degrees(YAW_TOLERANCE):.0f}°")
+    return Verdict(Code.OK, text)

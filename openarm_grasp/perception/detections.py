@@ -37,13 +37,11 @@ class Sighting:
         target: The averaged detection.
         others: Every other object, newest sight of each.
         t_ns: Stamp of the newest frame.
-        spread: Largest distance of a frame's position from the average, m.
     """
 
     target: Detection
     others: tuple[Detection, ...]
     t_ns: int
-    spread: float
 
 
 def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Frame, ...]:

@@ -67,8 +67,7 @@ def find(
             f" {limits.agree_within * 1e3:.1f} mm; is it at rest?",
         )
     target = average(track)
-    spread = max(_distance(d, target) for d in track)
-    return Sighting(target, _others(frames, target, limits.match_radius), frames[-1].t_ns, spread)
+    return Sighting(target, _others(frames, target, limits.match_radius), frames[-1].t_ns)
 
 
 def _anchor(frame: Frame, label: str, at: Sequence[float] | None, exclude_near: Sequence[Sequence[float]]) -> Detection:

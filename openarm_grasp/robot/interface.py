@@ -72,7 +72,6 @@ class Planned:
         transfer: Free path to the beginning of the approach.
         approach: Straight line to where it grasps or lets go.
         retreat: Straight line away.
-        planning_time: s of wall clock.
         refusals: Why others were refused, by id.
         limit_margins: Of each way, how near it comes to a joint limit, rad; NaN: refused or not looked at. Empty when
             the planner does not say.
@@ -82,7 +81,6 @@ class Planned:
     transfer: Trajectory
     approach: Trajectory
     retreat: Trajectory
-    planning_time: float = 0.0
     refusals: Mapping[str, Verdict] = field(default_factory=dict[str, Verdict])
     limit_margins: tuple[float, ...] = ()
 
@@ -93,17 +91,14 @@ class RobotInterface(Protocol):
     @property
     def description(self) -> RobotDescription:
         """The robot."""
-        ...
 
     @property
     def states(self) -> RobotStateBuffer:
         """Its joint states."""
-        ...
 
     @property
     def base_frame(self) -> str:
         """Name of the base frame."""
-        ...
 
     deadline_ns: int
     """Robot time after which `check` raises CANCELLED; 0: none."""
@@ -111,67 +106,52 @@ class RobotInterface(Protocol):
     @property
     def now_ns(self) -> int:
         """Robot time."""
-        ...
 
     def effort(self, joint: str) -> float:
         """Newest effort of a joint, N or N m; 0 when none is published."""
-        ...
 
     def pads(self, arm: str) -> tuple[float, ...]:
         """Force on each finger pad of a hand, N; empty without a sensor."""
-        ...
 
     def check(self) -> None:
         """Raise when the work may not go on: CANCELLED, ROBOT_LOST."""
-        ...
 
     def warn(self, text: str) -> None:
         """Report something that does not stop the work."""
-        ...
 
     def stop_observing(self) -> None:
         """The camera is not needed for now."""
-        ...
 
     async def until(
         self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
     ) -> None:
         """Wait for a condition, no longer than `limit` s; `guard` is called at each check and may raise."""
-        ...
 
     async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
         """Carry out several coroutines at once; all end before this does, then the first error is raised."""
-        ...
 
     async def observe(self, count: int, *, near: bool = False) -> Frames:
         """Frames of detections that are taken from now on, by the camera over the table or the one on the hand."""
-        ...
 
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Plan; raises with the planner's code."""
-        ...
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
         """How far the arm's TCP stays from a point, m by arm; empty when that cannot be said."""
-        ...
 
     async def follow(
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
     ) -> None:
         """Follow a planned trajectory."""
-        ...
 
     async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Move the TCP on a straight line."""
-        ...
 
     async def move_named(self, arm: str, named: str, obstacles: Sequence[Box], what: str) -> None:
         """Move an arm on a free path to a posture."""
-        ...
 
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Move the fingers with at most `effort` N (0: any); whether they arrived or push against something."""
-        ...
 
 
 def check_deadline(now_ns: int, deadline_ns: int) -> None:

@@ -94,7 +94,6 @@ def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
         result.transfer,
         result.approach,
         result.retreat,
-        result.planning_time,
         refusals,
         tuple(result.limit_margins),
     )

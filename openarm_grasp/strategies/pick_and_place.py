@@ -20,7 +20,7 @@ from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.evidence import verdicts
-from openarm_grasp.evidence.verdicts import GripVerdict, PlaceVerdict, SightVerdict, Verdict
+from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Frame, Sighting, apart, labels_in_view
 from openarm_grasp.perception.find import find, on_table
 from openarm_grasp.planning import candidates
@@ -81,7 +81,7 @@ class Placed:
     """
 
     target: PlaceTarget
-    gripper: GripVerdict
+    gripper: Verdict
     reason: str
     failure: Verdict | None = None
 
@@ -296,7 +296,7 @@ async def _attempts(run: Run) -> GraspOutcome:
         why = run.start_again(grasp.sighting.target, grasp.candidate)
 
 
-def succeeded(run: Run, message: str, *, gripper: GripVerdict, camera: SightVerdict | PlaceVerdict) -> GraspOutcome:
+def succeeded(run: Run, message: str, *, gripper: Verdict, camera: Verdict) -> GraspOutcome:
     """Say that what was asked for has happened: the only place that can.
 
     Args:
@@ -408,7 +408,7 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
     if kept is not None:
         newest = frames[-1]
         others = (d for d in newest.detections if d.label != kept.target.label)
-        sighting = Sighting(kept.target, _standing(others, top_z), newest.t_ns, 0.0)
+        sighting = Sighting(kept.target, _standing(others, top_z), newest.t_ns)
     else:
         found = find(frames, request.label, limits, at=request.object_at, exclude_near=request.exclude_near)
         target = on_table(found.target, top_z)
@@ -637,7 +637,7 @@ async def close(run: Run, grasp: Grasp, why: str) -> str:
         evidence = await robot.measure(arm, c.width, c.T_base_tcp, settle=timing.settle_limit)
         gripper = verdicts.judge_grip(evidence, run.config.held)
         if not gripper.ok:
-            raise OpenArmError(gripper.grip.code, gripper.reason)
+            raise OpenArmError(gripper.code, gripper.reason)
     except OpenArmError as error:
         reraise_stop(error)
         run.hand = Hand.AT_OBJECT
@@ -645,7 +645,7 @@ async def close(run: Run, grasp: Grasp, why: str) -> str:
     return gripper.reason
 
 
-async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[GripVerdict, SightVerdict, str]:
+async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Verdict, Verdict, str]:
     """Lift straight up, then judge by gripper and camera whether the object has come along.
 
     Returns:
@@ -822,7 +822,7 @@ def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[candidate
     return (*others, candidates.Box(f"placed/{run.label}", placed.target.T_base_tcp @ held.T_frame_box, held.size))
 
 
-async def verify(run: Run, placed: Placed) -> PlaceVerdict:
+async def verify(run: Run, placed: Placed) -> Verdict:
     """Judge by the camera, from home, whether the object is at its place.
 
     Raises:

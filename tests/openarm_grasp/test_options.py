@@ -47,7 +47,7 @@ def no_way(code: Code, **refusals: str) -> NoWayError:
 
 def test_the_answer_has_every_way_with_its_score_and_its_fate(asked) -> None:
     refusals = {"red/x-/tilt0": Verdict(Code.IN_COLLISION, "red/x-/tilt0: on the approach it meets 'blue'")}
-    options = asked(Planned(0, "", "", "", 0.1, refusals, (0.3, 0.2, *(nan,) * 26)))
+    options = asked(Planned(0, "", "", "", refusals, (0.3, 0.2, *(nan,) * 26)))
     assert len(options) == 28
     assert [o.score for o in options] == sorted((o.score for o in options), reverse=True)
     assert all(o.score == pytest.approx(sum(o.parts.values())) for o in options)

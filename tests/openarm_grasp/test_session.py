@@ -11,7 +11,7 @@ import pytest
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.evidence.verdicts import Grip, GripVerdict, PlaceVerdict
+from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import propose
 from openarm_grasp.strategies.pair import PairOutcome, check_pair
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, Proof
@@ -96,7 +96,7 @@ def test_a_place_goes_on_with_what_it_holds_after_frames_that_are_too_old(world)
 )
 @pytest.mark.requirement("P-02")
 def test_the_outcome_of_two_is_told_in_one_word(first: str, second: str, kind: str) -> None:
-    proof = Proof(GripVerdict(Grip.HELD, "held"), PlaceVerdict(Code.OK, "at its place"))
+    proof = Proof(Verdict(Code.OK, "held"), Verdict(Code.OK, "at its place"))
     ends = {
         "done": GraspOutcome(Code.OK, "placed", "a", attempts=1, proof=proof),
         "refused": GraspOutcome(Code.UNREACHABLE, "too far", "a"),

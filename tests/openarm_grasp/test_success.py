@@ -12,30 +12,29 @@ import pytest
 
 import openarm_grasp
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.verdicts import Grip, GripVerdict, PlaceVerdict, Sight, SightVerdict
+from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.strategies.request import Feasible, GraspOutcome, Proof
 
-HELD = GripVerdict(Grip.HELD, "held")
-AT_PLACE = PlaceVerdict(Code.OK, "2 mm from its target")
+HELD = Verdict(Code.OK, "held")
+AT_PLACE = Verdict(Code.OK, "2 mm from its target")
 
 
-@pytest.mark.parametrize("grip", list(Grip))
-@pytest.mark.parametrize("sight", list(Sight))
+@pytest.mark.parametrize("grip", [Code.OK, Code.GRASP_MISSED, Code.HAND_COLLISION, Code.GRASP_LOST])
+@pytest.mark.parametrize("sight", [Code.OK, Code.GRASP_MISSED, Code.STALE_DATA])
 @pytest.mark.requirement("P-08")
 def test_a_lift_is_proven_by_a_hand_that_holds_and_a_camera_that_sees_the_object_gone(grip, sight):
-    agree = grip is Grip.HELD and sight in (Sight.RISEN, Sight.GONE)
-    if agree:
-        Proof(GripVerdict(grip, "a"), SightVerdict(sight, "b"))
+    if grip is Code.OK and sight is Code.OK:
+        Proof(Verdict(grip, "a"), Verdict(sight, "b"))
         return
     with pytest.raises(OpenArmError, match="success without evidence") as error:
-        Proof(GripVerdict(grip, "a"), SightVerdict(sight, "b"))
+        Proof(Verdict(grip, "a"), Verdict(sight, "b"))
     assert error.value.code is Code.INTERNAL
 
 
 @pytest.mark.requirement("P-09")
 def test_a_place_is_proven_by_the_camera_and_the_hand_that_carried():
     Proof(HELD, AT_PLACE)
-    for gripper, camera in product((HELD, GripVerdict(Grip.LOST, "")), (AT_PLACE, PlaceVerdict(Code.PLACE_FAILED, ""))):
+    for gripper, camera in product((HELD, Verdict(Code.GRASP_LOST, "")), (AT_PLACE, Verdict(Code.PLACE_FAILED, ""))):
         if (gripper, camera) != (HELD, AT_PLACE):
             with pytest.raises(OpenArmError, match="success without evidence"):
                 Proof(gripper, camera)
@@ -75,8 +74,8 @@ def test_one_function_builds_the_proof_of_a_success_and_it_cannot_be_called_with
 def test_the_answers_of_a_pick_and_of_a_place_carry_their_proof(world):
     picked = world.grasp(phase="pick")
     assert isinstance(picked.proof, Proof)
-    assert isinstance(picked.proof.camera, SightVerdict)
+    assert picked.proof.camera.reason == "'red' has gone from its place"
     placed = world.grasp("", phase="place")
     assert isinstance(placed.proof, Proof)
-    assert isinstance(placed.proof.camera, PlaceVerdict)
+    assert placed.proof.camera.reason == "'red' stands 0 mm from its target"
     assert placed.proof.gripper.ok
