@@ -11,7 +11,7 @@ opening axis is always horizontal, so both fingers close at one height and the o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from math import cos, hypot, radians, sin
 
@@ -181,38 +181,31 @@ def propose(
             name = f"{target.label}/{edge}{flip}/tilt{tilt_deg:g}" + (f"/lean{lean}" if tilt_deg else "")
             y_tool = direction if flip == "+" else -direction
             heading = np.cross(UP, direction) * (1.0 if lean == "+" else -1.0)
-            candidate = _candidate(name, target, config, y_tool, heading, radians(tilt_deg), width)
+            tilt = radians(tilt_deg)
+            z_tool = sin(tilt) * heading - cos(tilt) * UP
+            p = target.p_base.copy()
+            p[2] = target.bottom + tcp_height(float(target.size[2]), tilt, config.hand)
             parts = {
-                **candidate.parts,
-                "side": _SIDE_WEIGHT * sin(candidate.tilt) * _outward(target.p_base, heading, shoulder_xy),
+                "tilt": -_TILT_COST_PER_RAD * tilt,
+                "width": _WIDTH_WEIGHT * max(0.0, 1.0 - width / config.approach.max_width),
+                "side": _SIDE_WEIGHT * sin(tilt) * _outward(target.p_base, heading, shoulder_xy),
                 "room": _ROOM_WEIGHT * (min(room, _ROOM) / _ROOM - 1.0),
                 "used": -USED_PENALTY if name in used else 0.0,
             }
-            found.append(replace(candidate, parts=parts, score=sum(parts.values())))
+            found.append(
+                GraspCandidate(
+                    id=name,
+                    T_base_tcp=se3.make(se3.rotation_from_z_y(z_tool, y_tool), p),
+                    approach_offset=-config.approach.pregrasp_distance * z_tool,
+                    retreat_offset=config.approach.lift_height * UP,
+                    width=width,
+                    tilt=tilt,
+                    score=sum(parts.values()),
+                    parts=parts,
+                )
+            )
     # Stable sort: equal scores keep the order of the edges, so the same scene gives the same plan.
     return tuple(sorted(found, key=lambda c: -c.score))
-
-
-def _candidate(
-    name: str, target: Detection, config: GraspConfig, y_tool: Array, heading: Array, tilt: float, width: float
-) -> GraspCandidate:
-    z_tool = sin(tilt) * heading - cos(tilt) * UP
-    p = target.p_base.copy()
-    p[2] = target.bottom + tcp_height(float(target.size[2]), tilt, config.hand)
-    parts = {
-        "tilt": -_TILT_COST_PER_RAD * tilt,
-        "width": _WIDTH_WEIGHT * max(0.0, 1.0 - width / config.approach.max_width),
-    }
-    return GraspCandidate(
-        id=name,
-        T_base_tcp=se3.make(se3.rotation_from_z_y(z_tool, y_tool), p),
-        approach_offset=-config.approach.pregrasp_distance * z_tool,
-        retreat_offset=config.approach.lift_height * UP,
-        width=width,
-        tilt=tilt,
-        score=sum(parts.values()),
-        parts=parts,
-    )
 
 
 def hold_of(candidate: GraspCandidate) -> str:

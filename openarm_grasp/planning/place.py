@@ -17,6 +17,7 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene.scene import Table
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig, PlaceConfig
 from openarm_grasp.evidence.verdicts import SQUARE_WITHIN
@@ -206,21 +207,14 @@ def clear_spots(
     return found
 
 
-def check_position(
-    position: Sequence[float],
-    target: Detection,
-    others: Sequence[Detection],
-    table_x: tuple[float, float],
-    table_y: tuple[float, float],
-) -> Array:
+def check_position(position: Sequence[float], target: Detection, others: Sequence[Detection], table: Table) -> Array:
     """A place position that a user asked for.
 
     Args:
         position: x, y (and a z that is not read), base frame, m.
         target: The object that shall stand there.
         others: Other objects in view.
-        table_x: Ends of the table top, base frame, m.
-        table_y: Its sides.
+        table: Whose top it shall be on.
 
     Returns:
         (2,) position.
@@ -231,7 +225,7 @@ def check_position(
     """
     p = np.asarray(position, dtype=np.float64)[:2]
     half = float(min(target.size[:2])) / 2.0
-    (x_min, x_max), (y_min, y_max) = table_x, table_y
+    (x_min, x_max), (y_min, y_max) = table.x, table.y
     # Not finite compares false, too.
     if not (x_min + half <= p[0] <= x_max - half and y_min + half <= p[1] <= y_max - half):
         raise OpenArmError(

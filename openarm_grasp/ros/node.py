@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 from openarm_interfaces.action import Pick, PickTwo
@@ -16,16 +17,21 @@ from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import Side
 from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
+from openarm_grasp.planning.arms import ARMS
+from openarm_grasp.robot.interface import RobotInterface
+from openarm_grasp.robot.skills import Skills
 from openarm_grasp.ros import messages
-from openarm_grasp.ros.request_server import RequestServer
-from openarm_grasp.strategies.pair import PairOutcome
+from openarm_grasp.ros.graph_robot import GraphRobot
+from openarm_grasp.strategies.pair import Pair, PairOutcome
+from openarm_grasp.strategies.registry import carry_out, carry_out_pair
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
 from openarm_grasp.strategies.states import State
-from openarm_grasp.strategies.task import Status
+from openarm_grasp.strategies.task import GraspSession, Status, Task
 
 AnswerT = TypeVar("AnswerT", GraspOutcome, PairOutcome)
 OnStatus = Callable[[int, GraspStatus], None]
@@ -40,7 +46,10 @@ class GraspNode(BaseNode[GraspConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("grasp", GraspConfig, **kwargs)
         context = GraspContext.of(self.config, load_scene(self.config.scene).table, self.description)
-        self._requests = RequestServer(self, context)
+        self._robot = GraphRobot(self, self.config)
+        self._skills = Skills(self._robot, self.config)
+        self._session = GraspSession(context)
+        self._running: tuple[GraspRequest, ...] = ()
         self._newest: dict[int, Status] = {}
         self._goal: ServerGoalHandle | None = None
         self._status_topic = self.create_publisher(GraspStatus, "/grasp/status", _QOS_STATUS)
@@ -54,7 +63,7 @@ class GraspNode(BaseNode[GraspConfig]):
 
     def close(self) -> None:
         """Stop listening and take the actions down."""
-        self._requests.close()
+        self._robot.close()
         while self._actions:
             self._actions.pop().destroy()
         super().close()
@@ -81,7 +90,7 @@ class GraspNode(BaseNode[GraspConfig]):
 
     async def _as_goal(self, goal: ServerGoalHandle, work: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
         """Carry a goal out; a cancel reaches the one that is being carried out."""
-        mine = not self._requests.running
+        mine = not self._running
         if mine:
             self._goal = goal
         outcome = await work()
@@ -98,7 +107,7 @@ class GraspNode(BaseNode[GraspConfig]):
     def _on_cancel(self, goal: ServerGoalHandle) -> CancelResponse:
         if self._goal is None or goal.goal_id != self._goal.goal_id:
             return CancelResponse.REJECT
-        self._requests.cancel()
+        self._robot.cancel()
         return CancelResponse.ACCEPT
 
     def _serve(self, kind: Any, name: str, execute: Callable[[ServerGoalHandle], Any]) -> ActionServer:
@@ -106,8 +115,11 @@ class GraspNode(BaseNode[GraspConfig]):
 
     # --- requests
     async def _one(self, request: GraspRequest, on_status: OnStatus | None = None) -> GraspOutcome:
+        report = partial(self._publish, on_status=on_status)
         try:
-            outcome = await self._requests.one(request, lambda status: self._publish(status, on_status))
+            outcome = await self._take(
+                (request,), lambda: carry_out(Task(self._session, self._skills, request, report))
+            )
         except OpenArmError as error:
             self._refused(f"grasp of {request.label!r}", error)
             return GraspOutcome(error.code, error.message, request.label)
@@ -115,14 +127,36 @@ class GraspNode(BaseNode[GraspConfig]):
         return outcome
 
     async def _two(self, requests: tuple[GraspRequest, GraspRequest], on_status: OnStatus) -> PairOutcome:
+        report = partial(self._publish, on_status=on_status)
+        robots: dict[Side, RobotInterface] = {arm: self._robot.next_to_other() for arm in ARMS}
         try:
-            outcome = await self._requests.two(requests, lambda status: self._publish(status, on_status))
+            outcome = await self._take(
+                requests,
+                lambda: carry_out_pair(Pair(self._session, self._skills, robots, requests, report, carry_out)),
+            )
         except OpenArmError as error:
             self._refused(f"grasp of {requests[0].label!r} and {requests[1].label!r}", error)
             return PairOutcome((), error.code, error.message)
         for answer in outcome.answers:
             self._report(answer)
         return outcome
+
+    async def _take(self, requests: tuple[GraspRequest, ...], work: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
+        """Carry requests out, one or two at a time.
+
+        Raises:
+            OpenArmError: BUSY, NOT_READY or INVALID_ARGUMENT, when they are not taken; CANCELLED before they began.
+        """
+        if self._running:
+            labels = " and ".join(repr(request.label) if request.label else "an object" for request in self._running)
+            raise OpenArmError(Code.BUSY, f"a grasp of {labels} is running; cancel it or wait until it has ended")
+        self._running = requests
+        try:
+            await self._robot.begin(moves=not requests[0].dry_run)
+            return await work()
+        finally:
+            self._robot.end()
+            self._running = ()
 
     def _refused(self, what: str, error: OpenArmError) -> None:
         self.get_logger().warning(f"{what} refused: {error}")
@@ -137,14 +171,14 @@ class GraspNode(BaseNode[GraspConfig]):
         """Publish how a request ended."""
         report = f"{outcome.code}: {outcome.message} (arm {outcome.arm or '-'}, attempts {outcome.attempts})"
         self.get_logger().info(report) if outcome.success else self.get_logger().warning(report)
-        drift = self._requests.session.drift.of(self.config.camera)
+        drift = self._session.drift.of(self.config.camera)
         if drift.alarm:
             self.get_logger().error(drift.message)
         self._diagnose(not drift.alarm, f"{drift.message}; {report}" if drift.alarm else report, drift=drift.message)
 
     def _publish(self, status: Status, on_status: OnStatus | None) -> None:
         """Publish a state that was entered."""
-        t_ns = self._requests.now_ns
+        t_ns = self._robot.now_ns
         self._newest[status.request] = status
         message = messages.status_msg(status, t_ns)
         self._status_topic.publish(message)

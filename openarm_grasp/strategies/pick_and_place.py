@@ -437,7 +437,7 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
     """
     request, target, table = run.request, sighting.target, run.context.table
     if request.place is not None:
-        check_position(request.place, target, sighting.others, table.x, table.y)
+        check_position(request.place, target, sighting.others, table)
     run.options, why = {}, ""
     arms = arm_order(request.arm, float(target.p_base[1]), run.config.approach.overlap_half_width)
     where = "({:.3f}, {:.3f}, {:.3f}) m".format(*target.p_base)
@@ -514,7 +514,7 @@ def _grasp(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) ->
     """A grasp with the ways to put the object down: where it was asked for, or on free spots."""
     request, target, others, table = run.request, sighting.target, sighting.others, run.context.table
     if request.place is not None:
-        spots = (check_position(request.place, target, others, table.x, table.y),)
+        spots = (check_position(request.place, target, others, table),)
     else:
         spots = free_spots(arm, target, others, run.config)
     yaw = request.place_yaw

@@ -22,18 +22,12 @@ from openarm_grasp.strategies.request import GraspOutcome
 from openarm_grasp.strategies.task import Task
 
 Strategy = Callable[[Task], Awaitable[GraspOutcome | None]]
-PairStrategy = Callable[[Pair], Awaitable[PairOutcome | None]]
 
 #: For one object.
 STRATEGIES: dict[str, Strategy] = {
     "direct": direct,
     "push": push,
     "hand_over": hand_over,
-}
-#: For two objects that are asked for together.
-PAIR_STRATEGIES: dict[str, PairStrategy] = {
-    "simultaneous": simultaneous,
-    "in_turn": in_turn,
 }
 #: These end a request; no other strategy is tried.
 _ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
@@ -78,8 +72,5 @@ async def carry_out_pair(pair: Pair) -> PairOutcome:
             when both ended before an object was touched.
     """
     pair.check()
-    for strategy in PAIR_STRATEGIES.values():
-        outcome = await strategy(pair)
-        if outcome is not None:
-            return outcome
-    raise OpenArmError(Code.INTERNAL, f"none of the strategies {', '.join(PAIR_STRATEGIES)} answered")
+    outcome = await simultaneous(pair)
+    return await in_turn(pair) if outcome is None else outcome

@@ -47,8 +47,8 @@ def test_the_grasp_node_speaks_the_type_that_the_bridge_serves(bridge, action: s
 
     async def grip() -> bool:
         try:
-            await grasp._requests._robot._nodes.begin(list)
-            return await grasp._requests._robot.grip("right", bench.FINGER, 0.03, "open")
+            await grasp._robot._nodes.begin(list)
+            return await grasp._robot.grip("right", bench.FINGER, 0.03, "open")
         except OpenArmError as error:  # one that left the task would end the executor
             faults.append(error)
             return False

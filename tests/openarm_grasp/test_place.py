@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.scene.scene import Table
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import GraspCandidate, propose
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, yaw_offsets
 
 CONFIG = GraspConfig()
-TABLE_X, TABLE_Y = (0.11, 0.81), (-0.60, 0.60)
+TABLE = Table()
 
 
 def box(x=0.26, y=-0.2, yaw=0.3, size=(0.04, 0.06, 0.05), label="red") -> Detection:
@@ -164,17 +165,17 @@ def test_a_full_table_has_no_free_spot():
 @pytest.mark.parametrize("position", [(0.05, 0.0), (0.3, 0.7), (float("nan"), 0.1), (0.3, float("inf"), 0.4)])
 def test_a_place_off_the_table_is_refused(position):
     with pytest.raises(OpenArmError) as error:
-        check_position(position, box(), [], TABLE_X, TABLE_Y)
+        check_position(position, box(), [], TABLE)
     assert error.value.code is Code.INVALID_ARGUMENT
     assert "not on the table" in error.value.message
 
 
 def test_a_place_on_another_object_is_refused_with_its_name():
     with pytest.raises(OpenArmError, match="'blue' stands 20 mm") as error:
-        check_position((0.30, -0.30), box(), [box(x=0.32, y=-0.30, label="blue")], TABLE_X, TABLE_Y)
+        check_position((0.30, -0.30), box(), [box(x=0.32, y=-0.30, label="blue")], TABLE)
     assert error.value.code is Code.IN_COLLISION
 
 
 def test_a_place_beside_another_object_is_left_to_the_planner():
-    p = check_position((0.30, -0.30, 9.9), box(), [box(x=0.36, y=-0.30, label="blue")], TABLE_X, TABLE_Y)
+    p = check_position((0.30, -0.30, 9.9), box(), [box(x=0.36, y=-0.30, label="blue")], TABLE)
     assert p == pytest.approx((0.30, -0.30))
