@@ -25,14 +25,12 @@ class Drift:
     Attributes:
         camera: Which.
         bias: (2,) mean residual, base frame, m: where the camera sees objects, less where they are.
-        error: (2,) its standard error, m.
         grasps: How many.
         alarm: The bias is large and sure.
     """
 
     camera: str
     bias: Array
-    error: Array
     grasps: int
     alarm: bool
 
@@ -48,39 +46,37 @@ class Drift:
 
 
 class DriftWatch:
-    """Collects residuals by camera.
+    """Collects residuals of a camera.
 
     Args:
         config: When to raise an alarm.
+        camera: That sees the objects.
     """
 
-    def __init__(self, config: DriftConfig) -> None:
-        self._config = config
-        self._seen: dict[str, deque[tuple[Array, float]]] = {}
+    def __init__(self, config: DriftConfig, camera: str) -> None:
+        self._config, self._camera = config, camera
+        self._seen = deque[tuple[Array, float]](maxlen=config.window)
 
-    def add(self, camera: str, direction: Array, residual: float) -> None:
+    def add(self, direction: Array, residual: float) -> None:
         """Take one measurement.
 
         Args:
-            camera: That saw the object.
             direction: (2,) unit vector in which the error was measured, base frame.
             residual: Seen less true along it, m.
         """
-        window = self._seen.setdefault(camera, deque(maxlen=self._config.window))
-        window.append((direction, residual))
+        self._seen.append((direction, residual))
 
-    def of(self, camera: str) -> Drift:
-        """What is known of a camera.
+    def drift(self) -> Drift:
+        """What is known of the camera.
 
         The bias is the least-squares solution of all measurements, each of one direction; a little damping
         keeps a direction that no grasp has measured at zero.
         """
-        seen = self._seen.get(camera, deque[tuple[Array, float]]())
-        n = len(seen)
+        n = len(self._seen)
         if n < self._config.least:
-            return Drift(camera, np.zeros(2), np.full(2, np.inf), n, alarm=False)
-        A = np.array([direction for direction, _ in seen])
-        b = np.array([residual for _, residual in seen])
+            return Drift(self._camera, np.zeros(2), n, alarm=False)
+        A = np.array([direction for direction, _ in self._seen])
+        b = np.array([residual for _, residual in self._seen])
         information = A.T @ A + 0.1 * np.eye(2)
         bias = np.asarray(np.linalg.solve(information, A.T @ b), dtype=np.float64)
         sigma = max(float(np.std(b - A @ bias)), 0.0005)
@@ -88,4 +84,4 @@ class DriftWatch:
         size = float(np.linalg.norm(bias))
         along = bias / size if size > 0.0 else np.array([1.0, 0.0])
         sure = size > self._config.sigmas * float(np.linalg.norm(along * error))
-        return Drift(camera, bias, error, n, alarm=size > self._config.bias and sure)
+        return Drift(self._camera, bias, n, alarm=size > self._config.bias and sure)

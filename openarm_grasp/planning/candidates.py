@@ -258,10 +258,3 @@ def held_box(target: Detection, candidate: GraspCandidate, config: GraspConfig) 
     """The object in the closed hand, TCP frame."""
     box = target_box(target, config)
     return Box(box.id, se3.inverse(candidate.T_base_tcp) @ box.T_frame_box, box.size)
-
-
-def shifted(T: Array, offset: Array) -> Array:
-    """The pose (4, 4) moved by an offset (3,) in its parent frame."""
-    moved = T.copy()
-    moved[:3, 3] += offset
-    return moved

@@ -12,31 +12,17 @@ from openarm_interfaces.action import MoveArm, PlanApproach
 from openarm_interfaces.msg import ApproachTarget, CollisionBox
 from openarm_interfaces.srv import ComputeIK
 from sensor_msgs.msg import JointState
-from vision_msgs.msg import Detection3DArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.convert import matrix_to_pose, stamp_to_ns, vector, xyz
-from openarm_common.ros.detections import detections_from_msg
+from openarm_common.ros.convert import matrix_to_pose, vector, xyz
 from openarm_common.ros.node import BASE_FRAME
 from openarm_common.types import Array
 from openarm_grasp.evidence.verdicts import Verdict
-from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NoWayError
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
 
 
-# --- detections
-def frame_from_msg(message: Detection3DArray) -> Frame:
-    """One frame of detections, in the frame that its header names.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, for a pose that is not one.
-    """
-    return Frame(stamp_to_ns(message.header.stamp), detections_from_msg(message))
-
-
-# --- planning
 def box_to_msg(box: Box) -> CollisionBox:
     """A collision box; its frame is that of its user."""
     return CollisionBox(id=box.id, pose=matrix_to_pose(box.T_frame_box), size=vector(box.size))

@@ -19,13 +19,13 @@ from vision_msgs.msg import Detection3DArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.detections import detections_from_msg
 from openarm_common.ros.node import BASE_FRAME, BaseNode, reliable
 from openarm_common.ros.tf import RobotStateListener
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import Silence
 from openarm_grasp.perception.detections import Frame
 from openarm_grasp.robot.interface import Frames
-from openarm_grasp.ros import convert
 from openarm_grasp.ros.pad_listener import Pads
 
 #: What the detector of the camera over the table finds.
@@ -208,7 +208,11 @@ class GraphClients:
         """
         self._frames = []
         self._observing_since_ns = self.now_ns
-        self._look(topic)
+        if self._detections is not None and self._topic != topic:
+            self.stop_observing()
+        if self._detections is None:
+            self._topic = topic
+            self._detections = self._node.create_subscription(Detection3DArray, topic, self._on_detections, reliable(5))
         try:
             await self.until(lambda: len(self._frames) >= count, limit, "observing")
         except OpenArmError as error:
@@ -218,19 +222,13 @@ class GraphClients:
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
         return Frames(tuple(self._frames[-count:]), self._frame_id)
 
-    def _look(self, topic: str) -> None:
-        if self._detections is not None and self._topic != topic:
-            self.stop_observing()
-        if self._detections is None:
-            self._topic = topic
-            self._detections = self._node.create_subscription(Detection3DArray, topic, self._on_detections, reliable(5))
-
     def _on_detections(self, message: Detection3DArray) -> None:
         # What the camera took before this look began shows another state of the world.
-        if stamp_to_ns(message.header.stamp) < self._observing_since_ns:
+        t_ns = stamp_to_ns(message.header.stamp)
+        if t_ns < self._observing_since_ns:
             return
         try:
-            self._frames.append(convert.frame_from_msg(message))
+            self._frames.append(Frame(t_ns, detections_from_msg(message)))
         except OpenArmError as error:
             self._node.get_logger().warning(f"dropped a frame of detections: {error.message}")
             return

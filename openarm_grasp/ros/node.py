@@ -171,7 +171,7 @@ class GraspNode(BaseNode[GraspConfig]):
         """Publish how a request ended."""
         report = f"{outcome.code}: {outcome.message} (arm {outcome.arm or '-'}, attempts {outcome.attempts})"
         self.get_logger().info(report) if outcome.success else self.get_logger().warning(report)
-        drift = self._session.drift.of(self.config.camera)
+        drift = self._session.drift.drift()
         if drift.alarm:
             self.get_logger().error(drift.message)
         self._diagnose(not drift.alarm, f"{drift.message}; {report}" if drift.alarm else report, drift=drift.message)

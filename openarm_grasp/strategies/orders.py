@@ -113,7 +113,8 @@ class Order:
     def next(self) -> GraspRequest | None:
         """The next request; None when the order has ended."""
         for label in dict.fromkeys(self.labels):
-            if label in self.failed or self.placed.count(label) >= self._most(label):
+            most = self.each if isinstance(self.each, int) else self.each.get(label, 1)
+            if label in self.failed or self.placed.count(label) >= most:
                 continue
             if label in self._blocked and self._blocked[label][0] == len(self.placed):
                 continue  # nothing has been taken away since
@@ -147,9 +148,6 @@ class Order:
             # No more of it in view, when some was placed, is what was asked for.
             why = "" if code in _GONE and label in self.placed else f"{code}: {message}"
             self._blocked[label] = (len(self.placed), why)
-
-    def _most(self, label: str) -> int:
-        return self.each if isinstance(self.each, int) else self.each.get(label, 1)
 
     @property
     def outcome(self) -> str:

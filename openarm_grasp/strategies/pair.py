@@ -30,8 +30,8 @@ Requests = tuple[GraspRequest, GraspRequest]
 
 #: Places nearer to each other than this are served one after the other, m.
 _APART = 0.20
-#: These end both requests.
-_ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
+#: These end a request, and one that runs beside it; no other strategy is tried.
+ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ async def simultaneous(pair: Pair) -> PairOutcome | None:
 async def in_turn(pair: Pair) -> PairOutcome:
     """One after the other; the second is not begun when the first was stopped or its object is still in the hand."""
     first = await pair.alone(0)
-    if first.code in _ENDS or first.held:
+    if first.code in ENDS or first.held:
         text = f"not begun: {first.label!r} ended with {first.code}: {first.message}"
         second = GraspOutcome(first.code, text, pair.requests[1].label)
     else:
@@ -200,7 +200,7 @@ async def _arms_for_both(pair: Pair) -> tuple[tuple[Side, ...], str]:
     try:
         found = await _observe_both(pair)
     except OpenArmError as error:
-        if error.code not in _ENDS:
+        if error.code not in ENDS:
             return (), f"{error.message}: one after the other"
         if error.code is Code.CANCELLED:
             pair.task(0, pair.robot)  # a deadline ends work as a cancel does; here it gets its own name

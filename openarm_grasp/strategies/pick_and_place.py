@@ -798,19 +798,18 @@ async def _leave(run: Run, grasp: Grasp, placed: Placed | None) -> None:
     arm, robot, config, T_base_tcp = grasp.arm, run.robot, run.config, grasp.candidate.T_base_tcp
     if placed is not None:
         if run.hand is Hand.RELEASED:
-            T_away = candidates.shifted(placed.target.T_base_tcp, placed.target.retreat_offset)
+            T_away = se3.make(p=placed.target.retreat_offset) @ placed.target.T_base_tcp
             await robot.move_linear(arm, T_away, "leave")
         return
     at_object = run.hand is not Hand.FREE
     if run.hand is Hand.HOLDING:
-        await robot.move_linear(
-            arm, candidates.shifted(T_base_tcp, config.place.release_height * candidates.UP), "put back"
-        )
+        T_back = se3.make(p=config.place.release_height * candidates.UP) @ T_base_tcp
+        await robot.move_linear(arm, T_back, "put back")
         run.hand = Hand.AT_OBJECT
     await robot.grip(arm, config.hand.opening, "open")
     await robot.wait(config.timing.after_release)
     if at_object:
-        await robot.move_linear(arm, candidates.shifted(T_base_tcp, grasp.candidate.approach_offset), "back off")
+        await robot.move_linear(arm, se3.make(p=grasp.candidate.approach_offset) @ T_base_tcp, "back off")
 
 
 def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[candidates.Box, ...]:
@@ -842,6 +841,6 @@ async def verify(run: Run, placed: Placed) -> Verdict:
         text = f"{run.label!r} is not in view after the place; observing again"
     error = placing_error(run.label, placed.target, frames[-1]) if frames else None
     if error is not None:
-        run.task.session.drift.add(config.camera, *error)
+        run.task.session.drift.add(*error)
     p_target, yaw = placed.target.position, run.request.place_yaw
     return verdicts.judge_place(run.label, p_target, frames, config.place.tolerance, yaw, run.height)

@@ -26,7 +26,7 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.perception.find import find
 from openarm_grasp.planning.arms import ARMS, arm_order
-from openarm_grasp.planning.candidates import UP, GraspCandidate, shifted
+from openarm_grasp.planning.candidates import UP, GraspCandidate
 from openarm_grasp.planning.feasibility import FeasibilityCheck, grasp_request, refusal_of, standing_at
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.interface import Planned
@@ -161,7 +161,8 @@ async def carry_out_push(task: Task, planned: Push, label: str, number: int) -> 
     T_base_back, fault = way.T_base_tcp, None
     try:
         await _go_behind(task, planned)
-        T_base_back = shifted(way.T_base_tcp, way.retreat_offset - config.push.gap * _direction(way.retreat_offset))
+        p_back = way.retreat_offset - config.push.gap * _direction(way.retreat_offset)
+        T_base_back = se3.make(p=p_back) @ way.T_base_tcp
         await robot.follow(arm, planned.plan.retreat, "push")
     except OpenArmError as error:
         fault = error

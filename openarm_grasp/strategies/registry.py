@@ -16,7 +16,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.strategies.direct import direct
 from openarm_grasp.strategies.hand_over import hand_over
-from openarm_grasp.strategies.pair import Pair, PairOutcome, in_turn, simultaneous
+from openarm_grasp.strategies.pair import ENDS, Pair, PairOutcome, in_turn, simultaneous
 from openarm_grasp.strategies.push import push
 from openarm_grasp.strategies.request import GraspOutcome
 from openarm_grasp.strategies.task import Task
@@ -29,8 +29,6 @@ STRATEGIES: dict[str, Strategy] = {
     "push": push,
     "hand_over": hand_over,
 }
-#: These end a request; no other strategy is tried.
-_ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
 
 
 async def carry_out(task: Task) -> GraspOutcome:
@@ -44,9 +42,9 @@ async def carry_out(task: Task) -> GraspOutcome:
             outcome = await strategy(task)
         except OpenArmError as error:
             known = task.outcome
-            if known is None or error.code not in (*_ENDS, *NO_WAY, Code.PLACE_FAILED):
+            if known is None or error.code not in (*ENDS, *NO_WAY, Code.PLACE_FAILED):
                 raise
-            if error.code in _ENDS:
+            if error.code in ENDS:
                 return task.answer(replace(known, code=error.code, message=error.message), "")
             task.outcome = replace(known, message=f"{known.message}; {error.message}")
             continue

@@ -44,7 +44,7 @@ class GraspSession:
 
     def __init__(self, context: GraspContext) -> None:
         self.context = context
-        self.drift = DriftWatch(context.config.drift)
+        self.drift = DriftWatch(context.config.drift, context.config.camera)
         #: What hands kept when their requests ended, by arm.
         self.kept: dict[str, Kept] = {}
 
