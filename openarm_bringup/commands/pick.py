@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from openarm_interfaces.msg import GraspStatus
 
     from openarm_grasp.planning.options import Option
-    from openarm_grasp.ros.answers import GraspResult, PairResult
+    from openarm_grasp.ros.client import GraspResult, PairResult
 
 
 Arm = Literal["auto", "left", "right"]

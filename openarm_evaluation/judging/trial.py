@@ -18,8 +18,7 @@ from openarm_evaluation.judging.provenance import scene_hash
 
 if TYPE_CHECKING:
     from openarm_evaluation.judging.ros.observer import Observer
-    from openarm_grasp.ros.answers import GraspResult
-    from openarm_grasp.ros.client import GraspClient
+    from openarm_grasp.ros.client import GraspClient, GraspResult
     from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
 
 #: How near an object must be to its place in the scene file to be that scene's, m.
@@ -253,7 +252,7 @@ def _observed(
 
 def _failed(error: OpenArmError, label: str) -> GraspResult:
     """Return the result of a request that was not answered."""
-    from openarm_grasp.ros.answers import GraspResult
+    from openarm_grasp.ros.client import GraspResult
 
     return GraspResult(False, error.code, error.message, "FAILED", label, "", 0, (0.0, 0.0, 0.0), 0.0)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detections of objects, and the geometry of their boxes.
+"""Detections of objects, the geometry of their boxes, and the one object in them that can be trusted.
 
 All poses are in the base frame. A detection is an upright box: its z axis is up, ``size[0]`` and ``size[1]`` are the
 footprint edges along its x and y, ``size[2]`` its height. A box has no front: turned by 90° with swapped edges it is
@@ -10,12 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from openarm_common import se3
 from openarm_common.detection import Detection
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
+from openarm_grasp.config import DetectConfig
 
 #: An object that is chosen by its position is no farther from it than this, m.
 SAME_PLACE = 0.05
@@ -97,3 +100,141 @@ def average(track: Sequence[Detection]) -> Detection:
     score = float(np.mean([d.score for d in track]))
     around = 2 * sum(d.round for d in track) > len(track)
     return Detection(reference.label, score, se3.make(se3.rot_z(yaw), p), np.mean(sizes, axis=0), around)
+
+
+def find(
+    frames: Sequence[Frame],
+    label: str,
+    limits: DetectConfig,
+    *,
+    at: Sequence[float] | None = None,
+    exclude_near: Sequence[Sequence[float]] = (),
+) -> Sighting:
+    """Follow one object through all frames and average it.
+
+    Args:
+        frames: At least one, oldest first.
+        label: What to look for; "" takes any.
+        limits: How near detections must be to be one object, and how much it may seem to move.
+        at: (x, y) where it stands, m; None takes the detection with the highest score.
+        exclude_near: (x, y) of objects that are excluded, m.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED, when no frame holds anything, or the chosen one cannot be measured;
+            UNKNOWN_OBJECT, naming what is in view; STALE_DATA, when the object was not in the newest frame and two
+            thirds of all, or moved between them.
+    """
+    seen = labels_in_view(frames)
+    if not seen:
+        raise OpenArmError(Code.NOTHING_DETECTED, f"nothing is in view (asked for {label or 'any object'!r})")
+    if label and label not in seen:
+        raise OpenArmError(Code.UNKNOWN_OBJECT, f"no {label!r} in view; in view: {', '.join(seen)}")
+    anchor = _anchor(frames[-1], label, at, exclude_near)
+    track: list[Detection] = []
+    for frame in frames:
+        fit = [d for d in frame.detections if d.label == anchor.label and d.measured]
+        near = [d for d in fit if _distance(d, anchor) <= limits.match_radius]
+        track += [min(near, key=lambda d: _distance(d, anchor))] if near else []
+    # A detector may miss a thing in one frame; in most of them it must be in its place.
+    if 3 * len(track) < 2 * len(frames):
+        blurred = [f for f in frames if any(not d.measured and _same_thing(d, anchor) for d in f.detections)]
+        if 3 * (len(track) + len(blurred)) >= 2 * len(frames):
+            raise _not_measured(anchor)
+        raise OpenArmError(
+            Code.STALE_DATA,
+            f"{anchor.label!r} is in the same place in {len(track)} of {len(frames)} frames only: expected one within"
+            f" {limits.match_radius * 1e3:.0f} mm of {_text(anchor.p_base)} in two thirds of them",
+        )
+    steps = [_distance(a, b) for a, b in pairwise(track)]
+    if steps and max(steps) > limits.agree_within:
+        raise OpenArmError(
+            Code.STALE_DATA,
+            f"{anchor.label!r} moved {max(steps) * 1e3:.1f} mm between two frames, expected at most"
+            f" {limits.agree_within * 1e3:.1f} mm; is it at rest?",
+        )
+    target = average(track)
+    return Sighting(target, _others(frames, target, limits.match_radius), frames[-1].t_ns)
+
+
+def _anchor(frame: Frame, label: str, at: Sequence[float] | None, exclude_near: Sequence[Sequence[float]]) -> Detection:
+    """The detection of the object that is asked for."""
+    name = label or "the object"
+    fitting = [d for d in frame.detections if not label or d.label == label]
+    if not fitting:
+        raise OpenArmError(Code.STALE_DATA, f"{name!r} was in view, but not in the newest frame")
+    chosen = [d for d in fitting if all(_from(d, p) > SAME_PLACE for p in exclude_near)]
+    if not chosen:
+        raise OpenArmError(
+            Code.UNKNOWN_OBJECT, f"no {name!r} in view besides {len(fitting)} that shall stay where they are"
+        )
+    if at is not None:
+        near = [d for d in chosen if _from(d, at) <= SAME_PLACE]
+        if not near:
+            there = ", ".join(_text(d.p_base) for d in chosen)
+            limit = f"within {SAME_PLACE * 1e3:.0f} mm of ({at[0]:.3f}, {at[1]:.3f}) m"
+            raise OpenArmError(Code.UNKNOWN_OBJECT, f"no {name!r} {limit}; it is seen at {there}")
+        chosen = [min(near, key=lambda d: _from(d, at))]
+    measured = [d for d in chosen if d.measured]
+    if not measured:
+        raise _not_measured(chosen[0])
+    return max(measured, key=lambda d: d.score)
+
+
+def _same_thing(a: Detection, b: Detection) -> bool:
+    return a.label == b.label and apart(a, b) <= SAME_PLACE
+
+
+def _not_measured(d: Detection) -> OpenArmError:
+    return OpenArmError(
+        Code.NOTHING_DETECTED,
+        f"{d.label!r} is in view at about {_text(d.p_base)}, but cannot be measured: something hides its outline, or"
+        " the border of the image cuts it",
+    )
+
+
+def on_table(d: Detection, table_z: float, *, reach: float = 0.03) -> Detection:
+    """Let a box that stands on the table end there: its top is measured, its bottom is usually hidden.
+
+    Args:
+        d: The box.
+        table_z: Height of the table top, base frame, m.
+        reach: A bottom further than this from the table is believed (the object stands on something else), m.
+
+    Raises:
+        OpenArmError: STALE_DATA, when the box is flatter than 5 mm: there is nothing to grasp.
+    """
+    if abs(d.bottom - table_z) > reach:
+        return d
+    height = d.top - table_z
+    if height < 0.005:
+        raise OpenArmError(
+            Code.STALE_DATA,
+            f"{d.label!r} is measured {height * 1e3:.0f} mm above the table at {table_z:.3f} m, expected at least 5 mm;"
+            " is the camera calibrated?",
+        )
+    T = d.T_base_object.copy()
+    T[2, 3] = table_z + height / 2.0
+    return replace(d, T_base_object=T, size=np.array([d.size[0], d.size[1], height]))
+
+
+def _others(frames: Sequence[Frame], target: Detection, match_radius: float) -> tuple[Detection, ...]:
+    found: list[Detection] = []
+    for frame in reversed(frames):
+        for d in frame.detections:
+            # The middle of what is seen of an object may lie near another one.
+            rivals = (k for k in (target, *found) if k.label == d.label or (k.measured and d.measured))
+            if all(apart(d, known) > match_radius for known in rivals):
+                found.append(d)
+    return tuple(found)
+
+
+def _distance(a: Detection, b: Detection) -> float:
+    return float(np.linalg.norm(a.p_base - b.p_base))
+
+
+def _from(d: Detection, p: Sequence[float]) -> float:
+    return float(np.hypot(d.p_base[0] - p[0], d.p_base[1] - p[1]))
+
+
+def _text(p: Array) -> str:
+    return "(" + ", ".join(f"{v:.3f}" for v in p) + ") m"

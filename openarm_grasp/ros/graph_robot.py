@@ -22,7 +22,7 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, Trajectory, check_deadline
-from openarm_grasp.ros import convert
+from openarm_grasp.ros import messages
 from openarm_grasp.ros.graph_clients import DETECTIONS, GraphClients
 
 
@@ -183,18 +183,18 @@ class GraphRobot:
     # --- planning and moving
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Ask /motion/plan_approach."""
-        goal = convert.plan_goal(request, self._config.velocity_scale)
+        goal = messages.plan_goal(request, self._config.velocity_scale)
         what = f"{request.arm} arm: planning"
         result = await self._nodes.goal(self._plan, goal, self._config.limits.plan_timeout, what, self._watched(None))
-        return convert.planned_from_msg(result, len(goal.targets))
+        return messages.planned_from_msg(result, len(goal.targets))
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
         """Ask /motion/compute_ik."""
         if not self._ik.service_is_ready():
             return {}
-        answered = self._ik.call_async(convert.reach_request(arm, T_base_tcp))
+        answered = self._ik.call_async(messages.reach_request(arm, T_base_tcp))
         await self._nodes.until(answered.done, self._config.limits.answer_timeout, "/motion/compute_ik")
-        return convert.reach_from_msg(arm, answered.result(), T_base_tcp)
+        return messages.reach_from_msg(arm, answered.result(), T_base_tcp)
 
     async def follow(
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
@@ -205,12 +205,12 @@ class GraphRobot:
 
     async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Ask /motion/move for a straight line."""
-        goal = convert.move_goal(arm, T_base_tcp, (), self._config.velocity_scale, self.max_start_delay)
+        goal = messages.move_goal(arm, T_base_tcp, (), self._config.velocity_scale, self.max_start_delay)
         await self._moved(self._move, goal, what)
 
     async def move_named(self, arm: str, named: str, obstacles: Sequence[Box], what: str) -> None:
         """Ask /motion/move for a free path to a posture."""
-        goal = convert.move_goal(arm, named, obstacles, self._config.velocity_scale, self.max_start_delay)
+        goal = messages.move_goal(arm, named, obstacles, self._config.velocity_scale, self.max_start_delay)
         await self._moved(self._move, goal, what)
 
     async def _moved(
@@ -219,12 +219,12 @@ class GraphRobot:
         limit = self._config.limits.move_timeout + self.max_start_delay
         result = await self._nodes.goal(client, goal, limit, what, self._watched(guard))
         if not result.success:
-            code = convert.code_from_text(result.code, Code.EXECUTION_FAILED)
+            code = messages.code_from_text(result.code, Code.EXECUTION_FAILED)
             raise OpenArmError(code, f"{what}: {result.message or 'failed'}")
 
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Ask the gripper's controller."""
-        goal = convert.gripper_goal(self._config.gripper_action, joint, position, effort)
+        goal = messages.gripper_goal(self._config.gripper_action, joint, position, effort)
         limit = self._config.limits.gripper_timeout
         result = await self._nodes.goal(self._grippers[arm], goal, limit, what, self._watched(None))
         return bool(result.stalled or result.reached_goal)

@@ -27,9 +27,9 @@ from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.ros import messages
 from openarm_grasp.ros.graph_robot import GraphRobot
-from openarm_grasp.strategies.pair import Pair, PairOutcome
+from openarm_grasp.strategies.pair import Pair
 from openarm_grasp.strategies.registry import carry_out, carry_out_pair
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
+from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome
 from openarm_grasp.strategies.states import State
 from openarm_grasp.strategies.task import GraspSession, Status, Task
 

@@ -8,21 +8,20 @@ to each other that the arms would only wait, the objects are picked one after th
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
-from openarm_grasp.perception.detections import SAME_PLACE, Sighting
-from openarm_grasp.perception.find import find, on_table
+from openarm_grasp.perception.detections import SAME_PLACE, Sighting, find, on_table
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.feasibility import FeasibilityCheck, refusal_of
 from openarm_grasp.robot.coordination import ArmCoordination, coordinated
 from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
+from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome
 from openarm_grasp.strategies.states import State
 from openarm_grasp.strategies.task import GraspSession, Report, Status, Task
 
@@ -32,40 +31,6 @@ Requests = tuple[GraspRequest, GraspRequest]
 _APART = 0.20
 #: These end a request, and one that runs beside it; no other strategy is tried.
 ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
-
-
-@dataclass(frozen=True)
-class PairOutcome:
-    """The answer to two requests.
-
-    Attributes:
-        answers: To each, in their order; none when they were not taken.
-        code: OK, or of the first that failed; CANCELLED, when one of them was.
-        message: What happened to each.
-        simultaneous: Both arms worked at the same time.
-        duration: s of robot time.
-    """
-
-    answers: tuple[GraspOutcome, ...]
-    code: Code
-    message: str
-    simultaneous: bool = False
-    duration: float = 0.0
-
-    @property
-    def success(self) -> bool:
-        """Whether both happened."""
-        return self.code is Code.OK
-
-    @property
-    def kind(self) -> str:
-        """What both are; else CANCELLED when one is, PARTIAL when one has come somewhere, FAILED."""
-        kinds = {answer.kind for answer in self.answers} or {"REFUSED"}
-        if len(kinds) == 1:
-            return kinds.pop()
-        if "CANCELLED" in kinds:
-            return "CANCELLED"
-        return "PARTIAL" if kinds & {"SUCCESS", "PARTIAL"} else "FAILED"
 
 
 class Pair:

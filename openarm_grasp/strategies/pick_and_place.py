@@ -21,8 +21,7 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.verdicts import Verdict
-from openarm_grasp.perception.detections import Frame, Sighting, apart, labels_in_view
-from openarm_grasp.perception.find import find, on_table
+from openarm_grasp.perception.detections import Frame, Sighting, apart, find, labels_in_view, on_table
 from openarm_grasp.planning import candidates
 from openarm_grasp.planning.arms import ARMS, arm_order, out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget

@@ -23,8 +23,7 @@ from openarm_common.robot.description import RobotDescription, Side
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.perception.find import find
+from openarm_grasp.perception.detections import Sighting, find
 from openarm_grasp.planning.arms import ARMS, arm_order
 from openarm_grasp.planning.candidates import UP, GraspCandidate
 from openarm_grasp.planning.feasibility import FeasibilityCheck, grasp_request, refusal_of, standing_at

@@ -16,9 +16,9 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.strategies.direct import direct
 from openarm_grasp.strategies.hand_over import hand_over
-from openarm_grasp.strategies.pair import ENDS, Pair, PairOutcome, in_turn, simultaneous
+from openarm_grasp.strategies.pair import ENDS, Pair, in_turn, simultaneous
 from openarm_grasp.strategies.push import push
-from openarm_grasp.strategies.request import GraspOutcome
+from openarm_grasp.strategies.request import GraspOutcome, PairOutcome
 from openarm_grasp.strategies.task import Task
 
 Strategy = Callable[[Task], Awaitable[GraspOutcome | None]]

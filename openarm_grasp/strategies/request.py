@@ -137,3 +137,37 @@ class GraspOutcome:
     def success(self) -> bool:
         """Whether what was asked for happened."""
         return self.code is Code.OK
+
+
+@dataclass(frozen=True)
+class PairOutcome:
+    """The answer to two requests.
+
+    Attributes:
+        answers: To each, in their order; none when they were not taken.
+        code: OK, or of the first that failed; CANCELLED, when one of them was.
+        message: What happened to each.
+        simultaneous: Both arms worked at the same time.
+        duration: s of robot time.
+    """
+
+    answers: tuple[GraspOutcome, ...]
+    code: Code
+    message: str
+    simultaneous: bool = False
+    duration: float = 0.0
+
+    @property
+    def success(self) -> bool:
+        """Whether both happened."""
+        return self.code is Code.OK
+
+    @property
+    def kind(self) -> str:
+        """What both are; else CANCELLED when one is, PARTIAL when one has come somewhere, FAILED."""
+        kinds = {answer.kind for answer in self.answers} or {"REFUSED"}
+        if len(kinds) == 1:
+            return kinds.pop()
+        if "CANCELLED" in kinds:
+            return "CANCELLED"
+        return "PARTIAL" if kinds & {"SUCCESS", "PARTIAL"} else "FAILED"

@@ -13,8 +13,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import propose
-from openarm_grasp.strategies.pair import PairOutcome, check_pair
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, Proof
+from openarm_grasp.strategies.pair import check_pair
+from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome, Proof
 from openarm_grasp.strategies.task import GraspSession, Kept
 from tests.openarm_grasp.scripted import GoHome
 

@@ -11,7 +11,7 @@ from openarm_common.ros.convert import pose_to_matrix
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import Box, held_box, propose, target_box
 from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
-from openarm_grasp.ros import convert
+from openarm_grasp.ros import messages
 
 
 def test_a_plan_of_what_comes_later_names_where_the_object_will_not_stand_any_more() -> None:
@@ -19,12 +19,12 @@ def test_a_plan_of_what_comes_later_names_where_the_object_will_not_stand_any_mo
     target = Detection("red", 1.0, se3.make(p=(0.30, -0.20, 0.425)), np.full(3, 0.05))
     ways = propose(target, config)
     box, gone = target_box(target, config), Box("red", se3.make(p=(0.40, -0.20, 0.425)), (0.06, 0.06, 0.05))
-    grasp = convert.plan_goal(PlanGrasp("right", ways, (), box, (gone,)), 0.0)
-    place = convert.plan_goal(
+    grasp = messages.plan_goal(PlanGrasp("right", ways, (), box, (gone,)), 0.0)
+    place = messages.plan_goal(
         PlanPlace("right", (), (), held_box(target, ways[0], config), ignore_regions=(gone,)), 0.0
     )
     for goal in (grasp, place):
         (told,) = goal.ignore_regions
         np.testing.assert_allclose(pose_to_matrix(told.pose), gone.T_frame_box)
         assert (told.size.x, told.size.y, told.size.z) == gone.size
-    assert list(convert.plan_goal(PlanGrasp("right", ways, (), box), 0.0).ignore_regions) == []
+    assert list(messages.plan_goal(PlanGrasp("right", ways, (), box), 0.0).ignore_regions) == []
