@@ -15,7 +15,7 @@ from openarm_common.errors import Answer, Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
 from openarm_common.ros.convert import point, xyz
 from openarm_grasp.planning.options import Option
-from openarm_grasp.ros.messages import option_from_msg
+from openarm_grasp.ros.messages import code_from_text, option_from_msg
 from openarm_grasp.strategies.request import GraspRequest
 
 OnFeedback = Callable[[GraspStatus], None]
@@ -164,7 +164,7 @@ class GraspClient(BackgroundNode):
         return PairResult(
             success=answer.success,
             outcome=answer.outcome,
-            code=_code(answer.code),
+            code=Code.OK if answer.success else code_from_text(answer.code, Code.INTERNAL),
             message=answer.message,
             simultaneous=answer.simultaneous,
             results=tuple(_result(one) for one in answer.results),
@@ -200,16 +200,12 @@ def _where(
         request.has_object_position, request.object_position = True, point((object_at[0], object_at[1], 0.0))
 
 
-def _code(text: str) -> Code:
-    return Code(text) if text in Code.__members__ else Code.INTERNAL
-
-
 def _result(message: Pick.Result | PickResult) -> GraspResult:
     x, y, z = (float(v) for v in xyz(message.place_position))
     return GraspResult(
         success=message.success,
         outcome=message.outcome,
-        code=_code(message.code),
+        code=Code.OK if message.success else code_from_text(message.code, Code.INTERNAL),
         message=message.message,
         label=message.label,
         arm=message.arm,

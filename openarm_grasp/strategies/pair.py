@@ -8,7 +8,7 @@ to each other that the arms would only wait, the objects are picked one after th
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,32 +33,31 @@ _APART = 0.20
 ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
 
 
+@dataclass
 class Pair:
     """Two requests of a user while strategies carry them out.
 
-    Args:
+    Attributes:
         session: What outlives the requests.
         robot: Carries out what is done with one arm at a time.
         robots: Interface for each arm while both work.
         requests: What is asked for.
         report: Called at each state that is entered.
-        alone: Carries out one of the requests alone, by whatever strategy.
+        carry_out: Carries out one of the requests alone, by whatever strategy.
+        reason: Why both are, or are not, carried out at the same time.
     """
 
-    def __init__(
-        self,
-        session: GraspSession,
-        robot: Skills,
-        robots: Mapping[Side, RobotInterface],
-        requests: Requests,
-        report: Report,
-        alone: Callable[[Task], Awaitable[GraspOutcome]],
-    ) -> None:
-        self.session, self.robot, self.robots = session, robot, robots
-        self.requests, self.report, self._alone = requests, report, alone
-        self.began_ns = robot.now_ns
-        #: Why both are, or are not, carried out at the same time.
-        self.reason = ""
+    session: GraspSession
+    robot: Skills
+    robots: Mapping[Side, RobotInterface]
+    requests: Requests
+    report: Report
+    carry_out: Callable[[Task], Awaitable[GraspOutcome]]
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        """Begin to measure the time."""
+        self.began_ns = self.robot.now_ns
 
     def check(self) -> None:
         """Refuse what is no pair, and what would drop an object that a hand keeps.
@@ -91,7 +90,7 @@ class Pair:
     async def alone(self, i: int) -> GraspOutcome:
         """Carry one of the requests out alone."""
         try:
-            return await self._alone(self.task(i, self.robot))
+            return await self.carry_out(self.task(i, self.robot))
         except OpenArmError as error:
             return GraspOutcome(error.code, error.message, self.requests[i].label)
 

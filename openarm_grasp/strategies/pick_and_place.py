@@ -32,7 +32,7 @@ from openarm_grasp.robot.interface import Frames, Planned
 from openarm_grasp.robot.skills import reraise_stop
 from openarm_grasp.strategies.request import Feasible, GraspOutcome, GraspRequest, Proof
 from openarm_grasp.strategies.states import State, check_transition
-from openarm_grasp.strategies.task import Findings, Kept, Status, Task
+from openarm_grasp.strategies.task import Findings, Grasp, Status, Task
 
 #: Frames that must not show the object in its old place after the lift: a detector may miss it in one.
 _LIFT_FRAMES = 2
@@ -49,23 +49,6 @@ class Hand(Enum):
     CARRYING = "elsewhere, holding the object"
     RELEASED = "around the object that it has put down"
     CLEAR = "away from the object that it has put down"
-
-
-@dataclass(frozen=True)
-class Grasp:
-    """A grasp that was chosen.
-
-    Attributes:
-        arm: Whose hand.
-        sighting: The object and its neighbours before the grasp.
-        candidate: How the hand takes hold.
-        places: Ways to put the object down.
-    """
-
-    arm: str
-    sighting: Sighting
-    candidate: GraspCandidate
-    places: tuple[PlaceTarget, ...]
 
 
 @dataclass(frozen=True)
@@ -102,7 +85,7 @@ class Run:
         kept: What a hand kept from an earlier request, when it is this one's to place.
     """
 
-    def __init__(self, task: Task, request: GraspRequest, kept: Kept | None) -> None:
+    def __init__(self, task: Task, request: GraspRequest, kept: Grasp | None) -> None:
         self.task, self.request, self.kept = task, request, kept
         self.robot, self.context, self.config = task.robot, task.context, task.context.config
         self.began_ns = task.robot.now_ns
@@ -149,8 +132,8 @@ class Run:
         """
         check_transition(self.state, state)
         previous, self.state = self.state, state
-        status = Status(state, previous, reason, self.attempt, self.label, self.arm, self.task.index)
-        status = replace(status, failed=self.failure is not None)
+        failed = self.failure is not None
+        status = Status(state, previous, reason, self.attempt, self.label, self.arm, self.task.index, failed)
         if state in (State.PLAN, State.MOVE_TO_PREGRASP):
             mine = (option for option in self.options.values() if option.arm == self.arm)
             refused = frozenset(option.id for option in mine if option.code not in ("", Code.OK))
@@ -239,7 +222,7 @@ async def pick_and_place(task: Task, request: GraspRequest) -> GraspOutcome:
     session.check_hands(robot, request)
     request.check()
     kept = session.to_place(request) if request.phase == "place" else None
-    run = Run(task, replace(request, label=kept.target.label) if kept else request, kept)
+    run = Run(task, replace(request, label=kept.sighting.target.label) if kept else request, kept)
     robot.set_deadline(request.timeout)
     try:
         outcome = await _attempts(run)
@@ -252,7 +235,7 @@ async def pick_and_place(task: Task, request: GraspRequest) -> GraspOutcome:
         text = f"{type(error).__name__}: {error}; see the log of the grasp node"
         outcome = run.answer(Code.INTERNAL, text)
     if run.holding and run.grasp is not None:
-        session.kept[run.arm] = Kept(run.arm, run.grasp.sighting.target, run.grasp.candidate)
+        session.kept[run.arm] = run.grasp
     elif not run.holding and not request.dry_run:
         session.kept.pop(run.arm, None)
     task.outcome, task.findings, task.attempts = outcome, run.findings, max(task.attempts, outcome.attempts)
@@ -362,7 +345,12 @@ async def detect(run: Run, why: str) -> Sighting:
                     f"nothing is in view of the camera (asked for {asked or 'any object'!r})",
                 )
             run.enter(State.IDLE, run.missed_round(code, missing))
-            why = await _next_frame(run)
+            why = "the next frame has come"
+            try:
+                await run.robot.observe(1)
+            except OpenArmError as error:
+                reraise_stop(error)
+                why = error.message  # the next round observes all the same
             continue
         run.enter(State.TRANSFORM, text)
         run.robot.stop_observing()
@@ -387,16 +375,6 @@ async def _clear_view(run: Run) -> None:
         await run.robot.go_home(ARMS, back_off_below=low)
 
 
-async def _next_frame(run: Run) -> str:
-    """Wait for the next frame; the next round observes whether it comes or not."""
-    try:
-        await run.robot.observe(1)
-    except OpenArmError as error:
-        reraise_stop(error)
-        return error.message
-    return "the next frame has come"
-
-
 def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
     """The object and its neighbours in frames of the base frame.
 
@@ -406,8 +384,8 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
     request, limits, top_z, kept = run.request, run.config.detect, run.context.table.top_z, run.kept
     if kept is not None:
         newest = frames[-1]
-        others = (d for d in newest.detections if d.label != kept.target.label)
-        sighting = Sighting(kept.target, _standing(others, top_z), newest.t_ns)
+        others = (d for d in newest.detections if d.label != kept.sighting.target.label)
+        sighting = Sighting(kept.sighting.target, _standing(others, top_z), newest.t_ns)
     else:
         found = find(frames, request.label, limits, at=request.object_at, exclude_near=request.exclude_near)
         target = on_table(found.target, top_z)

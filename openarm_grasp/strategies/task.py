@@ -6,13 +6,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.drift import DriftWatch
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.candidates import GraspCandidate
+from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
@@ -21,18 +20,20 @@ from openarm_grasp.strategies.states import State
 
 # --- what outlives a request
 @dataclass(frozen=True)
-class Kept:
-    """What a hand kept when its request ended.
+class Grasp:
+    """A grasp that was chosen.
 
     Attributes:
         arm: Whose hand.
-        target: The object as it stood before the grasp.
-        candidate: How it is held.
+        sighting: The object and its neighbours before the grasp.
+        candidate: How the hand takes hold.
+        places: Ways to put the object down.
     """
 
     arm: str
-    target: Detection
+    sighting: Sighting
     candidate: GraspCandidate
+    places: tuple[PlaceTarget, ...]
 
 
 class GraspSession:
@@ -46,7 +47,7 @@ class GraspSession:
         self.context = context
         self.drift = DriftWatch(context.config.drift, context.config.camera)
         #: What hands kept when their requests ended, by arm.
-        self.kept: dict[str, Kept] = {}
+        self.kept: dict[str, Grasp] = {}
 
     def check_hands(self, robot: Skills, request: GraspRequest) -> None:
         """Refuse what would drop an object that an ended request left in a hand; forget one that is gone.
@@ -64,11 +65,11 @@ class GraspSession:
             elif request.phase != "place":
                 raise OpenArmError(
                     Code.NOT_READY,
-                    f"the {arm} hand still holds {kept.target.label!r} (gap {aperture * 1e3:.0f} mm); ask for phase"
-                    f" place first, or open it with /{arm}_gripper_controller/gripper_cmd where that is safe",
+                    f"the {arm} hand still holds {kept.sighting.target.label!r} (gap {aperture * 1e3:.0f} mm); ask for"
+                    f" phase place first, or open it with /{arm}_gripper_controller/gripper_cmd where that is safe",
                 )
 
-    def to_place(self, request: GraspRequest) -> Kept:
+    def to_place(self, request: GraspRequest) -> Grasp:
         """What a request for phase place is about.
 
         Raises:
@@ -78,9 +79,9 @@ class GraspSession:
         if not kept:
             raise OpenArmError(Code.NOT_READY, "no hand holds anything that was picked; ask for phase pick first")
         for one in kept:
-            if request.label in ("", one.target.label) and request.arm in ("", "auto", one.arm):
+            if request.label in ("", one.sighting.target.label) and request.arm in ("", "auto", one.arm):
                 return one
-        held = ", ".join(f"the {one.arm} hand that holds {one.target.label!r}" for one in kept)
+        held = ", ".join(f"the {one.arm} hand that holds {one.sighting.target.label!r}" for one in kept)
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
             f"asked to place {request.label or 'an object'!r} with arm {request.arm!r}, but it is {held}",

@@ -12,18 +12,19 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import propose
 from openarm_grasp.strategies.pair import check_pair
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome, Proof
-from openarm_grasp.strategies.task import GraspSession, Kept
+from openarm_grasp.strategies.task import Grasp, GraspSession
 from tests.openarm_grasp.scripted import GoHome
 
 
-def kept(arm: str, label: str) -> Kept:
+def kept(arm: str, label: str) -> Grasp:
     T = np.eye(4)
     T[:3, 3] = (0.26, 0.2, 0.425)
     target = Detection(label, 1.0, T, np.full(3, 0.05))
-    return Kept(arm, target, propose(target, GraspConfig())[0])
+    return Grasp(arm, Sighting(target, (), 0), propose(target, GraspConfig())[0], ())
 
 
 @pytest.fixture
