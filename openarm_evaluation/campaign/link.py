@@ -214,18 +214,17 @@ class DirectLink:
         request = ExecuteRequest(arm, trajectory, self.max_start_delay)
         await self._moved(lambda stopped: self.robot.motion.execute(request, stopped), what, guard)
 
-    async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
-        """Move the TCP on a straight line."""
-        await self._move(MoveRequest(arm, LineGoal(T_base_tcp), **self._options()), what)
-
-    async def move_named(self, arm: str, named: str, obstacles: Sequence[GraspBox], what: str) -> None:
-        """Move an arm on a free path to a posture."""
-        await self._move(MoveRequest(arm, NamedGoal(named), boxes_of(obstacles), **self._options()), what)
-
-    def _options(self) -> dict[str, Any]:
-        return {"hand_empty": True, "scale": self._config.velocity_scale, "max_start_delay": self.max_start_delay}
-
-    async def _move(self, request: MoveRequest, what: str) -> None:
+    async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[GraspBox] = ()) -> None:
+        """Move an arm on a free path to a named posture, or its TCP on a straight line to a pose."""
+        goal = NamedGoal(to) if isinstance(to, str) else LineGoal(to)
+        request = MoveRequest(
+            arm,
+            goal,
+            boxes_of(obstacles),
+            hand_empty=True,
+            scale=self._config.velocity_scale,
+            max_start_delay=self.max_start_delay,
+        )
         await self._moved(lambda stopped: self.robot.motion.move(request, stopped), what)
 
     async def _moved(

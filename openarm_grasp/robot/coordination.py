@@ -107,13 +107,9 @@ class CoordinatedRobot:
         """Follow a planned trajectory, when the other arm leaves clearance for it."""
         await self._patiently(lambda: self._robot.follow(arm, trajectory, what, guard), what)
 
-    async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
-        """Move the TCP on a straight line."""
-        await self._patiently(lambda: self._robot.move_linear(arm, T_base_tcp, what), what)
-
-    async def move_named(self, arm: str, named: str, obstacles: Sequence[Box], what: str) -> None:
-        """Move an arm on a free path to a posture."""
-        await self._patiently(lambda: self._robot.move_named(arm, named, obstacles, what), what)
+    async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = ()) -> None:
+        """Move an arm to a named posture, or its TCP to a pose."""
+        await self._patiently(lambda: self._robot.move(arm, to, what, obstacles), what)
 
     # --- the other arm
     async def _patiently(self, work: Callable[[], Awaitable[T]], what: str) -> T:

@@ -144,11 +144,8 @@ class RobotInterface(Protocol):
     ) -> None:
         """Follow a planned trajectory."""
 
-    async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
-        """Move the TCP on a straight line."""
-
-    async def move_named(self, arm: str, named: str, obstacles: Sequence[Box], what: str) -> None:
-        """Move an arm on a free path to a posture."""
+    async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = ()) -> None:
+        """Move an arm on a free path to a named posture, or its TCP on a straight line to a pose (4, 4)."""
 
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Move the fingers with at most `effort` N (0: any); whether they arrived or push against something."""

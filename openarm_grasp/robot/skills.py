@@ -147,7 +147,7 @@ class Skills:
     async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
         """Move the TCP to a pose on a straight line."""
         self.robot.check()
-        await self.robot.move_linear(arm, T_base_tcp, f"{arm} arm: {what}")
+        await self.robot.move(arm, T_base_tcp, f"{arm} arm: {what}")
 
     async def go_home(
         self, arms: Sequence[str], obstacles: Sequence[Box] = (), *, back_off_below: float = float("-inf")
@@ -173,11 +173,11 @@ class Skills:
             if T_base_tcp[2, 3] < back_off_below:
                 T_back = T_base_tcp @ se3.make(p=(0.0, 0.0, -config.approach.pregrasp_distance))
                 try:
-                    await robot.move_linear(arm, T_back, f"{arm} arm: back off")
+                    await robot.move(arm, T_back, f"{arm} arm: back off")
                 except OpenArmError as error:
                     reraise_stop(error)
                     robot.warn(error.message)  # the free path home may still be there
-            await robot.move_named(arm, config.home_state, obstacles, f"{arm} arm: go {config.home_state}")
+            await robot.move(arm, config.home_state, f"{arm} arm: go {config.home_state}", obstacles)
 
     # --- the hand
     def aperture(self, arm: str) -> float:

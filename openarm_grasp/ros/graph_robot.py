@@ -203,14 +203,9 @@ class GraphRobot:
         goal = ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_start_delay=self.max_start_delay)
         await self._moved(self._execute, goal, what, guard)
 
-    async def move_linear(self, arm: str, T_base_tcp: Array, what: str) -> None:
-        """Ask /motion/move for a straight line."""
-        goal = messages.move_goal(arm, T_base_tcp, (), self._config.velocity_scale, self.max_start_delay)
-        await self._moved(self._move, goal, what)
-
-    async def move_named(self, arm: str, named: str, obstacles: Sequence[Box], what: str) -> None:
-        """Ask /motion/move for a free path to a posture."""
-        goal = messages.move_goal(arm, named, obstacles, self._config.velocity_scale, self.max_start_delay)
+    async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = ()) -> None:
+        """Ask /motion/move."""
+        goal = messages.move_goal(arm, to, obstacles, self._config.velocity_scale, self.max_start_delay)
         await self._moved(self._move, goal, what)
 
     async def _moved(
