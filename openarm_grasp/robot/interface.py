@@ -91,14 +91,17 @@ class RobotInterface(Protocol):
     @property
     def description(self) -> RobotDescription:
         """The robot."""
+        ...
 
     @property
     def states(self) -> RobotStateBuffer:
         """Its joint states."""
+        ...
 
     @property
     def base_frame(self) -> str:
         """Name of the base frame."""
+        ...
 
     deadline_ns: int
     """Robot time after which `check` raises CANCELLED; 0: none."""
@@ -106,12 +109,15 @@ class RobotInterface(Protocol):
     @property
     def now_ns(self) -> int:
         """Robot time."""
+        ...
 
     def effort(self, joint: str) -> float:
         """Newest effort of a joint, N or N m; 0 when none is published."""
+        ...
 
     def pads(self, arm: str) -> tuple[float, ...]:
         """Force on each finger pad of a hand, N; empty without a sensor."""
+        ...
 
     def check(self) -> None:
         """Raise when the work may not go on: CANCELLED, ROBOT_LOST."""
@@ -132,12 +138,15 @@ class RobotInterface(Protocol):
 
     async def observe(self, count: int, *, near: bool = False) -> Frames:
         """Frames of detections that are taken from now on, by the camera over the table or the one on the hand."""
+        ...
 
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Plan; raises with the planner's code."""
+        ...
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
         """How far the arm's TCP stays from a point, m by arm; empty when that cannot be said."""
+        ...
 
     async def follow(
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None
@@ -149,6 +158,7 @@ class RobotInterface(Protocol):
 
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Move the fingers with at most `effort` N (0: any); whether they arrived or push against something."""
+        ...
 
 
 def check_deadline(now_ns: int, deadline_ns: int) -> None:
