@@ -3,7 +3,7 @@
 
     python benchmarks/calibration.py [--quick] [--trials N] [--json PATH]
 
-Synthetic (see openarm_calibration.synthetic): 5, 10, 20, 30 poses; camera in the hand and over it; 0.1, 0.3 and 1.0 px;
+Synthetic (see hand_eye_problems.py): 5, 10, 20, 30 poses; camera in the hand and over it; 0.1, 0.3 and 1.0 px;
 an exact robot and one of 0.2 mm and 0.02° by axis. Each trial is solved with the noise known and with it estimated. A
 ratio is the rms of the errors over their bounds, for the position and for the rotation of the camera.
 """
@@ -23,12 +23,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import cv2
 import numpy as np
 
+from benchmarks import hand_eye_problems as synthetic
 from benchmarks.report import Row, write_report
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
 from openarm_calibration.handeye.problem import Setup, difference
 from openarm_calibration.handeye.refine import Noise
 from openarm_calibration.handeye.solve import SolveConfig, solve
-from openarm_calibration.synthetic import synthetic
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 

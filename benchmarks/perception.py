@@ -39,13 +39,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.map_accuracy import compare
 from benchmarks.map_scene import MapScene
 from benchmarks.report import Row, write_report
 from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
 from openarm_common.octree.codec import read_file, write_file
 from openarm_common.robot.self_filter import SelfFilter
 from openarm_common.scene.scene import load_scene, random_scene
-from openarm_octomap.accuracy import compare
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import DepthScan, OccupancyGrid

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 from openarm_common.lazy import attach
 
 if TYPE_CHECKING:
-    from openarm_octomap.accuracy import MapAccuracy, compare
     from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig, OctomapNodeConfig
     from openarm_octomap.distance import DistanceTransform
     from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
@@ -35,11 +34,9 @@ __all__ = [
     "FilterConfig",
     "Frame",
     "GridConfig",
-    "MapAccuracy",
     "Mapper",
     "OccupancyGrid",
     "OctomapNodeConfig",
-    "compare",
 ]
 
 __getattr__, __dir__ = attach(__name__, __file__)

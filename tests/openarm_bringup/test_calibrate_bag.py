@@ -21,11 +21,11 @@ from openarm_bringup.bags.ros.recorder import from_profile
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.sampling.samples import load_session
 from openarm_calibration.store.store import CalibrationStore
-from openarm_calibration.synthetic.synthetic_session import BOARD, Known, make_session, photograph
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.ros.convert import array_to_image, info_from_intrinsics, matrix_to_transform, ns_to_stamp
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+from tests.openarm_calibration.known_session import BOARD, Known, make_session, photograph
 
 MS = 1_000_000
 PLACES = 8

@@ -14,10 +14,10 @@ import pytest
 from openarm_bringup import cli
 from openarm_bringup.calibration import run as calibration
 from openarm_calibration.ros.client import AutoResult
-from openarm_calibration.synthetic.synthetic_session import make_session
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.errors import Code, OpenArmError
+from tests.openarm_calibration.known_session import make_session
 
 
 @pytest.fixture(scope="module")

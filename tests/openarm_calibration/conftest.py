@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from openarm_calibration.synthetic.synthetic_session import Known, make_session
+from tests.openarm_calibration.known_session import Known, make_session
 
 
 @pytest.fixture

@@ -17,11 +17,11 @@ from openarm_calibration.board.board import Board, Charuco, CircleGrid, parse_bo
 from openarm_calibration.board.board_files import pdf, png, write_board
 from openarm_calibration.board.detect import detect, guess_pose, refined
 from openarm_calibration.handeye.problem import project
-from openarm_calibration.synthetic import synthetic_session
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
+from tests.openarm_calibration import known_session
 
 K = Intrinsics.from_fovy(640, 480, 60.0)
 ROW = np.array([K.fx, K.fy, K.cx, K.cy])
@@ -35,7 +35,7 @@ def pose(rng: np.random.Generator, far: float = 0.7) -> np.ndarray:
 
 def photograph(board: Board, T: np.ndarray, rng: np.random.Generator, mirrored: bool = False) -> np.ndarray:
     """Picture of a board with grey noise of 2."""
-    image = synthetic_session.photograph(board, T, K, mirrored=mirrored) + rng.normal(0.0, 2.0, (480, 640))
+    image = known_session.photograph(board, T, K, mirrored=mirrored) + rng.normal(0.0, 2.0, (480, 640))
     return np.clip(image, 0, 255).astype(np.uint8)
 
 

@@ -8,11 +8,11 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks import hand_eye_problems as synthetic
 from openarm_calibration.handeye.closed_form import METHODS, closed_form, kronecker
 from openarm_calibration.handeye.problem import View, assemble, difference, moved
 from openarm_calibration.handeye.refine import Noise, mount_error, pixel_noise
 from openarm_calibration.handeye.solve import SolveConfig, solve
-from openarm_calibration.synthetic import synthetic
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 

@@ -14,9 +14,9 @@ from openarm_calibration.handeye.problem import moved
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.handeye.solve import SolveConfig
 from openarm_calibration.sampling.samples import SampleSet
-from openarm_calibration.synthetic.synthetic_session import Known
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.errors import OpenArmError
+from tests.openarm_calibration.known_session import Known
 
 ROBOT = (4e-4, math.radians(0.04))
 

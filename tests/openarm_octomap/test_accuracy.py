@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
+from benchmarks.map_accuracy import compare
 from benchmarks.map_scene import MapScene, Visible
 from openarm_common import se3
 from openarm_common.camera.flying_pixels import FlyingConfig
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.self_filter import SelfFilter
 from openarm_common.scene.scene import load_scene
-from openarm_octomap.accuracy import compare
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.kernels import OCCUPIED
 from openarm_octomap.mapper import Mapper

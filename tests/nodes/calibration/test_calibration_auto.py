@@ -20,11 +20,11 @@ from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.ros.node import CalibrationNode
 from openarm_calibration.sampling.samples import load_session
 from openarm_calibration.store.store import CalibrationStore
-from openarm_calibration.synthetic.synthetic_session import Known, make_session
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.ros.convert import pose_to_matrix
 from openarm_common.scene.scene import load_scene
+from tests.openarm_calibration.known_session import Known, make_session
 
 QUICK = {
     "auto.search.draws": 500, "auto.search.candidates": 12, "auto.tries": 10, "auto.settle_timeout": 1.0,

@@ -23,9 +23,9 @@ from rclpy.parameter import Parameter
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.ros.node import CalibrationNode
 from openarm_calibration.store.store import CalibrationStore
-from openarm_calibration.synthetic.synthetic_session import make_session
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
+from tests.openarm_calibration.known_session import make_session
 
 MS = 1_000_000
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Accuracy of a map: cells compared with the geometry that a simulator knows.
 
-Serves judges and tests; nothing that controls the robot reads it.
+Nothing that controls the robot reads it.
 """
 
 from __future__ import annotations
