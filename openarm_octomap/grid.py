@@ -21,7 +21,7 @@ from openarm_common.octree.lattice import DEPTH, Lattice
 from openarm_common.robot.self_filter import Shapes
 from openarm_common.types import Array, Bytes, Floats
 from openarm_octomap import kernels
-from openarm_octomap.config import GridConfig, UnknownPolicy
+from openarm_octomap.config import GridConfig
 from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN, reset_cells
 
 #: Keys outside of the box that one scan may end in.
@@ -131,8 +131,7 @@ class OccupancyGrid:
         """
         n = reset_cells(
             shapes.kinds, shapes.halves + padding, shapes.seen_from(np.eye(4)),
-            self.lattice.resolution, np.array(self.lattice.key_min, np.int64), self.log_odds, self.states,
-            self._changed,
+            self.lattice.resolution, self._key_min, self.log_odds, self.states, self._changed,
         )  # fmt: skip
         return self._changed[:n].copy()
 
@@ -234,23 +233,6 @@ class OccupancyGrid:
         out = np.full(index.shape[0], UNKNOWN, np.uint8)
         out[inside] = states[tuple(index[inside].T)]
         return out
-
-    def blocked_at(
-        self, points: ArrayLike, unknown: UnknownPolicy = "occupied", depth: int = DEPTH
-    ) -> NDArray[np.bool_]:
-        """Whether points (n, 3), m, must be kept clear of, at any depth; `unknown` is what unknown cells count as.
-
-        Args:
-            points: (n, 3), m.
-            unknown: What unknown cells count as.
-            depth: Of the tree; 16 is the resolution of the map.
-        """
-        states = self.states_at(points, depth)
-        return np.asarray((states == OCCUPIED) | ((states == UNKNOWN) & (unknown == "occupied")))
-
-    def centres(self, state: int = OCCUPIED) -> Array:
-        """Return centres (n, 3), m, of the cells of a state."""
-        return self.lattice.centres(np.argwhere(self.states == state))
 
     def _mark(self, scan: DepthScan | CloudScan) -> tuple[int, int, int]:
         config = self.config

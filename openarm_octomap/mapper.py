@@ -26,6 +26,7 @@ from openarm_common.types import Floats
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig, UnknownPolicy
 from openarm_octomap.distance import DistanceTransform
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
+from openarm_octomap.kernels import OCCUPIED, UNKNOWN
 
 #: Beyond any workspace, and still a whole number of cells, m.
 _FAR = 1e6
@@ -270,7 +271,8 @@ class Mapper:
         depth = max(DEPTH - levels, 1)
         at = np.clip(at, -_FAR, _FAR)
         with self._lock:
-            states, blocked = self._grid.states_at(at, depth), self._grid.blocked_at(at, unknown, depth)
+            states = self._grid.states_at(at, depth)
+        blocked = (states == OCCUPIED) | ((states == UNKNOWN) & (unknown == "occupied"))
         return Answer(states, blocked, edge * 2 ** (DEPTH - depth))
 
     def load(self, path: Path) -> tuple[int, int]:

@@ -281,8 +281,8 @@ def _part(joint: Solution, camera: int, own: Problem) -> Solution:
     mine = np.unique(problem.pose[rows][joint.used[rows]])
     part = Estimate(
         estimate.X[camera : camera + 1], estimate.Z[board : board + 1],
-        estimate.correction[np.searchsorted(numbers, mine)], estimate.noise, information, estimate.cost,
-        estimate.converged, spread=None if estimate.spread is None else covariance,
+        estimate.correction[np.searchsorted(numbers, mine)], estimate.noise, information,
+        spread=None if estimate.spread is None else covariance,
     )  # fmt: skip
     places = {int(row): k for k, row in enumerate(rows)}
     outliers = tuple(

@@ -142,22 +142,6 @@ def _search(
     return best_t, best_r
 
 
-def robot_spread(
-    full: Array, KMK: Array, both: Array, start: tuple[float, float], *, whole: bool
-) -> tuple[float, float]:
-    """Return the spread (m, rad) of the largest restricted likelihood.
-
-    Args:
-        full: See `criterion`.
-        KMK: See `criterion`.
-        both: See `criterion`.
-        start: Where to begin, m and rad.
-        whole: Whether the whole range is searched first, or only what is near the start.
-    """
-    found: tuple[float, float] = _search(full, np.ascontiguousarray(KMK), np.ascontiguousarray(both), *start, whole)
-    return found
-
-
 @njit(cache=True, nogil=True)
 def _answers(
     full: Array, KMK: Array, both: Array, spreads: Array, values: Array, answers: Array, covariances: Array
@@ -252,8 +236,6 @@ class Estimate:
         correction: (poses, 6) of the robot's poses.
         noise: That was used, or found.
         information: (parameters, parameters), columns as `problem.design`.
-        cost: Of the views and the corrections, in units of the noise.
-        converged: Whether the last step was small.
         scale: Of the board.
         delay: Of the images, s.
         intrinsics: (cameras, 4) changes of fx, fy, cx, cy, px.
@@ -266,8 +248,6 @@ class Estimate:
     correction: Array
     noise: Noise
     information: Array
-    cost: float
-    converged: bool
     scale: float = 1.0
     delay: float = 0.0
     intrinsics: Array | None = None
@@ -387,7 +367,7 @@ def refine(
         raise OpenArmError(
             Code.INTERNAL, "the refinement starts with a mark behind the camera; the closed form it came from is wrong"
         )
-    converged, damping, settled = False, 0.0, 0
+    damping, settled = 0.0, 0
     for count in range(iterations):
         if estimate_robot and count >= 2 and settled < 4:
             found = restricted_likelihood(linear, noise, whole=count == 2)
@@ -413,16 +393,14 @@ def refine(
         damping = damping * 0.1 if damping > 1e-6 else 0.0
         small = float(np.abs(step[: 6 * (problem.cameras + problem.boards)]).max()) < 1e-9
         if (small or cost - reached < 1e-9 * max(reached, 1.0)) and (not estimate_robot or settled >= 1):
-            converged = True
             break
     spread: Array | None = None
     if estimate_robot:
         full, both = _joined(linear)
         spread = averaged(full, linear.KMK, both, TYPICAL_ROBOT)
     information, _, _ = eliminate(linear, noise.prior)
-    total = linear.cost + _prior_cost(state.correction, noise.prior)
     return Estimate(
-        state.X, state.Z, state.correction, noise, information, total, converged,
+        state.X, state.Z, state.correction, noise, information,
         state.scale, state.delay, state.intrinsics, tuple(extras), spread,
     )  # fmt: skip
 
@@ -480,8 +458,8 @@ def restricted_likelihood(linear: Linear, noise: Noise, *, whole: bool) -> Noise
         whole: Whether the whole range is searched first.
     """
     full, both = _joined(linear)
-    found = robot_spread(full, linear.KMK, both, (noise.translation, noise.rotation), whole=whole)
-    return Noise(noise.px, *found)
+    start = noise.translation, noise.rotation
+    return Noise(noise.px, *_search(full, linear.KMK, both, *start, whole))
 
 
 def _joined(linear: Linear) -> tuple[Array, Array]:

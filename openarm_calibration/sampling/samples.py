@@ -28,7 +28,7 @@ from openarm_calibration.board.board import Board, parse_board
 from openarm_calibration.board.detect import BoardDetection, guess_pose
 from openarm_calibration.handeye.problem import Problem, View, assemble, difference
 from openarm_common import se3
-from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import write_whole
@@ -205,10 +205,6 @@ class SampleSet:
             view = View(points, sample.detection.pixels, A, self.head.setup, self.board.radius, pose=k, rate=rate)
             views.append(replace(view, name=sample.name))
         return assemble(views, [self.head.optics], [sample.T_camera_board for sample in self._samples])
-
-    def mount(self, X: Array) -> Array:
-        """Return T_parent_link of the camera for a solved X (4, 4) of its optical frame."""
-        return X @ se3.inverse(T_LINK_OPTICAL)
 
     # --- session file
     def _text(self) -> str:

@@ -60,10 +60,6 @@ class Letterbox:
         out[self.top : self.top + self.inner[1], self.left : self.left + self.inner[0]] = rgb
         return out
 
-    def into(self, boxes: Array) -> Array:
-        """Return boxes (n, 4) of the image in the input."""
-        return boxes * (*self.scale, *self.scale) + (self.left, self.top, self.left, self.top)
-
     def back(self, boxes: Array) -> Array:
         """Return boxes (n, 4) of the input in the image, cut where the image ends."""
         size = self.inner[0] / self.scale[0], self.inner[1] / self.scale[1]

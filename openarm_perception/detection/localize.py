@@ -112,21 +112,6 @@ class Localizer:
         """Cut out the neighbourhood of a detection, for the methods below; arguments and errors as `patch.cut`."""
         return cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
 
-    def coarse(self, patch: Patch) -> Array:
-        """Return the point on the visible surface: the median pixel of the mask at the median of its valid depths.
-
-        A single pixel carries the whole noise of the sensor; the median of hundreds carries next to none of it.
-
-        Returns:
-            (3,) in the base frame, m.
-
-        Raises:
-            OpenArmError: BAD_IMAGE, when there are too few valid depths.
-        """
-        v, u = np.nonzero(self._on_object(patch))
-        ray = patch.rays[int(np.median(v)), int(np.median(u))]
-        return patch.T_base_camera[:3, 3] + ray * float(np.median(patch.z[v, u]))
-
     def locate(self, patch: Patch) -> LocatedObject:
         """Locate the object of a detection.
 

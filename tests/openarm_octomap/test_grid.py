@@ -15,9 +15,11 @@ from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.codec import read_file, write_file
-from openarm_octomap.config import GridConfig
+from openarm_common.robot.description import RobotDescription
+from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
 from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN
+from openarm_octomap.mapper import Frame, Mapper
 
 K = Intrinsics.from_fovy(64, 48, 60.0)
 #: Looks down from 1 m onto z = 0.
@@ -230,7 +232,7 @@ def test_coarse_queries_keep_what_is_occupied() -> None:
     """A cell of 4, 8, 16 cm is occupied when a part of it is; centres lie on OctoMap's lattice of that edge."""
     grid = OccupancyGrid(GridConfig(**SMALL))
     grid.integrate([scan(floor(box=(slice(20, 28), slice(28, 36), 890)))], 0)
-    fine = grid.centres()
+    fine = grid.lattice.centres(np.argwhere(grid.states == OCCUPIED))
     for depth in (16, 15, 14, 13):
         lattice, states = grid.coarse(depth)
         assert lattice.resolution == pytest.approx(0.02 * 2 ** (16 - depth))
@@ -243,12 +245,12 @@ def test_coarse_queries_keep_what_is_occupied() -> None:
 
 
 def test_each_query_says_what_unknown_counts_as() -> None:
-    grid = OccupancyGrid(GridConfig(**SMALL))
-    grid.integrate([scan(floor(box=(slice(20, 28), slice(28, 36), 890)))], 0)
+    mapper = Mapper(RobotDescription.load(), GridConfig(**SMALL), FilterConfig(enabled=False), FieldConfig())
+    mapper.update([Frame("overhead", 0, scan(floor(box=(slice(20, 28), slice(28, 36), 890))), {})])
     occupied, free, unknown = (0.0, 0.0, 0.11), (0.0, 0.0, 0.3), (0.0, 0.0, -0.03)
-    assert grid.blocked_at([occupied, free, unknown]).tolist() == [True, False, True]
-    assert grid.blocked_at([occupied, free, unknown], "free").tolist() == [True, False, False]
-    assert grid.blocked_at([free], "free", depth=10).tolist() == [True]  # the coarse cell holds the box
+    assert mapper.query([occupied, free, unknown], 0.0, "occupied").blocked.tolist() == [True, False, True]
+    assert mapper.query([occupied, free, unknown], 0.0, "free").blocked.tolist() == [True, False, False]
+    assert mapper.query([free], 64 * 0.02, "free").blocked.tolist() == [True]  # the coarse cell holds the box
 
 
 def test_decay_forgets_what_nobody_looked_at() -> None:
