@@ -40,11 +40,12 @@ class DepthScan(DepthView):
 
     def points(self) -> Floats:
         """Points (n, 3) float32 of the valid pixels in the base frame, m: exactly those that are put into the map."""
-        out = np.empty((self.depth.size, 3), np.float32)
-        near, far = np.float32(self.near), np.float32(self.far)
-        T = np.ascontiguousarray(self.T_base_camera[:3], dtype=np.float32)
-        n = kernels.image_points(self.depth, self.scale, near, far, *self.rays, T, out)
-        return out[:n]
+        depth = self.depth.astype(np.float32) * self.scale
+        v, u = np.nonzero((depth >= np.float32(self.near)) & (depth <= np.float32(self.far)))
+        a, b, z = self.rays[0][u], self.rays[1][v], depth[v, u]
+        # in the order in which the kernel computes, so that they are equal to the last bit
+        rows = self.T_base_camera[:3].astype(np.float32)
+        return np.stack([(row[0] * a + (row[1] * b + row[2])) * z + row[3] for row in rows], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +118,9 @@ class OccupancyGrid:
         if self.config.decay_s <= 0.0:
             return np.empty(0, np.int32)
         limit = self._milliseconds(t_ns) - round(self.config.decay_s * 1e3)
-        n = kernels.forget_before(
-            limit, self.log_odds.reshape(-1), self.states.reshape(-1), self.seen.reshape(-1), self._changed
-        )
-        return self._changed[:n].copy()
+        old = (self.states == OCCUPIED) & (self.seen < limit)
+        self.states[old], self.log_odds[old] = UNKNOWN, np.nan
+        return np.flatnonzero(old).astype(np.int32)
 
     def forget(self, shapes: Shapes, padding: float) -> NDArray[np.int32]:
         """Make the occupied cells unknown that padded shapes fill; flat indices of those.

@@ -39,40 +39,6 @@ def _free_slot(x: Whole, y: Whole, z: Whole, table: Ints) -> Whole:
 
 
 @njit(cache=True, nogil=True)
-def image_points(
-    depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32,
-    ray_x: Floats, ray_y: Floats, T: Floats, out: Floats,
-) -> int:  # fmt: skip
-    """Return points of the valid pixels in the frame of the map, as `image_ends` computes them.
-
-    Args:
-        depth: (h, w) planar depth in counts of `scale` metres.
-        scale: Metres of a count.
-        near: Nearest valid depth, m.
-        far: Farthest valid depth, m.
-        ray_x: (w,) x over z of each column.
-        ray_y: (h,) y over z of each row.
-        T: (3, 4) float32, camera in the frame of the map.
-        out: (h * w, 3), filled.
-
-    Returns:
-        How many points there are.
-    """
-    n = 0
-    for v in range(depth.shape[0]):
-        b = ray_y[v]
-        for u in range(depth.shape[1]):
-            z = np.float32(depth[v, u]) * scale
-            if near <= z <= far:
-                a = ray_x[u]
-                out[n, 0] = (T[0, 0] * a + (T[0, 1] * b + T[0, 2])) * z + T[0, 3]
-                out[n, 1] = (T[1, 0] * a + (T[1, 1] * b + T[1, 2])) * z + T[1, 3]
-                out[n, 2] = (T[2, 0] * a + (T[2, 1] * b + T[2, 2])) * z + T[2, 3]
-                n += 1
-    return n
-
-
-@njit(cache=True, nogil=True)
 def image_ends(
     depth: DepthImage, scale: np.float32, near: np.float32, far: np.float32,
     block: int, stride: int, reach: np.float32,
@@ -83,7 +49,7 @@ def image_ends(
     """Return cells where the rays of a depth image end, each once; those of surfaces are marked.
 
     Args:
-        depth: As for `image_points`, and so are `scale`, `near`, `far`, `ray_x`, `ray_y`, `T`.
+        depth: (h, w) planar depth in counts of `scale` metres.
         scale: Metres of a count.
         near: Nearest valid depth, m.
         far: Farthest valid depth, m.
@@ -505,27 +471,4 @@ def apply_marks(
             log_odds[j] = value
             seen[j] = now
         words[i] = 0
-    return count
-
-
-@njit(cache=True, nogil=True)
-def forget_before(
-    limit: int, log_odds: Floats, states: Bytes, seen: NDArray[np.int32], changed: NDArray[np.int32]
-) -> int:
-    """Make occupied cells unknown that were last observed before `limit`; flat arrays, returns how many.
-
-    Args:
-        limit: ms.
-        log_odds: (n,), changed.
-        states: (n,), changed.
-        seen: (n,) when each cell was last observed, ms.
-        changed: Filled with the indices.
-    """
-    count = 0
-    for i in range(states.size):
-        if states[i] == OCCUPIED and seen[i] < limit:
-            states[i] = UNKNOWN
-            log_odds[i] = np.float32(np.nan)
-            changed[count] = i
-            count += 1
     return count

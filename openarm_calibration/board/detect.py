@@ -261,22 +261,8 @@ def _robust_homography(plane: Array, pixels: Array) -> Array:
 
 
 def homography(plane: Array, pixels: Array) -> Array:
-    """Return the homography (3, 3) from plane points (n, 2) to pixels (n, 2), by normalised least squares."""
-    A, b = _normaliser(plane), _normaliser(pixels)
-    x, u = mapped(A, plane), mapped(b, pixels)
-    one, zero = np.ones((len(x), 1)), np.zeros((len(x), 3))
-    p = np.concatenate([x, one], axis=1)
-    rows = np.concatenate(
-        [np.concatenate([p, zero, -u[:, :1] * p], axis=1), np.concatenate([zero, p, -u[:, 1:] * p], axis=1)]
-    )
-    H = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    H = np.linalg.inv(b) @ H @ A
-    return H / H[2, 2]
-
-
-def _normaliser(points: Array) -> Array:
-    middle, spread = points.mean(axis=0), max(float(points.std()), 1e-12)
-    return np.array([[1 / spread, 0, -middle[0] / spread], [0, 1 / spread, -middle[1] / spread], [0, 0, 1.0]])
+    """Return the homography (3, 3) from plane points (n, 2) to pixels (n, 2), by least squares."""
+    return cv2.findHomography(plane, pixels)[0].astype(np.float64)
 
 
 def _homography_residual(H: Array, plane: Array, pixels: Array) -> float:

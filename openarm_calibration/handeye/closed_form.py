@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Closed forms of the hand-eye problem: those of OpenCV 4 by name, and a quick one of our own to start from.
+"""Closed forms of the hand-eye problem: those of OpenCV 4 by name.
 
 All take the robot's poses A = T_base_gripper and the poses C = T_camera_board of one camera and one board, and return
 X and Z as `problem` defines them. Methods are known by name, never by OpenCV's numbers, which change between versions.
@@ -103,41 +103,6 @@ def _robot_world(name: str, B: Array, C: Array) -> Mounts:
     return Mounts(se3.inverse(se3.make(R_x, np.ravel(t_x))), se3.inverse(se3.make(R_z, np.ravel(t_z))))
 
 
-def kronecker(setup: Setup, A: Array, C: Array) -> Mounts:
-    """Return both mounts by the Kronecker product (Shah's way); quick enough for hundreds of subsets.
-
-    From `R_X R_C = R_B R_Z` both rotations are the leading singular vectors of the summed Kronecker products; the
-    translations then follow linearly.
-
-    Args:
-        setup: in_hand or to_hand.
-        A: (n, 4, 4) T_base_gripper.
-        C: (n, 4, 4) T_camera_board.
-
-    Raises:
-        OpenArmError: DEGENERATE, when there is no finite answer.
-    """
-    B = inverses(A) if setup == "in_hand" else A
-    R_B, R_C = B[:, :3, :3], C[:, :3, :3]
-    # row-major: vec(Bᵀ X C) = (Bᵀ ⊗ Cᵀ) vec(X)
-    K = np.einsum("nji,nlk->ikjl", R_B, R_C).reshape(9, 9)
-    try:
-        U, _, Vt = np.linalg.svd(K)
-    except np.linalg.LinAlgError as error:
-        raise OpenArmError(Code.DEGENERATE, "the rotations of the poses have no singular vectors") from error
-    R_X, R_Z = Vt[0].reshape(3, 3), U[:, 0].reshape(3, 3)
-    if np.linalg.det(R_X) < 0.0:
-        R_X, R_Z = -R_X, -R_Z
-    R_X, R_Z = nearest_rotation(R_X), nearest_rotation(R_Z)
-    left = np.concatenate([np.broadcast_to(np.eye(3), R_B.shape), -R_B], axis=2).reshape(-1, 6)
-    right = (B[:, :3, 3] - C[:, :3, 3] @ R_X.T).reshape(-1)
-    t = np.linalg.lstsq(left, right, rcond=None)[0]
-    mounts = Mounts(se3.make(R_X, t[:3]), se3.make(R_Z, t[3:]))
-    if not (_is_rigid(mounts.X) and _is_rigid(mounts.Z)):
-        raise OpenArmError(Code.DEGENERATE, f"no finite closed form for these {len(A)} poses")
-    return mounts
-
-
 def nearest_rotation(M: Array) -> Array:
     """Return the rotation (3, 3) nearest to a matrix."""
     U, _, Vt = np.linalg.svd(M)
@@ -154,7 +119,7 @@ def _is_rigid(T: Array) -> bool:
 
 
 def initial(problem: Problem, camera: int, board: int) -> Mounts:
-    """Return the quick closed form of one camera and board of a problem.
+    """Return a closed form of one camera and board of a problem, to start from.
 
     Args:
         problem: The views.
@@ -162,8 +127,8 @@ def initial(problem: Problem, camera: int, board: int) -> Mounts:
         board: Index of the board.
 
     Raises:
-        OpenArmError: DEGENERATE, from `kronecker`.
+        OpenArmError: DEGENERATE, from `closed_form`.
     """
     chosen = (problem.camera == camera) & (problem.board == board) & (problem.kind < 2)
     setup: Setup = "in_hand" if problem.kind[chosen][0] == 0 else "to_hand"
-    return kronecker(setup, problem.A[chosen], problem.free[chosen])
+    return closed_form("SHAH", setup, problem.A[chosen], problem.free[chosen])

@@ -28,6 +28,7 @@ from typing import Literal
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
@@ -371,13 +372,7 @@ def inverses(T: Array) -> Array:
 
 def exps(w: Array) -> Array:
     """Return rotations (n, 3, 3) of rotation vectors (n, 3)."""
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
-    K = skews(w)
-    small = angle < 1e-8
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1.0, np.sin(safe) / safe)
-    b = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    return np.eye(3) + a * K + b * (K @ K)
+    return Rotation.from_rotvec(w).as_matrix()
 
 
 def skews(v: Array) -> Array:

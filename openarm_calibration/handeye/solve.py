@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy import stats
 
-from openarm_calibration.handeye.closed_form import Mounts, initial, kronecker
+from openarm_calibration.handeye.closed_form import Mounts, closed_form, initial
 from openarm_calibration.handeye.observability import FEWEST, condition_number, require_accuracy, require_motion
 from openarm_calibration.handeye.problem import Extra, Problem, Setup, chain, design, normal_equations
 from openarm_calibration.handeye.refine import Estimate, Noise, pixel_noise, refine
@@ -346,7 +346,7 @@ def _consensus(problem: Problem, usable: Mask, config: SolveConfig) -> Mask:
         for _ in range(80):
             picked = rng.choice(len(mine), size=4 if len(mine) > 6 else 3, replace=False)
             try:
-                mounts = kronecker(setup, part.A[picked], part.free[picked])
+                mounts = closed_form("SHAH", setup, part.A[picked], part.free[picked])
             except OpenArmError:
                 continue  # a subset may be degenerate; another one is drawn
             X = np.broadcast_to(mounts.X, (problem.cameras, 4, 4))

@@ -19,7 +19,7 @@ from openarm_calibration.handeye.offline import Result
 from openarm_calibration.handeye.verdict import estimate_delay
 from openarm_calibration.ros.image_capture import wait_until
 from openarm_calibration.sampling.next_pose import PoseSearch, Proposal
-from openarm_calibration.sampling.samples import Sample, session_path, without
+from openarm_calibration.sampling.samples import Sample, session_path
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose, vector
@@ -287,7 +287,7 @@ class _Run:
             return max(abs(sample.joints[name] - here[name]) for name in names)
 
         far = max(node.samples.samples, key=away)
-        both = without(node.samples, (), node.description)
+        both = node.samples.copy()
         begun, ended, seen = len(both), False, 0
 
         async def follow() -> None:
@@ -307,13 +307,13 @@ class _Run:
         while not ended and seen < _ENOUGH_MOVING:
             self._report("delay", f"{seen} images of the moving arm")
             try:
-                view = await node.observe(moving=True)
+                t_ns, matched, detection, _ = await node.observe(moving=True)
             except OpenArmError as error:
                 if error.code not in _NO_SAMPLE:
                     raise
                 continue
-            if view.matched.speed > node.config.gate.max_speed:
-                both.take(view.t_ns, view.matched, view.detection)
+            if matched.speed > node.config.gate.max_speed:
+                both.take(t_ns, matched, detection)
                 seen = len(both) - begun
         await motion
         self._check()

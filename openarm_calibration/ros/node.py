@@ -12,7 +12,6 @@ from __future__ import annotations
 import datetime
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,16 +44,6 @@ from openarm_common.ros.answers import ResponseT, answer, answer_async
 from openarm_common.ros.convert import intrinsics_from_info
 from openarm_common.ros.node import BaseNode, run
 from openarm_common.ros.tf import RobotStateListener
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """The board in an image, and the robot at its stamp."""
-
-    t_ns: int
-    matched: Matched
-    detection: BoardDetection
-    pixels: NDArray[np.uint8]
 
 
 class CalibrationNode(BaseNode[CalibrationConfig]):
@@ -113,8 +102,8 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         self.samples, self._result = samples, None
         self._report()
 
-    async def observe(self, *, moving: bool = False) -> View:
-        """Detect the board in the next image, with the robot at its stamp.
+    async def observe(self, *, moving: bool = False) -> tuple[int, Matched, BoardDetection, NDArray[np.uint8]]:
+        """Detect the board in the next image: its stamp (ns), the robot there, the marks, and the pixels (h, w).
 
         Args:
             moving: Whether the robot may move meanwhile.
@@ -126,12 +115,11 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         pixels, t_ns = grey(frame.items["image"]), frame.t_ns
         self._check_optics(intrinsics_from_info(frame.items["camera_info"]))
         matched = match(self._states.buffer, t_ns, self.samples.joint_names, self.config.gate, moving=moving)
-        return View(t_ns, matched, await self.in_thread(detect, self.samples.board, pixels), pixels)
+        return t_ns, matched, await self.in_thread(detect, self.samples.board, pixels), pixels
 
     async def take(self) -> Sample:
         """Take a sample; errors as `observe`."""
-        view = await self.observe()
-        sample = self.samples.take(view.t_ns, view.matched, view.detection, view.pixels)
+        sample = self.samples.take(*await self.observe())
         self._change(self.samples)
         return sample
 

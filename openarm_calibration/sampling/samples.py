@@ -14,7 +14,7 @@ import json
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -121,7 +121,15 @@ class SampleSet:
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Joints that move the camera against the board."""
-        return moving_joints(self.head, self._description)
+        link = self.head.parent if self.head.setup == "in_hand" else self.head.carrier
+        return tuple(joint.name for joint in self._description.chain(link) if joint.type != "fixed")
+
+    def copy(self) -> SampleSet:
+        """Return a set with the same samples."""
+        out = SampleSet(self.head, self._description)
+        for sample in self._samples:
+            out.add(sample)
+        return out
 
     def take(
         self, t_image_ns: int, matched: Any, detection: BoardDetection, image: NDArray[np.uint8] | None = None
@@ -245,31 +253,10 @@ class SampleSet:
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-def moving_joints(head: SessionHead, description: RobotDescription) -> tuple[str, ...]:
-    """Return the names of the joints between the base and what the arm carries."""
-    link = head.parent if head.setup == "in_hand" else head.carrier
-    return tuple(joint.name for joint in description.chain(link) if joint.type != "fixed")
-
-
 def setup_of(description: RobotDescription, parent: str) -> Literal["in_hand", "to_hand"]:
     """Return whether a camera on a link moves with the arm, or is fixed and observes a board that the arm carries."""
     moves = any(joint.type != "fixed" for joint in description.chain(parent))
     return "in_hand" if moves else "to_hand"
-
-
-def without(samples: SampleSet, names: Sequence[str], description: RobotDescription) -> SampleSet:
-    """Return a copy without some samples.
-
-    Args:
-        samples: All.
-        names: Of those that are left out.
-        description: The robot.
-    """
-    out = SampleSet(samples.head, description)
-    for sample in samples.samples:
-        if sample.name not in names:
-            out.add(sample)
-    return out
 
 
 # --- reading a session file

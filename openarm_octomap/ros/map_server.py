@@ -17,6 +17,7 @@ from rclpy.node import Node
 from std_srvs.srv import Empty
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.octree.lattice import DEPTH
 from openarm_common.ros.answers import answer
 from openarm_common.ros.convert import ns_to_stamp, xyz
 from openarm_octomap.config import UnknownPolicy
@@ -46,7 +47,7 @@ class MapServices:
         self._mapper = mapper
         self._stamp = stamp
         self._show = show
-        node.create_service(GetOctomap, "octomap_binary", self._on_binary)
+        node.create_service(GetOctomap, "octomap_binary", self._answer_at(DEPTH))
         node.create_service(GetOctomap, "octomap_full", self._on_full)
         for depth in depths:
             node.create_service(GetOctomap, f"~/depth_{depth}/octomap_binary", self._answer_at(depth))
@@ -58,11 +59,6 @@ class MapServices:
         node.create_service(MapFile, "~/load", self._on_load)
 
     # --- octomap_server's
-    def _on_binary(self, _: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
-        snapshot = self._mapper.snapshot()
-        response.map = convert.octomap_msg(snapshot.binary, snapshot.lattice.resolution, self._stamp())
-        return response
-
     def _on_full(self, _: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
         snapshot = self._mapper.snapshot({"full"})
         if snapshot.full is not None:

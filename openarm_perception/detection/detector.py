@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, cast
+from typing import Any, Literal, Protocol, cast
 
 import cv2
 import numpy as np
@@ -61,6 +61,18 @@ class Detection2D:
     def area(self) -> int:
         """Pixels of the mask."""
         return int(np.count_nonzero(self.mask))
+
+
+def require_rgb(image: NDArray[Any]) -> None:
+    """Refuse what is no colour image.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, for another shape or type than (h, w, 3) uint8.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise OpenArmError(
+            Code.BAD_IMAGE, f"colour image has shape {image.shape} and type {image.dtype}; expected (h, w, 3) of uint8"
+        )
 
 
 class Detector(Protocol):
@@ -149,10 +161,7 @@ class ColorDetector:
         Raises:
             OpenArmError: BAD_IMAGE, for another shape or type.
         """
-        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-            raise OpenArmError(
-                Code.BAD_IMAGE, f"colour image has shape {rgb.shape} and type {rgb.dtype}; expected (h, w, 3) of uint8"
-            )
+        require_rgb(rgb)
         hsv = cast(Image, cv2.cvtColor(rgb, cv2.COLOR_RGB2HSV))
         found = [d for label, bounds in self._bounds.items() for d in self._of_colour(label, bounds, hsv)]
         return tuple(sorted((d for d in found if d.score >= self.config.min_score), key=lambda d: -d.area))

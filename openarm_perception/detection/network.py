@@ -21,7 +21,7 @@ from openarm_common.config import AT_RUN_TIME, Config, load_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_perception.detection.boxes import Candidates, Letterbox, blob, decode
-from openarm_perception.detection.detector import Detection2D
+from openarm_perception.detection.detector import Detection2D, require_rgb
 
 Image = NDArray[np.uint8]
 
@@ -136,10 +136,7 @@ class NetworkDetector:
 
     def candidates(self, rgb: Image, threshold: float) -> Candidates:
         """Return everything from a score on, boxes in pixels of the image."""
-        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
-            raise OpenArmError(
-                Code.BAD_IMAGE, f"colour image has shape {rgb.shape} and type {rgb.dtype}; expected (h, w, 3) of uint8"
-            )
+        require_rgb(rgb)
         letterbox = Letterbox.fit((rgb.shape[1], rgb.shape[0]), self.size)
         output = self.run(blob(letterbox.place(rgb)))
         found = decode(output, threshold, self.config.max_overlap)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import hand_eye_problems as synthetic
-from openarm_calibration.handeye.closed_form import METHODS, closed_form, kronecker
+from openarm_calibration.handeye.closed_form import METHODS, closed_form
 from openarm_calibration.handeye.problem import View, assemble, difference, moved
 from openarm_calibration.handeye.refine import Noise, mount_error, pixel_noise
 from openarm_calibration.handeye.solve import SolveConfig, solve
@@ -55,7 +55,7 @@ def test_refinement_reaches_the_bound_and_its_covariance_is_honest(setup: str, r
         errors.append(away**2)
         bounds.append(np.diag(truth.bound(noise))[:6])
         nees.append(away @ np.linalg.solve(solution.mount_covariance(), away))
-        start = kronecker(setup, truth.problem.A, truth.problem.free)
+        start = closed_form("SHAH", setup, truth.problem.A, truth.problem.free)
         closed.append(difference(start.X, truth.X) ** 2)
     for axes in (slice(0, 3), slice(3, 6)):
         rms, bound, other = (math.sqrt(np.mean(np.sum(np.array(v)[:, axes], axis=1))) for v in (errors, bounds, closed))
