@@ -127,46 +127,38 @@ def require_accuracy(problem: Problem, estimate: Estimate, most_translation: flo
     Raises:
         OpenArmError: DEGENERATE, with the deviation, its cause, and what to add.
     """
-    mounts = 6 * (problem.cameras + problem.boards)
-    units = np.tile(UNITS, problem.cameras + problem.boards)
-    scaled = estimate.information[:mounts, :mounts] * np.outer(units, units)
-    values: Array = np.linalg.eigvalsh(scaled).astype(np.float64) if np.isfinite(scaled).all() else np.zeros(1)
-    singular = not values[0] > 0.0 or values[-1] > _WORST_CONDITION * values[0]
-    if not singular:
-        covariance = estimate.covariance()[:mounts, :mounts] / np.outer(units, units)
-        for camera in range(problem.cameras):
-            block = covariance[6 * camera : 6 * camera + 6, 6 * camera : 6 * camera + 6]
-            t = math.sqrt(max(np.trace(block[:3, :3]), 0.0)) * UNITS[0]
-            r = math.sqrt(max(np.trace(block[3:, 3:]), 0.0)) * UNITS[3]
-            if t > most_translation or r > most_rotation:
-                seen = motion(problem.A[(problem.camera == camera) & (problem.kind < 2)])
-                raise OpenArmError(
-                    Code.DEGENERATE,
-                    f"{_cause(seen, estimate)}: the predicted error is {t * 1e3:.2g} mm and {math.degrees(r):.2g}°,"
-                    f" more than {most_translation * 1e3:g} mm or {math.degrees(most_rotation):g}°;"
-                    f" {_advice(seen, estimate)}",
-                )
-    else:
+    condition = condition_number(problem, estimate.information)
+    if condition > _WORST_CONDITION:
         seen = motion(problem.A[problem.kind < 2])
         raise OpenArmError(
             Code.DEGENERATE,
             f"{_cause(seen, estimate)}: some direction of the mounts is not determined"
-            f" (condition {condition(values):.1e}, at most {_WORST_CONDITION:.0e} is accepted);"
+            f" (condition {condition:.1e}, at most {_WORST_CONDITION:.0e} is accepted);"
             f" {_advice(seen, estimate)}",
         )
-
-
-def condition(values: Array) -> float:
-    """Return the condition number of eigenvalues in ascending order; infinite when singular."""
-    return float(values[-1] / values[0]) if values[0] > 0.0 else math.inf
+    covariance = estimate.covariance()
+    for camera in range(problem.cameras):
+        variance = np.maximum(np.diag(covariance)[6 * camera : 6 * camera + 6], 0.0)
+        t, r = math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum())
+        if t > most_translation or r > most_rotation:
+            seen = motion(problem.A[(problem.camera == camera) & (problem.kind < 2)])
+            raise OpenArmError(
+                Code.DEGENERATE,
+                f"{_cause(seen, estimate)}: the predicted error is {t * 1e3:.2g} mm and {math.degrees(r):.2g}°,"
+                f" more than {most_translation * 1e3:g} mm or {math.degrees(most_rotation):g}°;"
+                f" {_advice(seen, estimate)}",
+            )
 
 
 def condition_number(problem: Problem, information: Array) -> float:
-    """Return the condition number of the information on the mounts, in units of 1 mm and 0.1°."""
+    """Return the condition number of the information on the mounts, in units of 1 mm and 0.1°; infinite if singular."""
     mounts = problem.cameras + problem.boards
     units = np.tile(UNITS, mounts)
     scaled = information[: 6 * mounts, : 6 * mounts] * np.outer(units, units)
-    return condition(np.linalg.eigvalsh(scaled).astype(np.float64))
+    if not np.isfinite(scaled).all():
+        return math.inf
+    values = np.linalg.eigvalsh(scaled)
+    return float(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
 
 def _cause(seen: Motion, estimate: Estimate) -> str:

@@ -109,8 +109,6 @@ def calibrate(
 def _with_found_intrinsics(solution: Solution) -> Solution:
     """Return the same answer with the intrinsics that were found in place of those that were stated."""
     estimate, problem = solution.estimate, solution.problem
-    if estimate.intrinsics is None:
-        return solution
     found = [
         replace(stated, fx=stated.fx + float(d[0]), fy=stated.fy + float(d[1]), cx=stated.cx + float(d[2]),
                 cy=stated.cy + float(d[3]))
@@ -281,8 +279,8 @@ def _part(joint: Solution, camera: int, own: Problem) -> Solution:
     mine = np.unique(problem.pose[rows][joint.used[rows]])
     part = Estimate(
         estimate.X[camera : camera + 1], estimate.Z[board : board + 1],
-        estimate.correction[np.searchsorted(numbers, mine)], estimate.noise, information,
-        spread=None if estimate.spread is None else covariance,
+        estimate.correction[np.searchsorted(numbers, mine)], np.zeros((1, 4)), noise=estimate.noise,
+        information=information, spread=None if estimate.spread is None else covariance,
     )  # fmt: skip
     places = {int(row): k for k, row in enumerate(rows)}
     outliers = tuple(

@@ -361,13 +361,8 @@ def _pack(views: tuple[View, ...], intrinsics: tuple[Intrinsics, ...], free: Arr
 
 # --- transforms, batched over (..., 4, 4)
 def inverses(T: Array) -> Array:
-    """Return the inverse of rigid transforms."""
-    R = T[..., :3, :3].swapaxes(-1, -2)
-    out = np.zeros_like(T)
-    out[..., :3, :3] = R
-    out[..., :3, 3] = -(R @ T[..., :3, 3:])[..., 0]
-    out[..., 3, 3] = 1.0
-    return out
+    """Return the inverse of transforms."""
+    return np.linalg.inv(T)
 
 
 def exps(w: Array) -> Array:

@@ -227,30 +227,44 @@ class Noise:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
-    """Where the refinement ended.
+class State:
+    """The unknowns.
 
     Args:
         X: (cameras, 4, 4) mounts of the cameras (optical frames).
         Z: (boards, 4, 4) mounts of the boards.
         correction: (poses, 6) of the robot's poses.
-        noise: That was used, or found.
-        information: (parameters, parameters), columns as `problem.design`.
+        intrinsics: (cameras, 4) changes of fx, fy, cx, cy, px.
         scale: Of the board.
         delay: Of the images, s.
-        intrinsics: (cameras, 4) changes of fx, fy, cx, cy, px.
-        extras: Which of these were free.
-        spread: (parameters, parameters) covariance where the robot's spread was estimated.
     """
 
     X: Array
     Z: Array
     correction: Array
-    noise: Noise
-    information: Array
+    intrinsics: Array
     scale: float = 1.0
     delay: float = 0.0
-    intrinsics: Array | None = None
+
+    @classmethod
+    def start(cls, problem: Problem, X: Array, Z: Array) -> State:
+        """Return mounts with nothing corrected."""
+        return cls(X, Z, np.zeros((int(problem.pose.max()) + 1, 6)), np.zeros((problem.cameras, 4)))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Estimate(State):
+    """Where the refinement ended.
+
+    Args:
+        noise: That was used, or found.
+        information: (parameters, parameters), columns as `problem.design`.
+        extras: Which of the unknowns besides the mounts were free.
+        spread: (parameters, parameters) covariance where the robot's spread was estimated.
+    """
+
+    noise: Noise
+    information: Array
     extras: tuple[Extra, ...] = ()
     spread: Array | None = None
 
@@ -277,18 +291,6 @@ class Linear:
     KMG: Array  # (poses, 6, p)
     KMy: Array  # (poses, 6)
     cost: float  # of the views alone, in units of the pixel noise
-
-
-@dataclass(frozen=True, eq=False)
-class State:
-    """Unknowns where the problem is linearised."""
-
-    X: Array
-    Z: Array
-    correction: Array
-    scale: float
-    delay: float
-    intrinsics: Array
 
 
 def linearise(problem: Problem, state: State, px: float, extras: Sequence[Extra]) -> tuple[Linear, Array]:
@@ -361,7 +363,7 @@ def refine(
     Raises:
         OpenArmError: INTERNAL, when the start is no description of the views (a mark behind the camera).
     """
-    state = State(X, Z, np.zeros((int(problem.pose.max()) + 1, 6)), 1.0, 0.0, np.zeros((problem.cameras, 4)))
+    state = State.start(problem, X, Z)
     linear, _ = linearise(problem, state, noise.px, extras)
     if not np.isfinite(linear.cost):
         raise OpenArmError(
@@ -399,10 +401,7 @@ def refine(
         full, both = _joined(linear)
         spread = averaged(full, linear.KMK, both, TYPICAL_ROBOT)
     information, _, _ = eliminate(linear, noise.prior)
-    return Estimate(
-        state.X, state.Z, state.correction, noise, information,
-        state.scale, state.delay, state.intrinsics, tuple(extras), spread,
-    )  # fmt: skip
+    return Estimate(**vars(state), noise=noise, information=information, extras=tuple(extras), spread=spread)
 
 
 def information_at(problem: Problem, X: Array, Z: Array, noise: Noise) -> Array:
@@ -414,8 +413,7 @@ def information_at(problem: Problem, X: Array, Z: Array, noise: Noise) -> Array:
         Z: (boards, 4, 4).
         noise: Standard deviations.
     """
-    state = State(X, Z, np.zeros((int(problem.pose.max()) + 1, 6)), 1.0, 0.0, np.zeros((problem.cameras, 4)))
-    return eliminate(linearise(problem, state, noise.px, ())[0], noise.prior)[0]
+    return eliminate(linearise(problem, State.start(problem, X, Z), noise.px, ())[0], noise.prior)[0]
 
 
 def _stepped(problem: Problem, state: State, step: Array, correction: Array, extras: Sequence[Extra]) -> State:

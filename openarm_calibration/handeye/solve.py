@@ -68,10 +68,9 @@ def pose_tests(
         By number of the pose, as `problem.pose` counts.
     """
     T, B = chain(problem, estimate.X, estimate.Z, np.zeros((len(problem), 6)))
-    changes = estimate.intrinsics[problem.camera] if estimate.intrinsics is not None else 0.0
     squares, _, _ = normal_equations(
         problem.points, problem.pixels, problem.offsets, problem.radii, problem.free,
-        problem.camera_rows() + changes, estimate.scale,
+        problem.camera_rows() + estimate.intrinsics[problem.camera], estimate.scale,
     )  # fmt: skip
     M = squares[:, :6, :6] * estimate.noise.px**-2.0
     G, K = design(problem, estimate.X, estimate.Z, T, B, estimate.extras)

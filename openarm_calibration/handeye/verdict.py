@@ -95,9 +95,7 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
         )  # fmt: skip
         left = problem.subset(used[out])
         T, _ = chain(left, estimate.X, estimate.Z, np.zeros((len(left), 6)))
-        rows = left.camera_rows()
-        if estimate.intrinsics is not None:
-            rows = rows + estimate.intrinsics[left.camera]
+        rows = left.camera_rows() + estimate.intrinsics[left.camera]
         for k, view in enumerate(left.views):
             away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
             px = float(np.mean(np.sum(away**2, axis=1)))
@@ -232,8 +230,6 @@ def _focal(solution: Solution) -> tuple[float, float]:
     part = solution.problem.subset(solution.used)
     now, stated = solution.estimate, part.intrinsics[0]
     estimate = refine(part, now.X, now.Z, now.noise, extras=("intrinsics",))
-    if estimate.intrinsics is None:
-        return 1.0, math.inf
     try:
         covariance = estimate.covariance()
     except OpenArmError:
