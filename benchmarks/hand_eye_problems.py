@@ -8,7 +8,7 @@ A 1280×720 camera of 900 px focal length observes a 4×11 circle grid: from the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,8 +35,14 @@ class Truth:
 
     def bound(self, noise: Noise) -> Array:
         """Return (12, 12) Cramér-Rao bound on the covariance of X and Z."""
-        information = information_at(self.problem.with_poses(self.A), self.X[None], self.Z[None], noise)
+        information = information_at(with_poses(self.problem, self.A), self.X[None], self.Z[None], noise)
         return np.linalg.inv(information).astype(np.float64)
+
+
+def with_poses(problem: Problem, A: Array) -> Problem:
+    """Return the views of a problem with other robot poses (n, 4, 4)."""
+    views = [replace(view, A=a) for view, a in zip(problem.views, A, strict=True)]
+    return assemble(views, problem.intrinsics, list(problem.free))
 
 
 def mounts(setup: Setup) -> tuple[Array, Array]:

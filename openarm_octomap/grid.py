@@ -205,16 +205,11 @@ class OccupancyGrid:
         """States at another depth of the tree: a cell is occupied when any of its parts is, free when any is free.
 
         Args:
-            depth: 16 is the resolution of the map, each level less doubles the edge.
+            depth: 1 to 16, the resolution of the map; each level less doubles the edge.
 
         Returns:
             The box of coarse cells and their states.
-
-        Raises:
-            OpenArmError: INVALID_ARGUMENT, unless 1 <= depth <= 16.
         """
-        if not 1 <= depth <= DEPTH:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"depth is {depth}; expected 1 .. {DEPTH}")
         states = self.states
         for level in range(DEPTH - depth):
             finer = self.lattice.coarser(level)

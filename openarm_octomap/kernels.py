@@ -56,9 +56,9 @@ def image_ends(
         block: Edge in pixels of the blocks whose pixels must all lack a return for a ray to clear; 0: none clears.
         stride: Every so many columns and rows of such a block have a ray.
         reach: How far such a ray clears, m.
-        ray_x: (w,).
-        ray_y: (h,).
-        T: (3, 4).
+        ray_x: (w,) x over z of each column.
+        ray_y: (h,) y over z of each row.
+        T: (3, 4) float32, camera in the frame of the map.
         label: (h, w): 0 environment; 1 robot: the ray clears up to it and marks nothing; 2 nothing is known.
         resolution: Edge of a cell, m.
         key_min: (3,) key of marks[0, 0, 0].

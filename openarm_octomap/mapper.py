@@ -194,11 +194,7 @@ class Mapper:
             return self._snapshot(wanted)
 
     def coarse(self, depth: int) -> tuple[Lattice, Payload]:
-        """Return the map at another depth as an octree whose smallest cells are of that depth.
-
-        Raises:
-            OpenArmError: INVALID_ARGUMENT, unless 1 <= depth <= 16.
-        """
+        """Return the map at another depth, 1 to 16, as an octree whose smallest cells are of that depth."""
         with self._lock:
             if depth == DEPTH:
                 return self._grid.lattice, self._grid.binary()

@@ -64,8 +64,6 @@ def closed_form(method: str, setup: Setup, A: Array, C: Array) -> Mounts:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"no method {method!r}; methods: {', '.join(METHODS)} (and REFINED, the refinement)"
         )
-    if setup not in ("in_hand", "to_hand"):
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"setup is {setup!r}; a closed form needs in_hand or to_hand")
     require_opencv()
     B = inverses(A) if setup == "in_hand" else A
     solve: Callable[[str, Array, Array], Mounts] = _hand_eye if name in HAND_EYE else _robot_world

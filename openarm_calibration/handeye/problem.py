@@ -320,11 +320,6 @@ class Problem:
         """Return the same views by cameras of other intrinsics."""
         return assemble(self.views, intrinsics, list(self.free))
 
-    def with_poses(self, A: Array) -> Problem:
-        """Return the same views with other robot poses (n, 4, 4)."""
-        views = tuple(replace(view, A=a) for view, a in zip(self.views, A, strict=True))
-        return _pack(views, self.intrinsics, self.free, self.free_cost)
-
 
 def assemble(views: Sequence[View], intrinsics: Sequence[Intrinsics], guesses: Sequence[Array]) -> Problem:
     """Make a problem of views.
@@ -442,15 +437,6 @@ def sensitivity(problem: Problem, X: Array, Z: Array, T: Array, B: Array) -> tup
     return by_X, by_Z, by_A
 
 
-def parameter_count(problem: Problem, extras: Sequence[Extra]) -> int:
-    """Return the number of columns of `design`."""
-    return 6 * (problem.cameras + problem.boards) + sum(_width(problem, extra) for extra in extras)
-
-
-def _width(problem: Problem, extra: Extra) -> int:
-    return 4 * problem.cameras if extra == "intrinsics" else 1
-
-
 def design(problem: Problem, X: Array, Z: Array, T: Array, B: Array, extras: Sequence[Extra]) -> tuple[Array, Array]:
     """Return how the unknowns move each view.
 
@@ -469,12 +455,13 @@ def design(problem: Problem, X: Array, Z: Array, T: Array, B: Array, extras: Seq
     """
     by_X, by_Z, by_A = sensitivity(problem, X, Z, T, B)
     n = len(problem)
-    G = np.zeros((n, COLUMNS, parameter_count(problem, extras)))
+    widths = {"scale": 1, "delay": 1, "intrinsics": 4 * problem.cameras}
+    column = 6 * (problem.cameras + problem.boards)
+    G = np.zeros((n, COLUMNS, column + sum(widths[extra] for extra in extras)))
     index = np.arange(n)
     for k in range(6):
         G[index, :6, 6 * problem.camera + k] = by_X[:, :, k]
         G[index, :6, 6 * (problem.cameras + problem.board) + k] = by_Z[:, :, k]
-    column = 6 * (problem.cameras + problem.boards)
     for extra in extras:
         if extra == "scale":
             G[:, 6, column] = 1.0
@@ -484,5 +471,5 @@ def design(problem: Problem, X: Array, Z: Array, T: Array, B: Array, extras: Seq
         else:
             for k in range(4):
                 G[index, 7 + k, column + 4 * problem.camera + k] = 1.0
-        column += _width(problem, extra)
+        column += widths[extra]
     return G, by_A

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from openarm_calibration.board.board import Board, parse_board
+from openarm_calibration.board.board import parse_board
 from openarm_calibration.board.detect import BoardDetection, guess_pose
 from openarm_calibration.handeye.problem import Problem, View, assemble, difference
 from openarm_common import se3
@@ -56,11 +56,6 @@ class SessionHead(Config):
     def optics(self) -> Intrinsics:
         """Intrinsics of the camera."""
         return Intrinsics(*self.intrinsics)
-
-    @property
-    def target(self) -> Board:
-        """The board."""
-        return parse_board(self.board, "session:board")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +99,7 @@ class SampleSet:
                 links = ", ".join(description.links)
                 raise OpenArmError(Code.CONFIG_INVALID, f"session:{what}: no link {link!r}; links: {links}")
         self.head = head
-        self.board = head.target
+        self.board = parse_board(head.board, "session:board")
         self._description = description
         self._samples: list[Sample] = []
         self._taken = 0

@@ -10,7 +10,7 @@ its `kind`.
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -100,6 +100,7 @@ class Perceived:
         return (*self.located, *self.unmeasured)
 
 
+@dataclass(eq=False)
 class Pipeline:
     """Finds objects in images and locates them.
 
@@ -110,11 +111,10 @@ class Pipeline:
         label: Only objects of this name; empty takes all.
     """
 
-    def __init__(self, detector: Detector, localizer: Localizer, policy: Policy = "score", label: str = "") -> None:
-        self.detector = detector
-        self.localizer = localizer
-        self.policy: Policy = policy
-        self.label = label
+    detector: Detector
+    localizer: Localizer
+    policy: Policy = "score"
+    label: str = ""
 
     def run(
         self,
@@ -201,34 +201,24 @@ _PIXELS = 60
 _TALLEST, _JUMP = 0.30, 0.020
 
 
+@dataclass(eq=False)
 class NetworkPipeline(Pipeline):
     """Detects with a network.
 
     Args:
-        network: Finds boxes.
+        detector: The network, which finds boxes.
         colors: Names the colours of what is in them.
-        localizer: Finds where objects are.
-        policy: Which comes first.
-        label: Only objects of this name; empty takes all.
     """
 
-    def __init__(
-        self,
-        network: NetworkDetector,
-        colors: ColorDetector,
-        localizer: Localizer,
-        policy: Policy = "score",
-        label: str = "",
-    ) -> None:
-        super().__init__(network, localizer, policy, label)
-        self.network, self.colors = network, colors
+    detector: NetworkDetector
+    colors: ColorDetector = field(kw_only=True)
 
     def detect(self, view: View) -> ImageDetections:
         """Return what the network detects, with the pixels that are the object's."""
         return ImageDetections(self._by_network(view))
 
     def _by_network(self, view: View) -> tuple[Detection2D, ...]:
-        found = [cut_out(box, view, self.localizer) for box in self.network.detect(view.rgb)]
+        found = [cut_out(box, view, self.localizer) for box in self.detector.detect(view.rgb)]
         kept: list[Detection2D] = []
         for detection in sorted((d for d in found if d is not None), key=lambda d: -d.score):
             if not any(same(detection, other) for other in kept):
@@ -301,9 +291,9 @@ def make_pipeline(
         OpenArmError: CONFIG_INVALID or INVALID_ARGUMENT, from the network.
     """
     if kind in ("network", "both"):
-        loaded = before.network.changed(network) if isinstance(before, NetworkPipeline) else NetworkDetector(network)
+        loaded = before.detector.changed(network) if isinstance(before, NetworkPipeline) else NetworkDetector(network)
         made = NetworkPipeline if kind == "network" else CheckedPipeline
-        return made(loaded, colors, localizer, policy, label)
+        return made(loaded, localizer, policy, label, colors=colors)
     if kind == "anything":
         return ClusterPipeline(colors, localizer, policy, label)
     return Pipeline(colors, localizer, policy, label)

@@ -57,14 +57,12 @@ class FilterConfig(Config):
 
 
 def median_depth(depth: DepthImage, size: int) -> DepthImage:
-    """Return the median over `size` × `size` pixels; pixels that were invalid stay so, those at holes keep their value.
+    """Return the median over 3 × 3 or 5 × 5 pixels; pixels that were invalid stay so, those at holes keep their value.
 
     Raises:
-        OpenArmError: INVALID_ARGUMENT, unless size is 3 or 5; BAD_IMAGE, for another type of image.
+        OpenArmError: BAD_IMAGE, for another type of image.
     """
     unit_scale(depth)
-    if size not in (3, 5):
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"median size is {size}; valid: 3, 5")
     clean = np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
     valid = clean > 0
     smooth = cv2.medianBlur(clean, size)
@@ -101,13 +99,8 @@ def voxel_filter(points: Points, edge: float) -> Points:
 
     Args:
         points: (n, 3) float32; points that are not finite or further than 10^6 cells away are dropped.
-        edge: Of a cell, m.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, unless the edge is positive.
+        edge: Of a cell, m; positive.
     """
-    if not edge > 0.0:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"edge is {edge} m, expected > 0")
     size = 1 << max(4, int(2 * max(len(points), 1) - 1).bit_length())
     table = np.full(size, -1, np.int64)
     sums = np.zeros((len(points), 4), np.float64)

@@ -114,7 +114,7 @@ def test_one_gross_outlier_among_twelve_is_named_and_does_no_harm(setup: str) ->
         clean = solve(truth.problem.subset([i for i in range(12) if i != bad]))
         A = truth.problem.A.copy()
         A[bad] = moved(A[bad], np.concatenate([rng.normal(0, 0.02, 3), rng.normal(0, 0.05, 3)]))
-        spoiled = solve(truth.problem.with_poses(A))
+        spoiled = solve(synthetic.with_poses(truth.problem, A))
         assert f"s{bad:02d}" in [outlier.name for outlier in spoiled.outliers]
         assert len(spoiled.outliers) <= 2
         clean_error.append(mount_error(clean.estimate.X[0], truth.X)[0])
@@ -178,7 +178,7 @@ def test_numbers_that_are_not_finite_are_refused() -> None:
     A = truth.problem.A.copy()
     A[2, 0, 3] = np.nan
     with pytest.raises(OpenArmError, match="not a finite number"):
-        solve(truth.problem.with_poses(A))
+        solve(synthetic.with_poses(truth.problem, A))
 
 
 def test_both_set_ups_in_one_solve_share_the_robots_error_and_a_board() -> None:

@@ -60,8 +60,6 @@ def test_what_is_not_finite_or_far_too_far_is_dropped() -> None:
     points = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e9, 0, 0], [0.1, 0.1, 0.1]], np.float32)
     np.testing.assert_allclose(voxel_filter(points, 0.01), [[0.1, 0.1, 0.1]])
     assert voxel_filter(np.empty((0, 3), np.float32), 0.01).shape == (0, 3)
-    with pytest.raises(OpenArmError, match="expected > 0"):
-        voxel_filter(points, 0.0)
 
 
 @pytest.mark.parametrize("metres", [False, True])
@@ -97,8 +95,6 @@ def test_the_median_takes_noise_and_keeps_holes_and_edges() -> None:
     metres = (noisy * 1e-3).astype(np.float32)
     metres[metres == 0] = np.nan
     np.testing.assert_array_equal(np.isnan(median_depth(metres, 3)), np.isnan(metres))
-    with pytest.raises(OpenArmError, match="valid: 3, 5"):
-        median_depth(noisy, 4)
     with pytest.raises(OpenArmError, match="BAD_IMAGE"):
         median_depth(np.zeros((4, 4), np.uint8), 3)  # type: ignore[arg-type]
 
