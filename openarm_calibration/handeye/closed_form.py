@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from openarm_calibration.handeye.problem import Problem, Setup, inverses
+from openarm_calibration.handeye.problem import Setup, inverses
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
@@ -114,19 +114,3 @@ def mean_pose(T: Array) -> Array:
 
 def _is_rigid(T: Array) -> bool:
     return bool(np.isfinite(T).all() and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-4))
-
-
-def initial(problem: Problem, camera: int, board: int) -> Mounts:
-    """Return a closed form of one camera and board of a problem, to start from.
-
-    Args:
-        problem: The views.
-        camera: Index of the camera.
-        board: Index of the board.
-
-    Raises:
-        OpenArmError: DEGENERATE, from `closed_form`.
-    """
-    chosen = (problem.camera == camera) & (problem.board == board) & (problem.kind < 2)
-    setup: Setup = "in_hand" if problem.kind[chosen][0] == 0 else "to_hand"
-    return closed_form("SHAH", setup, problem.A[chosen], problem.free[chosen])

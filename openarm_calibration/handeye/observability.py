@@ -45,6 +45,7 @@ class Motion:
         second: Largest angle between two poses about axes across the main one, rad.
         translation: Largest distance between two poses, m.
         axis: (3,) main rotation axis in the gripper's frame.
+        least: Axis of the gripper about which it turned least.
     """
 
     poses: int
@@ -52,6 +53,7 @@ class Motion:
     second: float
     translation: float
     axis: Array
+    least: str
 
 
 def motion(A: Array) -> Motion:
@@ -59,13 +61,14 @@ def motion(A: Array) -> Motion:
     n = len(A)
     logs = [se3.log_so3(A[i, :3, :3].T @ A[j, :3, :3]) for i in range(n) for j in range(i + 1, n)]
     if not logs:
-        return Motion(n, 0.0, 0.0, 0.0, np.array([0.0, 0.0, 1.0]))
+        return Motion(n, 0.0, 0.0, 0.0, np.array([0.0, 0.0, 1.0]), "x")
     w = np.array(logs)
     axis = np.linalg.eigh(w.T @ w)[1][:, -1]
     across = np.linalg.norm(w - np.outer(w @ axis, axis), axis=1)
     apart = np.linalg.norm(A[:, None, :3, 3] - A[None, :, :3, 3], axis=-1)
     rotation = float(np.linalg.norm(w, axis=1).max())
-    return Motion(n, rotation, float(across.max()), float(apart.max()), axis)
+    least = "xyz"[int(np.argmin(np.sum(w**2, axis=0)))]
+    return Motion(n, rotation, float(across.max()), float(apart.max()), axis, least)
 
 
 def require_motion(problem: Problem) -> None:

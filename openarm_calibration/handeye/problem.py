@@ -357,7 +357,7 @@ def _pack(views: tuple[View, ...], intrinsics: tuple[Intrinsics, ...], free: Arr
 # --- transforms, batched over (..., 4, 4)
 def inverses(T: Array) -> Array:
     """Return the inverse of transforms."""
-    return np.linalg.inv(T)
+    return np.linalg.inv(T).astype(np.float64)
 
 
 def exps(w: Array) -> Array:

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy import stats
 
-from openarm_calibration.handeye.closed_form import Mounts, closed_form, initial
+from openarm_calibration.handeye.closed_form import closed_form
 from openarm_calibration.handeye.observability import FEWEST, condition_number, require_accuracy, require_motion
-from openarm_calibration.handeye.problem import Extra, Problem, Setup, chain, design, normal_equations
+from openarm_calibration.handeye.problem import Extra, Problem, chain, design, normal_equations
 from openarm_calibration.handeye.refine import Estimate, Noise, pixel_noise, refine
 from openarm_common import se3
 from openarm_common.config import Config
@@ -313,7 +313,8 @@ def starting_mounts(problem: Problem) -> tuple[Array, Array]:
     for camera, board in pairs[np.argsort(-counts)]:
         if camera in X and board in Z:
             continue
-        mounts: Mounts = initial(problem, int(camera), int(board))
+        part = problem.subset((problem.camera == camera) & (problem.board == board) & (problem.kind < 2))
+        mounts = closed_form("SHAH", part.views[0].setup, part.A, part.free)
         X.setdefault(int(camera), mounts.X)
         Z.setdefault(int(board), mounts.Z)
     for _ in range(problem.cameras + problem.boards):  # fixed views hand a mount on
@@ -340,12 +341,11 @@ def _consensus(problem: Problem, usable: Mask, config: SolveConfig) -> Mask:
         if len(mine) <= FEWEST + 1:
             continue
         part = problem.subset(mine)
-        setup: Setup = "in_hand" if part.kind[0] == 0 else "to_hand"
         best, agreement = math.inf, np.zeros(len(mine))
         for _ in range(80):
             picked = rng.choice(len(mine), size=4 if len(mine) > 6 else 3, replace=False)
             try:
-                mounts = closed_form("SHAH", setup, part.A[picked], part.free[picked])
+                mounts = closed_form("SHAH", part.views[0].setup, part.A[picked], part.free[picked])
             except OpenArmError:
                 continue  # a subset may be degenerate; another one is drawn
             X = np.broadcast_to(mounts.X, (problem.cameras, 4, 4))

@@ -57,19 +57,12 @@ class Bodies:
         shapes = [(name, shape) for name, link in description.links.items() for shape in link.collision]
         self._links = [name for name, _ in shapes]
         self._T_link_shape: Array = np.array([shape.T_link_primitive for _, shape in shapes]).reshape(-1, 4, 4)
-        half: list[tuple[float, float, float]] = []
-        small: list[tuple[float, float, float]] = []
-        for _, shape in shapes:
-            if shape.kind == "box":
-                x, y, z = (edge / 2.0 for edge in shape.size)
-                half.append((x, y, z))
-                small.append((x, y, z))
-            else:
-                r, h = shape.size[0], shape.size[1] / 2.0
-                half.append((r, r, h))
-                small.append((_CYLINDER * r, _CYLINDER * r, h))
-        self._large: Array = np.array(half).reshape(-1, 3) + _SKIN
-        self._small: Array = np.maximum(np.array(small).reshape(-1, 3) - _SKIN, 1e-4)
+        box = np.array([shape.kind == "box" for _, shape in shapes], bool)[:, None]
+        # edges of a box, or radius and length of a cylinder
+        edges = [s.size if s.kind == "box" else (2.0 * s.size[0], 2.0 * s.size[0], s.size[1]) for _, s in shapes]
+        half = np.array(edges).reshape(-1, 3) / 2.0
+        self._large: Array = half + _SKIN
+        self._small: Array = np.maximum(half * np.where(box, 1.0, (_CYLINDER, _CYLINDER, 1.0)) - _SKIN, 1e-4)
         allowed = description.allowed_collisions
         pairs = [
             (i, j)

@@ -65,25 +65,18 @@ def advice(A: Sequence[Array] | Array) -> str:
     if len(poses) == 0:
         return "take a first sample with all of the board in the image, as large as it fits"
     seen = motion(poses)
-    least = _least_turned(poses)
     if len(poses) < 3 or seen.rotation < math.radians(30.0) or seen.second < math.radians(15.0):
         return (
-            f"rotate about the wrist's {least} axis by 30° or more (so far {math.degrees(seen.rotation):.0f}°, and"
+            f"rotate about the wrist's {seen.least} axis by 30° or more (so far {math.degrees(seen.rotation):.0f}°, and"
             f" {math.degrees(seen.second):.0f}° about a second axis), with the board in the image"
         )
     if seen.translation < 0.05:
         return "move 5 cm or more nearer to the board, or farther from it, and tilt"
     if len(poses) < ENOUGH:
-        return f"{ENOUGH - len(poses)} more of this kind; rotate about the wrist's {least} axis, which turned least"
+        return (
+            f"{ENOUGH - len(poses)} more of this kind; rotate about the wrist's {seen.least} axis, which turned least"
+        )
     return "enough; solve, and check the predicted error"
-
-
-def _least_turned(poses: Array) -> str:
-    """Return the axis of the gripper about which the poses turned least."""
-    n = len(poses)
-    logs = [se3.log_so3(poses[i, :3, :3].T @ poses[j, :3, :3]) for i in range(n) for j in range(i + 1, n)]
-    spread = np.sum(np.square(logs), axis=0) if logs else np.zeros(3)
-    return "xyz"[int(np.argmin(spread))]
 
 
 #: Before the board was seen, its place is known as a person measures it, 1 cm and a few degrees: px of the image.

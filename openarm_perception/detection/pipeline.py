@@ -210,7 +210,7 @@ class NetworkPipeline(Pipeline):
         colors: Names the colours of what is in them.
     """
 
-    detector: NetworkDetector
+    detector: NetworkDetector  # pyright: ignore[reportIncompatibleVariableOverride] - never replaced
     colors: ColorDetector = field(kw_only=True)
 
     def detect(self, view: View) -> ImageDetections:
