@@ -22,7 +22,7 @@ def warm() -> None:
     robot = SelfFilter(description, SelfFilterConfig())
     joints = {name: 0.0 for name, joint in description.joints.items() if joint.type != "fixed"}
     shapes = robot.shapes(joints)
-    grid = OccupancyGrid(GridConfig(lower=(0.0, 0.0, 0.0), upper=(0.3, 0.3, 0.3), decay_s=1.0))
+    grid = OccupancyGrid(GridConfig(lower=(0.0, 0.0, 0.0), upper=(0.3, 0.3, 0.3)))
     intrinsics, T = Intrinsics.from_fovy(8, 6, 60.0), se3.make(None, (0.15, 0.15, 0.0))
     for depth in (np.full((6, 8), 200, np.uint16), np.full((6, 8), 0.2, np.float32)):
         scan = DepthScan(depth, intrinsics, T, 0.05, 1.0)
@@ -32,7 +32,6 @@ def warm() -> None:
     cloud = CloudScan(scan.points(), T[:3, 3])
     robot.label_points(cloud.points, shapes)
     grid.integrate([cloud], 0)
-    grid.decay(0)
     grid.forget(shapes, 0.01)
     for payload in (grid.binary(), grid.full()):
         decode(payload.data, grid.lattice.resolution, binary=payload.binary).on(grid.lattice)
