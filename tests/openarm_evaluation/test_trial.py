@@ -14,7 +14,7 @@ from openarm_evaluation.judging.judge import Sample, judge
 from openarm_evaluation.judging.provenance import machine, scene_hash, versions
 from openarm_evaluation.judging.statistics import summarise, wilson_low
 from openarm_evaluation.judging.trial import Step, Trial, choose_target, shows
-from openarm_grasp.ros.answers import GraspResult
+from openarm_grasp.ros.client import GraspResult
 
 
 def standing(scene: Scene, shift: float = 0.0, speed: float = 0.0) -> dict[str, Sample]:
