@@ -261,13 +261,16 @@ class CollisionScene(LineChecks):
         found = [self._contact(k) for k in self._colliding(q)]
         return sorted(found, key=lambda contact: contact.distance - contact.required)
 
-    def relax(self, q: ArrayLike, allowance: float, estimates: float | None = None) -> Contact | None:
+    def relax(
+        self, q: ArrayLike, allowance: float, estimates: float | None = None, passing: float = 0.0
+    ) -> Contact | None:
         """Let pairs that are too near at `q` stay as near as they are: an arm must be able to leave where it is.
 
         Args:
             q: (n,) where a motion starts.
             allowance: Overlap that is taken for an error of measurement, m.
             estimates: The same for pairs with boxes that are only estimated (all but `fixed`), m.
+            passing: What starts next to cells of the map may come nearer to them by this, but not touch them, m.
 
         Returns:
             A pair that overlaps deeper than that (nothing is relaxed then), or None.
@@ -284,10 +287,13 @@ class CollisionScene(LineChecks):
             # where the robot is there is nothing else: such cells are errors of the map
             cells = self._cells_at(q, [k for k in colliding if self._names[self._pair_index[k][1]] == MAP])
             self._build(replace(self._around, map=seen.minus(cells)))
-            return self.relax(q, allowance, estimates)
+            return self.relax(q, allowance, estimates, passing)
         for k, contact in zip(colliding, contacts, strict=True):
             self._required[k] = contact.distance - _LESS
-        if colliding:
+        for k, (_, j) in enumerate(self._pair_index):
+            if passing and self._names[j] == MAP:
+                self._required[k] = min(self._required[k], max(self._contact(k).distance - passing, 0.0))
+        if colliding or passing:
             self._set_margins()
         return None
 

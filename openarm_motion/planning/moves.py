@@ -24,6 +24,8 @@ _ROUNDING = 1e-3
 _GOALS = 24
 #: How far the elbow may swivel along a line when it can't keep its angle, rad; the smallest that works is taken.
 _DRIFTS = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5, 0.8, -0.8)
+#: A hand that leaves an object moves along the cells of its map, whose steps come nearer than the start by this, m.
+_PASSING = 0.003
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +88,7 @@ def to_pose_on_line(arm: Arm, now: StartState, pose: Array, around: RequestBoxes
     # a start nearer to a limit than the margin may go on as near
     margin = max(0.0, min(arm.config.planning.joint_margin, arm.kinematics.margin(now.start)))
     scene = arm.scene(now.state, around.obstacles, around.attached, straight=True, environment=now.environment)
-    arm.relax(scene, now.start)
+    arm.relax(scene, now.start, _PASSING)
     faults: list[PlanFailedError] = []
     for drift in _DRIFTS if not np.isnan(start.swivel) else (0.0,):
         try:

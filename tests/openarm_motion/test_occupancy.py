@@ -15,6 +15,7 @@ from openarm_common.octree.lattice import Lattice
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.occupancy import Environment, OccupancyMap, robot_bodies
 from openarm_motion.collision.solids import Cylinder, Mesh, Sphere, box_from
+from openarm_motion.kinematics.line import line_contact, solve_line
 from openarm_motion.planning import moves
 from openarm_motion.planning.arm import Arm
 
@@ -103,6 +104,27 @@ def test_octree_cell_at_the_gripper_does_not_hold_the_arm(right: Arm, home: dict
     goal = right.description.group_state("right_arm", "official_home")
     plan = moves.to_joints(right, now, [goal[name] for name in right.names], moves.RequestBoxes())
     assert plan.duration > 0.5
+
+
+def test_a_hand_may_back_off_along_cells_next_to_it_but_not_into_them(right: Arm, home: dict[str, float]) -> None:
+    """The steps of an object's cells come a little nearer to fingers that leave it than they were at the start."""
+    T = se3.make(se3.rotation_from_z_y((0.25, 0, -1), (1, 0, 0)), (0.349, -0.191, 0.468))
+    opened = right.with_gripper(home, right.config.planning.gripper_open)
+    known = Environment(map=seen((0.37, -0.19, 0.51)))
+    q = next(s.q for s in right.inverse.solutions(T, 0.05) if not right.scene(opened, straight=True).collides(s.q))
+    scene = right.scene(opened, straight=True, environment=known)
+    assert not scene.collides(q)
+    back, into = T.copy(), T.copy()
+    back[:3, 3] -= 0.1 * T[:3, 2]
+    line = solve_line(right.inverse, right.inverse.classify(q), T, back, 0.05)
+    contact = line_contact(scene, line)
+    assert contact is not None, "it comes nearer than straight lines may"
+    assert 0.001 < contact.distance < 0.003
+    now = right.start_state(opened, q, environment=known)
+    assert moves.to_pose_on_line(right, now, back, moves.RequestBoxes()).duration > 0.1
+    into[0, 3] -= 0.02
+    with pytest.raises(OpenArmError, match="finger would hit the map"):
+        moves.to_pose_on_line(right, now, into, moves.RequestBoxes())
 
 
 def test_cells_in_the_robot_and_in_known_bodies_are_explained(right: Arm, home: dict[str, float]) -> None:
