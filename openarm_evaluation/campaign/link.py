@@ -190,15 +190,15 @@ class DirectLink:
         )
         answer = await self._asked(lambda stopped: self.robot.motion.plan_approach(asked, stopped))
         refusals = {refused.id: Verdict(refused.code, refused.message) for refused in answer.refusals}
-        if answer.error is not None:
+        plan = answer.plan
+        if plan is None:
             raise NoWayError(answer.code, answer.message, refusals) from answer.error
-        transfer, approach, retreat = answer.parts
-        return Planned(answer.chosen, transfer, approach, retreat, refusals, answer.limit_margins)
+        return Planned(plan.chosen, *plan.parts, refusals, plan.limit_margins)
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
         """How far the arm's TCP stays from a point, in any orientation."""
         answer = self.robot.motion.compute_ik(arm, T_base_tcp, (), position_only=True)
-        return {arm: float(answer.position_error)}
+        return {arm: float(answer.nearest.position_error)}
 
     # --- moving
     async def follow(

@@ -24,7 +24,7 @@ from openarm_motion.kinematics.line import Line, line_contact, solve_line
 from openarm_motion.planning.arm import Arm, StartState, first_contact, segment_time
 from openarm_motion.planning.failure import PlanFailedError, Stage
 from openarm_motion.timing.trajectory import Trajectory
-from openarm_motion.timing.validation import Validation, validate_trajectory
+from openarm_motion.timing.validation import validate_trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,6 @@ class ApproachPlan:
         retreat: Straight line away from it.
         refusals: Why others were not chosen.
         held_after: Boxes that the arm holds at the end, tool frame.
-        certificates: How the three parts were validated, in their order.
         limit_margins: Of each target, how near its best configuration (of the chosen one: that which was planned) comes
             to a joint limit on both lines, rad; NaN for those that were refused or not checked.
     """
@@ -151,8 +150,12 @@ class ApproachPlan:
     retreat: Trajectory
     refusals: tuple[Refused, ...]
     held_after: tuple[Box, ...]
-    validations: tuple[Validation, Validation, Validation]
     limit_margins: tuple[float, ...]
+
+    @property
+    def parts(self) -> tuple[Trajectory, Trajectory, Trajectory]:
+        """Free path, approach and retreat."""
+        return self.transfer, self.approach, self.retreat
 
 
 class ApproachFailedError(PlanFailedError):
@@ -292,18 +295,17 @@ class _Checks:
             approach, retreat = (arm.time_line(line, now.scale) for line in (best.approach, best.retreat))
             what = "approach"
             try:
-                to = validate_trajectory(self._approach, approach)
+                validate_trajectory(self._approach, approach)
                 what = "retreat"
-                away = validate_trajectory(self._retreat, retreat)
+                validate_trajectory(self._retreat, retreat)
             except PlanFailedError as error:
                 id = targets[best.target].id
                 refusals.append(Refused.of(id, error, f"{id}: on the {what}, {error.message}"))
                 continue
             held = self.held_after(pose)
-            proof = (free.validation, to, away)
             self._margins[best.target] = best.margin
             margins = tuple(self._margins.tolist())
-            return ApproachPlan(best.target, free.trajectory, approach, retreat, tuple(refusals), held, proof, margins)
+            return ApproachPlan(best.target, free.trajectory, approach, retreat, tuple(refusals), held, margins)
         return None
 
     def candidates(self, index: int) -> tuple[list[_Candidate], Refused | None]:

@@ -29,7 +29,7 @@ from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.planner import PlannedPath, Planner, PlanQuery, make_planner, never
 from openarm_motion.timing.blending import timings
 from openarm_motion.timing.trajectory import JointLimits, Trajectory, profile, time_path
-from openarm_motion.timing.validation import Validation, validate_trajectory
+from openarm_motion.timing.validation import validate_trajectory
 
 #: A joint this far outside its limits is a wrong reading, not sag; rad.
 _SAG = 0.05
@@ -41,11 +41,10 @@ _FINENESS = (1.0, 4.0)
 
 @dataclass(frozen=True, eq=False)
 class ValidatedPlan:
-    """A path, the same timed, and how it was validated."""
+    """A path, and the same timed and validated."""
 
     path: PlannedPath
     trajectory: Trajectory
-    validation: Validation
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +269,8 @@ class Arm:
             path = self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
             for trajectory in self.timings(path, now.scale):
                 try:
-                    return ValidatedPlan(path, trajectory, validate_trajectory(scene, trajectory))
+                    validate_trajectory(scene, trajectory)
+                    return ValidatedPlan(path, trajectory)
                 except PlanFailedError as error:
                     fault, contact = error.message, error.contact
         text = f"the {self.name} arm's plan failed the validation: {fault}"

@@ -14,7 +14,6 @@ from openarm_interfaces.msg import (
     CollisionBox,
     CollisionObject,
     PlanFailure,
-    Refusal,
 )
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
@@ -30,7 +29,7 @@ from openarm_common.ros.convert import (
 )
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Cylinder, Mesh, Solid, Sphere
-from openarm_motion.planning.approach import ApproachRequest, Refused, Target
+from openarm_motion.planning.approach import ApproachRequest, Target
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.service.requests import (
     ArmGoal,
@@ -243,11 +242,6 @@ def _dual_goal(target: ArmTarget) -> DualGoal:
 def trajectory_msg(trajectory: Trajectory) -> JointTrajectory:
     """Message of a trajectory."""
     return trajectory_to_msg(trajectory.names, trajectory.t, trajectory.q, trajectory.v, trajectory.a)
-
-
-def refusals_msg(refusals: Sequence[Refused]) -> list[Refusal]:
-    """Messages of refusals."""
-    return [Refusal(id=refused.id, code=refused.code.value, message=refused.message) for refused in refusals]
 
 
 def held_markers(held: Mapping[str, tuple[str, Sequence[Box]]]) -> MarkerArray:

@@ -12,6 +12,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
+from openarm_interfaces.msg import Refusal
 from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
@@ -93,10 +94,11 @@ class MotionNode(BaseNode[MotionConfig]):
             answer = await _answered(ApproachAnswer, ask)
         finally:
             self.destroy_timer(timer)
-        result = PlanApproach.Result(chosen=answer.chosen, start_delay=answer.start_delay)
-        if answer.parts:
-            result.transfer, result.approach, result.retreat = map(convert.trajectory_msg, answer.parts)
-        result.refusals, result.limit_margins = convert.refusals_msg(answer.refusals), list(answer.limit_margins)
+        result = PlanApproach.Result(chosen=-1, start_delay=answer.start_delay)
+        if answer.plan is not None:
+            result.chosen, result.limit_margins = answer.plan.chosen, list(answer.plan.limit_margins)
+            result.transfer, result.approach, result.retreat = map(convert.trajectory_msg, answer.plan.parts)
+        result.refusals = [Refusal(id=r.id, code=r.code.value, message=r.message) for r in answer.refusals]
         return _end(handle, result, answer)
 
     async def _on_move(self, handle: ServerGoalHandle) -> MoveArm.Result:
@@ -115,8 +117,10 @@ class MotionNode(BaseNode[MotionConfig]):
             MoveArmsAnswer,
             lambda: self.service.move_arms(convert.move_arms_request(handle.request), cancelled(handle), report),
         )
-        result = MoveArms.Result(start_delays=list(answer.start_delays), clearance=answer.clearance)
-        result.trajectories = [convert.trajectory_msg(part) for part in answer.trajectories]
+        result = MoveArms.Result()
+        if answer.plan is not None:
+            result.start_delays, result.clearance = list(answer.plan.start_delays), answer.plan.clearance
+            result.trajectories = [convert.trajectory_msg(part) for part in answer.plan.trajectories]
         return _end(handle, result, answer)
 
     async def _on_execute(self, handle: ServerGoalHandle) -> ExecuteTrajectory.Result:
@@ -137,8 +141,9 @@ class MotionNode(BaseNode[MotionConfig]):
         try:
             pose = self.service.in_base(pose_to_matrix(request.pose.pose), request.pose.header.frame_id)
             answer = self.service.compute_ik(request.arm, pose, request.seed, position_only=request.position_only)
-            response.joint_positions, response.nearest = answer.q.tolist(), matrix_to_pose(answer.pose)
-            response.position_error, response.orientation_error = answer.position_error, answer.orientation_error
+            best, response.nearest = answer.nearest, matrix_to_pose(answer.pose)
+            response.joint_positions = best.q.tolist()
+            response.position_error, response.orientation_error = best.position_error, best.orientation_error
             if answer.error is not None:
                 raise answer.error
             response.success, response.code, response.message = True, Code.OK.value, "solved"
@@ -165,8 +170,8 @@ class MotionNode(BaseNode[MotionConfig]):
         state = self.service.scene_state()
         response.version, response.fixed, response.map = state.version, list(state.fixed), self.config.map.use
         response.objects = [convert.solid_msg(solid, BASE_FRAME) for solid in state.solids]
-        response.map_used, response.map_version = state.map_used, state.map_version
-        response.map_age, response.map_message = state.map_age, state.map_message
+        response.map_used, response.map_version = state.map.occupied is not None, state.map.version
+        response.map_age, response.map_message = state.map.age_s, state.map.why
         return response
 
     # --- what is published

@@ -23,13 +23,13 @@ from openarm_motion.collision.solids import Box, Solid, box_from
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning import moves
 from openarm_motion.planning.alternative import explained, explained_approach, near_joints, near_pose
-from openarm_motion.planning.approach import ApproachFailedError, ApproachPlan, plan_approach
+from openarm_motion.planning.approach import ApproachPlan, plan_approach
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.dual_arm import DualArm, DualArmGoals, DualArmPlan, plan_any, plan_staggered, plan_together
 from openarm_motion.planning.moves import goal_configurations, named_posture, yielding
 from openarm_motion.planning.planner import never
 from openarm_motion.scene.held import HeldObjects
-from openarm_motion.scene.map_view import FieldSource, MapView
+from openarm_motion.scene.map_view import FieldSource, MapState, MapView
 from openarm_motion.scene.planning_scene import PlanningScene
 from openarm_motion.service.context import PlanningContext
 from openarm_motion.service.coordination import ArmCoordination
@@ -151,22 +151,12 @@ class MotionService:
 
             plan = await self.robot.compute(work)
             delay = await self.coordination.start_delay(arm, plan.transfer, wanted.attached, stopped)
-            parts = (plan.transfer, plan.approach, plan.retreat)
-            self.on_plan({arm.name: parts})
-            self.memory.expect(arm.name, parts[:2], wanted.attached)
-            self.memory.expect(arm.name, parts[2:], plan.held_after)
-            answer = replace(
-                answer,
-                message=f"planned{prepared.note}",
-                start_delay=delay,
-                chosen=plan.chosen,
-                parts=parts,
-                refusals=plan.refusals,
-                limit_margins=plan.limit_margins,
-            )
+            self.on_plan({arm.name: plan.parts})
+            self.memory.expect(arm.name, plan.parts[:2], wanted.attached)
+            self.memory.expect(arm.name, plan.parts[2:], plan.held_after)
+            answer = replace(answer, message=f"planned{prepared.note}", start_delay=delay, plan=plan)
         except OpenArmError as error:
-            refusals = error.refusals if isinstance(error, ApproachFailedError) else ()
-            answer = replace(answer, error=error, message=error.message, refusals=refusals)
+            answer = replace(answer, error=error, message=error.message)
         return replace(answer, planning_time=self.robot.now() - begin)
 
     async def move(
@@ -228,14 +218,8 @@ class MotionService:
                 plan = await self.robot.compute(work)
                 seconds = max(part.duration for part in plan.trajectories)
                 apart = f"{plan.clearance * 1e3:.0f} mm apart"
-                answer = replace(
-                    answer,
-                    trajectories=plan.trajectories,
-                    start_delays=plan.start_delays,
-                    clearance=plan.clearance,
-                    planning_time=self.robot.now() - begin,
-                    message=f"planned, {seconds:.2f} s, {apart}{prepared.note}",
-                )
+                message = f"planned, {seconds:.2f} s, {apart}{prepared.note}"
+                answer = replace(answer, plan=plan, planning_time=self.robot.now() - begin, message=message)
                 plans = dict(zip((arm.name for arm in arms), plan.trajectories, strict=True))
                 self.on_plan({name: (part,) for name, part in plans.items()})
                 if not request.plan_only:
@@ -299,8 +283,7 @@ class MotionService:
         error = None
         if not best.success:
             error = moves.unreachable(arm, pose, position_only=position_only, margin=0.0, near=start)
-        fk = arm.kinematics.fk(best.q)
-        return IkAnswer(best.q, fk, best.position_error, best.orientation_error, error)
+        return IkAnswer(best, arm.kinematics.fk(best.q), error)
 
     def in_base(self, pose: Array, frame: str = "") -> Array:
         """Bring a pose (4, 4) in any known frame to the base frame.
@@ -317,14 +300,11 @@ class MotionService:
     def scene_state(self) -> SceneState:
         """Return the planning scene, and whether plans use the map."""
         scene = self.scene
-        used, version, age, why = False, 0, -1.0, ""
         try:
-            view = self._context.map_state()
-            used, version, age, why = view.occupied is not None, view.version, view.age_s, view.why
+            seen = self._context.map_state()
         except OpenArmError as error:
-            why = error.message
-        solids = (*scene.fixed, *scene.solids)
-        return SceneState(scene.version, solids, tuple(box.id for box in scene.fixed), used, version, age, why)
+            seen = MapState(None, why=error.message)
+        return SceneState(scene.version, (*scene.fixed, *scene.solids), tuple(box.id for box in scene.fixed), seen)
 
     def apply_scene(self, *, clear: bool, remove: Sequence[str], add: Sequence[Solid], expected: int = 0) -> str:
         """Change the planning scene, all as asked or nothing; see `PlanningScene.apply`. Return it in a sentence."""

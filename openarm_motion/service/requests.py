@@ -11,7 +11,10 @@ import numpy as np
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid
-from openarm_motion.planning.approach import ApproachRequest, Refused
+from openarm_motion.kinematics.chain import IkResult
+from openarm_motion.planning.approach import ApproachFailedError, ApproachPlan, ApproachRequest, Refused
+from openarm_motion.planning.dual_arm import DualArmPlan
+from openarm_motion.scene.map_view import MapState
 from openarm_motion.timing.trajectory import Motion, Trajectory
 
 
@@ -173,12 +176,15 @@ class MotionAnswer:
 
 @dataclass(frozen=True, eq=False)
 class ApproachAnswer(MotionAnswer):
-    """A planned approach; see `openarm_motion.planning.approach.ApproachPlan`."""
+    """A planned approach."""
 
-    chosen: int = -1
-    parts: tuple[Trajectory, ...] = ()
-    refusals: tuple[Refused, ...] = ()
-    limit_margins: tuple[float, ...] = ()
+    plan: ApproachPlan | None = None
+
+    @property
+    def refusals(self) -> tuple[Refused, ...]:
+        """Why targets were not chosen, whether one was or none."""
+        known = self.plan or self.error
+        return known.refusals if isinstance(known, ApproachPlan | ApproachFailedError) else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,32 +196,25 @@ class MoveAnswer(MotionAnswer):
 
 @dataclass(frozen=True, eq=False)
 class MoveArmsAnswer(MotionAnswer):
-    """A dual-arm motion: trajectories, the delay contained in each (s), and the least clearance of the arms (m)."""
+    """A planned, and maybe executed, dual-arm motion."""
 
-    trajectories: tuple[Trajectory, ...] = ()
-    start_delays: tuple[float, ...] = ()
-    clearance: float = 0.0
+    plan: DualArmPlan | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class IkAnswer:
-    """Nearest configuration to a pose, its errors (m, rad) and tool pose; `error` is None when it solves the pose."""
+    """Nearest configuration to a pose, and the tool's pose there; `error` is None when it solves the pose."""
 
-    q: Array
+    nearest: IkResult
     pose: Array
-    position_error: float
-    orientation_error: float
     error: OpenArmError | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class SceneState:
-    """The planning scene, and whether plans use the map: `map_message` says why not; age -1: there is none."""
+    """The planning scene, ids of what can't be changed in it, and the map."""
 
     version: int
     solids: tuple[Solid, ...]
     fixed: tuple[str, ...]
-    map_used: bool
-    map_version: int
-    map_age: float
-    map_message: str
+    map: MapState

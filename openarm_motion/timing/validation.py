@@ -9,7 +9,6 @@ the clearance there. Half a step away from a sample no point has moved further t
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -30,21 +29,6 @@ _ARMS = 0.9
 _TRAVEL = 0.004
 
 
-@dataclass(frozen=True)
-class Validation:
-    """What was checked.
-
-    Attributes:
-        states: How many states.
-        travel: No point of the arm moves further between two of them, m.
-        share: Share of each pair's clearance that was found everywhere.
-    """
-
-    states: int
-    travel: float
-    share: float
-
-
 class Checked(Protocol):
     """What a trajectory is checked in: a scene of one arm, or of two."""
 
@@ -63,29 +47,25 @@ class Checked(Protocol):
         ...
 
 
-def validate_trajectory(
-    scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL, share: float = _SHARE
-) -> Validation:
+def validate_trajectory(scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL) -> None:
     """Check a trajectory densely.
 
     Args:
         scene: What it was planned in; its clearances are reduced meanwhile, not for good.
         trajectory: As it goes to the controller.
         travel: Greatest travel of a point between two checks, m.
-        share: Share of each positive clearance to ask for; overlaps that are allowed stay so.
 
     Raises:
         PlanFailedError: IN_COLLISION, with the time and the pair.
     """
     times = dense_times(trajectory, scene.levers, travel)
     states = trajectory.at(times)[0]
-    with scene.lenient(share, max(share, _ARMS)):
+    with scene.lenient(_SHARE, _ARMS):
         for k in ends_first(len(states)):
             if scene.collides(states[k]):
                 contact = scene.contacts(states[k])[0]
                 text = f"after {times[k]:.2f} s of the trajectory {contact}"
                 raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
-    return Validation(len(states), travel, share)
 
 
 def dense_times(trajectory: Trajectory, levers: Array, travel: float = _TRAVEL) -> Array:

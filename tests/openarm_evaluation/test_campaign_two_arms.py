@@ -153,20 +153,20 @@ def test_plans_in_process_see_the_map_of_the_rendered_images() -> None:
     robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
     robot.pass_time(0.1)
     state = robot.motion.scene_state()
-    assert state.map_used, state.map_message
+    assert state.map.occupied is not None, state.map.why
     cells = OccupancyMap.of(robot.map.latest()).centres
     for item in robot.scene.objects:  # each object is in it, and hardly anything else above the table
         assert np.min(np.linalg.norm(cells - item.centre(robot.scene.table), axis=1)) < 0.06
     assert cells[:, 2].max() < robot.scene.table.top_z + 0.15
     robot.pass_time(0.5)
-    assert robot.motion.scene_state().map_version == state.map_version + 1
+    assert robot.motion.scene_state().map.version == state.map.version + 1
 
 
 def test_parameters_of_nodes_hold_in_process() -> None:
     sets = ("motion.map.use=off", "octomap.grid.resolution=0.04", "motion.limits.default_scale=0.2")
     robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False, sets=sets))
     robot.pass_time(0.1)
-    assert robot.motion.scene_state().map_message == "switched off"
+    assert robot.motion.scene_state().map.why == "switched off"
     assert robot.map.config.grid.resolution == 0.04
     assert robot.motion.arms["left"].scale(0.0) == 0.2
 

@@ -232,7 +232,8 @@ def test_a_dual_arm_motion_moves_both_arms_from_the_same_moment(bench) -> None:
     assert answer.code is Code.OK, answer.message
     left, right = (controller.goals[0] for controller in bench.robot.controllers.values())
     assert left.begin_ns == right.begin_ns > 0
-    assert answer.clearance >= 0.02
+    assert answer.plan is not None
+    assert answer.plan.clearance >= 0.02
 
 
 def test_an_unreachable_pose_carries_the_nearest_alternative(bench) -> None:
@@ -241,4 +242,4 @@ def test_an_unreachable_pose_carries_the_nearest_alternative(bench) -> None:
     assert answer.code is Code.UNREACHABLE
     ik = bench.service.compute_ik("right", pose, (), position_only=False)
     assert ik.error is not None
-    assert ik.position_error > 0.05
+    assert ik.nearest.position_error > 0.05

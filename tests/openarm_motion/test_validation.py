@@ -24,15 +24,17 @@ def across(right: Arm, home: dict[str, float]) -> PlannedPath:
 
 @pytest.mark.requirement("A-68")
 def test_a_planned_trajectory_is_certified_with_no_point_moving_far_between_two_looks(
-    right: Arm, home: dict[str, float]
+    right: Arm, home: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = right.scene(home)
     path = across(right, home)
     planned = right.plan(scene, StartState(home, path.waypoints[0]), path.waypoints[1:], 5.0)
-    certificate = validate_trajectory(scene, [*right.timings(planned, 0.5)][-1])
+    looks: list[np.ndarray] = []
+    collides = scene.collides
+    monkeypatch.setattr(scene, "collides", lambda q: looks.append(q) or collides(q))
+    validate_trajectory(scene, [*right.timings(planned, 0.5)][-1])
     way = float(np.sum(np.abs(np.diff(planned.waypoints, axis=0)) @ scene.levers))
-    assert certificate.states >= way / certificate.travel
-    assert certificate.share == 0.5
+    assert len(looks) >= way / 0.004
 
 
 def test_a_trajectory_through_a_thin_sheet_is_refused_with_the_time_and_the_pair(
