@@ -32,19 +32,14 @@ class Line:
     Attributes:
         q: (m, n) configurations, rad.
         s: (m,) way of the tool from the start, m (a turn counts as if at `ROTATION_LENGTH` from its axis).
-        end: The configuration at the end with its branch.
-        deviation: How far the tool leaves the line between two points if joints are interpolated linearly, m.
     """
 
     q: Array
     s: Array
-    end: Solution
-    deviation: float
 
     def reversed(self) -> Line:
-        """The same line the other way; `end` then carries the branch of the whole line."""
-        end = Solution(self.q[0], self.end.swivel, self.end.branch)
-        return Line(self.q[::-1].copy(), self.s[-1] - self.s[::-1], end, self.deviation)
+        """The same line the other way."""
+        return Line(self.q[::-1].copy(), self.s[-1] - self.s[::-1])
 
 
 def line_poses(T_a: Array, T_b: Array) -> tuple[Array, Array]:
@@ -91,10 +86,7 @@ def solve_line(
             Code.UNREACHABLE,
             f"the straight line of {s[-1] * 1e3:.0f} mm ends after {s[max(reached - 1, 0)] * 1e3:.0f} mm: {why}",
         )
-    between = inverse.kinematics.fk_many(0.5 * (q[1:] + q[:-1]))[:, :3, 3]
-    direct = 0.5 * (poses[1:, :3, 3] + poses[:-1, :3, 3])
-    deviation = float(np.max(np.linalg.norm(between - direct, axis=1)))
-    return Line(q, s, Solution(q[-1], start.swivel + swivel_change, start.branch), deviation)
+    return Line(q, s)
 
 
 def line_contact(scene: CollisionScene, line: Line) -> Contact | None:

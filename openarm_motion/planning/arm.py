@@ -28,7 +28,7 @@ from openarm_motion.kinematics.line import Line
 from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.planning.planner import PlannedPath, Planner, PlanQuery, make_planner, never
 from openarm_motion.timing.blending import timings
-from openarm_motion.timing.trajectory import JointLimits, Trajectory, profile, time_path
+from openarm_motion.timing.trajectory import JointLimits, Trajectory, straight_profile, time_path
 from openarm_motion.timing.validation import validate_trajectory
 
 #: A joint this far outside its limits is a wrong reading, not sag; rad.
@@ -183,6 +183,8 @@ class Arm:
         straight: bool = False,
         gripper: float | None = None,
         environment: Environment = NOTHING,
+        carried: Sequence[tuple[int, Box]] = (),
+        arms: float | None = None,
     ) -> CollisionScene:
         """Surroundings of the arm with the table in them.
 
@@ -194,10 +196,11 @@ class Arm:
             straight: Clearance of straight parts instead of free paths.
             gripper: Position of the finger joints instead of the present one, m.
             environment: Bodies of the planning scene, as certain as the table, the map, and the distance of the arms.
+            carried: What goes with the other arm, see `CollisionContext`.
+            arms: Distance that the arms keep from each other instead of that of clearance and environment, m.
         """
         clearance = self.config.straight if straight else self.config.clearance
-        if environment.arm_clearance > clearance.arms:
-            clearance = clearance.model_copy(update={"arms": environment.arm_clearance})
+        apart = max(clearance.arms, environment.arm_clearance) if arms is None else arms
         certain = (*self.static, *environment.solids)
         fixed = frozenset(body.id for body in certain)
         return CollisionScene(
@@ -206,10 +209,11 @@ class Arm:
                 state=state if gripper is None else self.with_gripper(state, gripper),
                 boxes=[*certain, *boxes],
                 held=held,
+                carried=carried,
                 touchable=touchable,
                 supports=fixed | touchable,
                 fixed=fixed,
-                clearance=clearance,
+                clearance=clearance.model_copy(update={"arms": apart}),
                 map=environment.map,
             ),
         )
@@ -341,11 +345,7 @@ def plan_query(
 
 def segment_time(a: Array, b: Array, limits: JointLimits) -> float:
     """Duration of a straight joint segment from rest to rest, s."""
-    size = np.maximum(np.abs(b - a), 1e-12)
-    if float(size.max()) < 1e-9:
-        return 0.0
-    v, acceleration, j = (float(np.min(x / size)) for x in (limits.velocity, limits.acceleration, limits.jerk))
-    return profile(1.0, v, acceleration, j).duration
+    return 0.0 if float(np.abs(b - a).max()) < 1e-9 else straight_profile(b - a, limits).duration
 
 
 def first_contact(scene: CollisionScene, q: Array) -> Contact | None:

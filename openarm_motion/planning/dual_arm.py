@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene, Contact, LineChecks
+from openarm_motion.collision.exact import CollisionScene, Contact, LineChecks
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.solids import Box
@@ -137,38 +137,10 @@ class DualArm:
         environment: Environment = NOTHING,
     ) -> CollisionScene:
         """Surroundings of one of the arms, the other one in them where `state` says; arguments as `scene`."""
-        arm = self.arms[index]
-        keep = arm.config.clearance.model_copy(update={"arms": separation})
-        certain = (*arm.static, *environment.solids)
-        fixed = frozenset(body.id for body in certain)
-        around = CollisionContext(
-            state,
-            [*certain, *boxes],
-            held=held[index],
-            carried=self.arms[1 - index].robot.on_tool(held[1 - index]),
-            supports=fixed,
-            fixed=fixed,
-            clearance=keep,
-            map=environment.map,
+        carried = self.arms[1 - index].robot.on_tool(held[1 - index])
+        return self.arms[index].scene(
+            state, boxes, held[index], environment=environment, carried=carried, arms=separation
         )
-        return CollisionScene(arm.robot, around)
-
-    def pair_scene(
-        self, state: Mapping[str, float], separation: float, held: tuple[Sequence[Box], Sequence[Box]] = ((), ())
-    ) -> DualArmScene:
-        """Nothing but the arms and what they hold; arguments as `scene`."""
-        first, second = (
-            CollisionContext(
-                state,
-                held=held[i],
-                carried=self.arms[1 - i].robot.on_tool(held[1 - i]),
-                clearance=Clearance(arms=separation),
-                own=False,
-            )
-            for i in range(2)
-        )
-        a, b = self.arms
-        return DualArmScene(CollisionScene(a.robot, first), CollisionScene(b.robot, second), self.split)
 
     def limits(self, scale: float) -> JointLimits:
         """Limits of all joints at a velocity scale."""
@@ -271,7 +243,7 @@ def plan_staggered(both: DualArm, now: StartState, wanted: DualArmGoals, time_li
     Raises:
         OpenArmError: as `plan_together`.
     """
-    found: list[_Staggered] = []
+    found: list[DualArmPlan] = []
     faults: list[OpenArmError] = []
     for first in range(2):
         try:
@@ -283,9 +255,9 @@ def plan_staggered(both: DualArm, now: StartState, wanted: DualArmGoals, time_li
     if not found:
         text = "; ".join(f"{arm.name} first: {e.message}" for arm, e in zip(both.arms, faults, strict=True))
         raise OpenArmError(faults[0].code, f"neither arm can go first: {text}")
-    best = min(found, key=lambda plan: max(part.duration for part in plan.parts))
+    best = min(found, key=lambda plan: max(part.duration for part in plan.trajectories))
     scene = both.scene(now.state, held=wanted.held)
-    return DualArmPlan(best.parts, best.waits, separation(scene, joined(both, best.parts)))
+    return replace(best, clearance=separation(scene, joined(both, best.trajectories)))
 
 
 def plan_any(both: DualArm, now: StartState, wanted: DualArmGoals, time_limit: float) -> DualArmPlan:
@@ -334,13 +306,8 @@ def delayed(trajectory: Trajectory, wait: float) -> Trajectory:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Staggered:
-    parts: tuple[Trajectory, Trajectory]
-    waits: tuple[float, float]
-
-
-def _in_order(both: DualArm, now: StartState, wanted: DualArmGoals, first: int, time_limit: float) -> _Staggered:
+def _in_order(both: DualArm, now: StartState, wanted: DualArmGoals, first: int, time_limit: float) -> DualArmPlan:
+    """The plan in which arm number `first` goes first, without the least distance of the arms."""
     second = 1 - first
     early = _alone(both, first, now, now.state, wanted, time_limit)
     there = {**now.state, **dict(zip(both.arms[first].names, early.q[-1].tolist(), strict=True))}
@@ -348,8 +315,8 @@ def _in_order(both: DualArm, now: StartState, wanted: DualArmGoals, first: int, 
     one, other = (ActiveMotion(both.arms[i], part, wanted.held[i]) for i, part in ((first, early), (second, late)))
     wait = least_delay(other, [one], now.state, stopped=now.stopped)
     if first == 0:
-        return _Staggered((early, delayed(late, wait)), (0.0, wait))
-    return _Staggered((delayed(late, wait), early), (wait, 0.0))
+        return DualArmPlan((early, delayed(late, wait)), (0.0, wait), np.nan)
+    return DualArmPlan((delayed(late, wait), early), (wait, 0.0), np.nan)
 
 
 def joined(both: DualArm, parts: tuple[Trajectory, Trajectory]) -> Trajectory:

@@ -16,7 +16,7 @@ from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
 
 from openarm_common.errors import Answer, Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
-from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix, trajectory_from_msg
+from openarm_common.ros.convert import matrix_to_pose, trajectory_from_msg
 from openarm_common.types import Array
 from openarm_motion.collision.solids import Box, Solid
 from openarm_motion.ros import convert
@@ -24,18 +24,6 @@ from openarm_motion.timing.trajectory import Trajectory
 
 #: Longest wait for a motion, s of wall clock.
 _LONG = 120.0
-
-
-@dataclass(frozen=True, eq=False)
-class MotionFailure:
-    """Why a plan failed, as openarm_interfaces/msg/PlanFailure; `alternative` (n,) rad is the nearest feasible goal."""
-
-    stage: str
-    first: str
-    second: str
-    distance: float
-    alternative: Array | None
-    alternative_pose: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +35,12 @@ class MotionResult(Answer):
     Attributes:
         trajectories: The plan, of each arm that was asked for; empty without one.
         scene_version: Of the planning scene that it was made in; 0 for `execute`.
-        failure: Where and why there is no plan; None after a success.
+        failure: Where and why there is no plan, and the nearest feasible goal, if any; None after a success.
     """
 
     trajectories: tuple[Trajectory, ...] = ()
     scene_version: int = 0
-    failure: MotionFailure | None = None
+    failure: PlanFailure | None = None
 
 
 class MotionClient(BackgroundNode):
@@ -206,19 +194,7 @@ def _result(result: Any, messages: Sequence[Any]) -> MotionResult:
             names, t, q, v, a = trajectory_from_msg(message)
             rest = np.zeros_like(q)
             trajectories.append(Trajectory(tuple(names), t, q, rest if v is None else v, rest if a is None else a))
-    failure = None if result.success else _failure(result.failure)
+    failure = None if result.success else result.failure
     return MotionResult(
         result.success, Code(result.code), result.message, tuple(trajectories), int(result.scene_version), failure
-    )
-
-
-def _failure(message: PlanFailure) -> MotionFailure:
-    there = message.has_alternative
-    return MotionFailure(
-        message.stage,
-        message.first,
-        message.second,
-        message.distance,
-        np.array(message.alternative) if there else None,
-        pose_to_matrix(message.alternative_pose) if there else None,
     )

@@ -165,7 +165,7 @@ class ArmCoordination:
             return None
         now_ns, state = self._robot.states.latest()
         try:
-            check_against_others(arm, active.rest(now_ns), state, [])
+            check_against_others(arm, active.rest(now_ns), state)
         except OpenArmError as error:
             text = f"the {name} arm stopped on its way, and the {arm.name} arm holds before it: {error.message}"
             return OpenArmError(error.code, text)
@@ -181,7 +181,7 @@ class ArmCoordination:
             now_ns, state = latest()
             begin_ns, stops = now_ns + round(head * 1e9), dict(self.stops)
             if not self.under_way(arm) and max_delay == 0.0:
-                check_against_others(arm, motion, state, [])
+                check_against_others(arm, motion, state)
                 return 0, 0.0
             opened = self._hands_open(state)
             others = self._others(arm, begin_ns, opened)

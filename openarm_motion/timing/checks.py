@@ -6,7 +6,7 @@ s, rad, rad/s.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -87,14 +87,13 @@ def check_trajectory(arm: Arm, motion: Motion, state: Mapping[str, float]) -> Mo
     return Motion(arm.names, t, q, None if v is None else v[:, order], None if a is None else a[:, order])
 
 
-def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float], others: Sequence[Motion]) -> None:
-    """Refuse a motion during which the arm would meet another arm, at rest or on its way.
+def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float]) -> None:
+    """Refuse a motion during which the arm would meet another arm at rest.
 
     Args:
         arm: The arm that is to move.
         motion: Its motion, beginning now.
         state: Present positions by joint name.
-        others: What the other arms still have before them, beginning now.
 
     Raises:
         OpenArmError: IN_COLLISION, with the pair and the time.
@@ -103,10 +102,7 @@ def check_against_others(arm: Arm, motion: Motion, state: Mapping[str, float], o
     scene = CollisionScene(arm.robot, CollisionContext(state=state, clearance=keep, own=False))
     if scene.relax(motion.q[0], arm.config.planning.start_overlap) is not None:
         return  # it is in contact already: any way out is better than none, and the plan has checked it
-    end = max([motion.duration, *(other.duration for other in others)])
-    for t in np.linspace(0.0, end, max(2, int(np.ceil(end / _PAIR_STEP)) + 1)):
-        if others:
-            scene.set_state({**state, **{k: x for other in others for k, x in other.joints_at(float(t)).items()}})
+    for t in np.linspace(0.0, motion.duration, max(2, int(np.ceil(motion.duration / _PAIR_STEP)) + 1)):
         q = np.array([motion.joints_at(float(t))[name] for name in arm.names])
         if scene.collides(q):
             contact = scene.contacts(q)[0]

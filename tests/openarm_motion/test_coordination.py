@@ -35,7 +35,7 @@ def standing(state: dict[str, float], arm: Arm, q: np.ndarray) -> dict[str, floa
 def nearest(arms: dict[str, Arm], state: dict[str, float], left: Motion, right: Motion, held=((), ())) -> float:
     """Least distance of the arms at looks 5 ms apart, from nothing but the motions."""
     both = DualArm(arms["left"], arms["right"])
-    scene = both.pair_scene(state, 0.1, held)
+    scene = both.scene(state, held=held)
     times = np.arange(0.0, max(left.t[-1], right.t[-1]) + 0.005, 0.005)
     return min(scene.separation(q) for q in np.hstack([left.states(times), right.states(times)]))
 
@@ -102,13 +102,13 @@ def test_two_held_objects_keep_apart_too(arms, home) -> None:
     right = to_the_middle(arms["right"], home, -0.20)
     both = DualArm(arms["left"], arms["right"])
     ends = np.concatenate([left.q[-1], right.q[-1]])
-    assert not both.pair_scene(home, 0.02).collides(ends)
+    assert not both.scene(home, separation=0.02).collides(ends)
     least_delay(ActiveMotion(arms["right"], right), [ActiveMotion(arms["left"], left)], home)
     wide = box_from("plate", (0.0, 0.0, 0.20), (0.05, 0.44, 0.02))
-    hits = both.pair_scene(home, 0.02, ([wide], [wide])).contacts(ends)
+    hits = both.scene(home, separation=0.02, held=([wide], [wide])).contacts(ends)
     assert {c.first.split()[-1] for c in hits} >= {"plate"}
     for held in (plate, wide):
-        meet = both.pair_scene(home, 0.02, ([held], [held])).collides(ends)
+        meet = both.scene(home, separation=0.02, held=([held], [held])).collides(ends)
         mine, other = ActiveMotion(arms["right"], right, [held]), ActiveMotion(arms["left"], left, [held])
         if meet:
             with pytest.raises(OpenArmError, match="plate"):

@@ -67,7 +67,7 @@ def test_a_program_changes_the_scene_and_reads_why_there_is_no_plan(bench) -> No
         assert (result.success, result.code) == (False, Code.IN_COLLISION)
         assert result.failure is not None
         assert (result.failure.stage, result.failure.second) == ("goal", "ball")
-        assert result.failure.alternative is not None
+        assert result.failure.has_alternative
         assert motion.move_to_joints("right", result.failure.alternative, scale=1.0).success
         with pytest.raises(OpenArmError, match="can't remove 'cup'"):
             motion.apply_scene(remove=["cup"])
