@@ -25,7 +25,6 @@ def warm() -> None:
     home = description.group_state(f"{SIDES[0]}_arm", "home")  # clear of singularities: a straight line leads away
     q = np.array([home[joint] for joint in description.arm_joints(SIDES[0])])
     pose = kinematics.fk_many(np.stack([q, q]))[0]
-    kinematics.jacobian(q)
     inverse.nearest(pose, q)
     inverse.position_solutions(pose, near=q)
     inverse.solutions(pose, near=q)

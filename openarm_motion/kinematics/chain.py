@@ -7,6 +7,7 @@ joint name is written down here. Poses are `T_base_tool` (4, 4) in the descripti
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -39,6 +40,21 @@ class IkResult:
     position_error: float
     orientation_error: float
     restarts: int
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """One configuration (n,) of the arm at a pose, and what singles it out among the others.
+
+    Attributes:
+        q: rad.
+        swivel: Angle of the elbow about the line from shoulder to wrist; NaN for an arm solved numerically.
+        branch: Branch of the closed form; -1 for an arm solved numerically.
+    """
+
+    q: Array
+    swivel: float = math.nan
+    branch: int = -1
 
 
 class ArmKinematics:
@@ -100,13 +116,6 @@ class ArmKinematics:
     def fk_many(self, q: ArrayLike) -> Array:
         """Tool poses (m, 4, 4) of configurations (m, n)."""
         return kernels.forward_many(np.ascontiguousarray(q, dtype=np.float64), *self.chain)
-
-    def jacobian(self, q: ArrayLike) -> Array:
-        """Geometric Jacobian (6, n) of the tool origin, linear rows first, base frame."""
-        pose, origins, directions = self._forward(q)
-        out = np.empty((6, self.n))
-        kernels.jacobian(origins, directions, self.prismatic, pose[:3, 3].copy(), out)
-        return out
 
     def joint_axes(self, q: ArrayLike) -> tuple[Array, Array]:
         """A point on each joint axis and its direction, (n, 3) each, base frame."""

@@ -8,34 +8,18 @@ The rest of the package asks only here, so an arm of any build behaves the same,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from openarm_common.errors import OpenArmError
 from openarm_common.types import Array
-from openarm_motion.kinematics.chain import ArmKinematics, IkResult
+from openarm_motion.kinematics.chain import ArmKinematics, IkResult, Solution
 from openarm_motion.kinematics.srs import SrsArm, SrsMiss
 
 #: Numeric solutions nearer to each other than this in every joint count as one.
 _SAME = 0.05
 _GUESSES = 24
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """One configuration (n,) of the arm at a pose, and what singles it out among the others.
-
-    Attributes:
-        q: rad.
-        swivel: Angle of the elbow about the line from shoulder to wrist; NaN for an arm solved numerically.
-        branch: Branch of the closed form; -1 for an arm solved numerically.
-    """
-
-    q: Array
-    swivel: float = math.nan
-    branch: int = -1
 
 
 class InverseKinematics:
@@ -68,14 +52,12 @@ class InverseKinematics:
             swivels = self._swivels
             if near is not None:
                 swivels = np.concatenate([[self._closed.classify(near).swivel], swivels])
-            return [Solution(s.q, s.swivel, s.branch) for s in self._closed.sweep(pose, swivels, margin)[0]]
+            return self._closed.sweep(pose, swivels, margin)[0]
         return self._numeric(pose, margin, near, position_only=False)
 
-    def position_solutions(
-        self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None, guesses: int = _GUESSES
-    ) -> list[Solution]:
+    def position_solutions(self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None) -> list[Solution]:
         """Configurations whose tool origin is at the position of `pose`, in whatever orientation."""
-        return [self.classify(s.q) for s in self._numeric(pose, margin, near, position_only=True, guesses=guesses)]
+        return [self.classify(s.q) for s in self._numeric(pose, margin, near, position_only=True)]
 
     def nearest(
         self, pose: Array, seed: ArrayLike | None = None, *, position_only: bool = False, margin: float = 0.0
@@ -86,10 +68,7 @@ class InverseKinematics:
     def classify(self, q: ArrayLike) -> Solution:
         """Swivel angle and branch of a configuration."""
         values = np.asarray(q, dtype=np.float64)
-        if self._closed is None:
-            return Solution(values)
-        found = self._closed.classify(values)
-        return Solution(values, found.swivel, found.branch)
+        return Solution(values) if self._closed is None else self._closed.classify(values)
 
     def why_not(
         self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None, *, position_only: bool = False
@@ -136,13 +115,11 @@ class InverseKinematics:
             q = result.q
         return path, poses.shape[0], ""
 
-    def _numeric(
-        self, pose: Array, margin: float, near: ArrayLike | None, *, position_only: bool, guesses: int = _GUESSES
-    ) -> list[Solution]:
+    def _numeric(self, pose: Array, margin: float, near: ArrayLike | None, *, position_only: bool) -> list[Solution]:
         rng = np.random.default_rng(0)
         arm = self.kinematics
         seeds = [] if near is None else [np.asarray(near, dtype=np.float64)]
-        seeds += [0.5 * (arm.lower + arm.upper), *rng.uniform(arm.lower, arm.upper, (guesses, arm.n))]
+        seeds += [0.5 * (arm.lower + arm.upper), *rng.uniform(arm.lower, arm.upper, (_GUESSES, arm.n))]
         found: list[Solution] = []
         for seed in seeds:
             result = arm.ik(pose, seed, position_only=position_only, margin=margin, restarts=0)

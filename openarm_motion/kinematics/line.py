@@ -15,8 +15,9 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision.exact import CollisionScene, Contact
+from openarm_motion.kinematics.chain import Solution
 from openarm_motion.kinematics.chain_kernels import ROTATION_LENGTH
-from openarm_motion.kinematics.inverse import InverseKinematics, Solution
+from openarm_motion.kinematics.inverse import InverseKinematics
 
 #: Distance and turn of the tool between two points of a line.
 STEP_M = 0.005

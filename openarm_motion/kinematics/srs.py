@@ -16,20 +16,11 @@ from numpy.typing import ArrayLike
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.kinematics import srs_kernels
-from openarm_motion.kinematics.chain import ArmKinematics
+from openarm_motion.kinematics.chain import ArmKinematics, Solution
 
 #: How far the axes may miss each other: a rounded rpy in the URDF costs 4e-6 m.
 _MEET = 2e-5
 _PERPENDICULAR = 1e-4
-
-
-@dataclass(frozen=True)
-class SrsSolution:
-    """One configuration at a pose: (7,) rad, its swivel angle and its branch (0 to 7)."""
-
-    q: Array
-    swivel: float
-    branch: int
 
 
 @dataclass(frozen=True)
@@ -76,7 +67,7 @@ class SrsArm:
         status = srs_kernels.solve(_c(pose), swivel, branch, self._geometry, self._tool, self._lower, self._upper, q)
         return q if status == 0 else None
 
-    def sweep(self, pose: Array, swivels: Array, margin: float = 0.0) -> tuple[list[SrsSolution], SrsMiss]:
+    def sweep(self, pose: Array, swivels: Array, margin: float = 0.0) -> tuple[list[Solution], SrsMiss]:
         """All configurations at `swivels` (k,) within the limits less `margin`, and what is in the way when none is."""
         rows = srs_kernels.BRANCHES * swivels.size
         found, at, branch = np.empty((rows, 7)), np.empty(rows), np.empty(rows, dtype=np.int64)
@@ -84,7 +75,7 @@ class SrsArm:
         count, status, joint, excess = srs_kernels.sweep(
             _c(pose), swivels, self._geometry, self._tool, self._lower, self._upper, margin, found, at, branch, nearest
         )
-        solutions = [SrsSolution(found[i].copy(), float(at[i]), int(branch[i])) for i in range(count)]
+        solutions = [Solution(found[i].copy(), float(at[i]), int(branch[i])) for i in range(count)]
         if status:
             return solutions, SrsMiss(self._distance_excess(pose), 0, 0.0, np.empty(0))
         return solutions, SrsMiss(0.0, int(joint), float(excess), nearest)
@@ -119,7 +110,7 @@ class SrsArm:
             why = f"{self.kinematics.names[joint]} would jump by {step:.2f} rad between neighbouring points"
         return path, int(index), why
 
-    def classify(self, q: ArrayLike) -> SrsSolution:
+    def classify(self, q: ArrayLike) -> Solution:
         """Swivel angle and branch of a configuration."""
         values = np.ascontiguousarray(q, dtype=np.float64)
         swivel = float(srs_kernels.swivel_of(values, self._geometry))
@@ -132,7 +123,7 @@ class SrsArm:
             distance = float(np.max(np.abs(candidate - values)))
             if distance < least:
                 best, least = branch, distance
-        return SrsSolution(values, swivel, best)
+        return Solution(values, swivel, best)
 
     def distance_text(self, excess: float) -> str:
         """Sentence about a wrist that is too far away (`excess` > 0, m) or too near (< 0)."""

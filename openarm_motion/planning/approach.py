@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision.exact import CollisionScene, Contact
 from openarm_motion.collision.solids import Box
-from openarm_motion.kinematics.inverse import Solution
+from openarm_motion.kinematics.chain import Solution
 from openarm_motion.kinematics.line import Line, line_contact, solve_line
 from openarm_motion.planning.arm import Arm, StartState, first_contact, segment_time
 from openarm_motion.planning.failure import PlanFailedError, Stage
@@ -233,31 +234,21 @@ class _Checks:
         # hands grasp open; a hand that holds something keeps its opening until it lets go
         opened = arm.config.planning.gripper_open
         before = None if request.attached else opened
-        self.free = arm.scene(
-            now.state, request.obstacles, request.attached, gripper=before, environment=now.environment
-        )
+        scene = partial(arm.scene, now.state, environment=now.environment)
+        self.free = scene(request.obstacles, request.attached, gripper=before)
         arm.relax(self.free, now.start)
-        self._approach = arm.scene(
-            now.state,
-            request.obstacles,
-            request.attached,
-            request.touchable,
-            straight=True,
-            gripper=before,
-            environment=now.environment,
-        )
+        straight = partial(scene, straight=True)
+        self._approach = straight(request.obstacles, request.attached, request.touchable, gripper=before)
         self._margins = np.full(len(request.targets), np.nan)
         self._carried = [box for box in request.obstacles if box.id in request.touchable]
         if request.attached_after:
             rest = [box for box in request.obstacles if box.id not in request.touchable]
             held = [*request.attached, *self._carried]
-            self._retreat = arm.scene(now.state, rest, held, straight=True, environment=now.environment)
+            self._retreat = straight(rest, held)
         elif request.detached_after:
             boxes = [*request.obstacles, *request.attached]
             ids = request.touchable | {box.id for box in request.attached}
-            self._retreat = arm.scene(
-                now.state, boxes, (), ids, straight=True, gripper=opened, environment=now.environment
-            )
+            self._retreat = straight(boxes, (), ids, gripper=opened)
         else:
             self._retreat = self._approach
 

@@ -8,8 +8,7 @@ the clearance there. Half a step away from a sample no point has moved further t
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,7 +18,8 @@ from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.timing.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from openarm_motion.collision.exact import Contact
+    from openarm_motion.collision.exact import CollisionScene
+    from openarm_motion.planning.dual_arm import DualArmScene
 
 #: Share of the clearance that must be left between the checks of the search.
 _SHARE = 0.5
@@ -29,25 +29,7 @@ _ARMS = 0.9
 _TRAVEL = 0.004
 
 
-class Checked(Protocol):
-    """What a trajectory is checked in: a scene of one arm, or of two."""
-
-    levers: Array
-
-    def collides(self, q: Array) -> bool:
-        """Whether some pair is nearer than it may be."""
-        ...
-
-    def contacts(self, q: Array) -> list[Contact]:
-        """All pairs that are nearer than they may be, the deepest first."""
-        ...
-
-    def lenient(self, share: float, arms: float | None = None) -> AbstractContextManager[None]:
-        """Ask for only a share of each positive distance meanwhile, `arms` of that to the other arm."""
-        ...
-
-
-def validate_trajectory(scene: Checked, trajectory: Trajectory, travel: float = _TRAVEL) -> None:
+def validate_trajectory(scene: CollisionScene | DualArmScene, trajectory: Trajectory, travel: float = _TRAVEL) -> None:
     """Check a trajectory densely.
 
     Args:
