@@ -32,14 +32,12 @@ class IkResult:
         q: (n,) rad; when not successful, the configuration nearest to the target that was found.
         position_error: m.
         orientation_error: rad; not a criterion when the position alone counted.
-        restarts: Random guesses used beyond the first.
     """
 
     success: bool
     q: Array
     position_error: float
     orientation_error: float
-    restarts: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,48 +143,35 @@ class ArmKinematics:
         seed: ArrayLike | None = None,
         *,
         position_only: bool = False,
-        posture: ArrayLike | None = None,
-        posture_weight: float = 0.05,
         margin: float = 0.0,
         tolerance: tuple[float, float] = (1e-5, 1e-4),
-        iterations: int = 100,
         restarts: int = 60,
-        random_seed: int = 0,
     ) -> IkResult:
         """Solve for a tool pose; never raises for one that is out of reach but returns the nearest found.
 
         Args:
             target: (4, 4) `T_base_tool`.
-            seed: (n,) first guess, and the posture unless that is given; default the middle of the limits.
+            seed: (n,) first guess, which redundant motion is pulled towards; default the middle of the limits.
             position_only: The orientation of the target is ignored.
-            posture: (n,) what redundant motion is pulled towards.
-            posture_weight: Strength of the pull.
             margin: Kept from every joint limit, rad.
             tolerance: Position (m) and orientation (rad).
-            iterations: Per guess.
-            restarts: Random guesses after the first.
-            random_seed: Of the guesses; the answer is the same for the same seed.
+            restarts: Random guesses after the first, the same each time.
         """
         middle = 0.5 * (self.lower + self.upper)
         first = middle if seed is None else np.asarray(seed, dtype=np.float64)
-        pull = first if posture is None else np.asarray(posture, dtype=np.float64)
         best = np.empty(self.n)
-        success, error_p, error_r, used = kernels.solve_ik(
+        success, error_p, error_r = kernels.solve_ik(
             np.ascontiguousarray(target, dtype=np.float64),
             np.ascontiguousarray(first),
-            np.ascontiguousarray(pull),
-            float(posture_weight),
             bool(position_only),
             (float(tolerance[0]), float(tolerance[1])),
-            iterations,
             restarts,
-            random_seed,
             np.minimum(self.lower + margin, middle),
             np.maximum(self.upper - margin, middle),
             *self.chain,
             best,
         )
-        return IkResult(bool(success), best, float(error_p), float(error_r), int(used))
+        return IkResult(bool(success), best, float(error_p), float(error_r))
 
     def _forward(self, q: ArrayLike) -> tuple[Array, Array, Array]:
         values = np.ascontiguousarray(q, dtype=np.float64)

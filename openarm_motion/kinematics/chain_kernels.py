@@ -20,6 +20,9 @@ from openarm_common.types import Array
 ROTATION_LENGTH = 0.2
 #: No joint moves further than this in one iteration: beyond it the linearisation says nothing.
 _MAX_STEP = 0.6
+#: Iterations of a guess, and strength of the pull of redundant motion towards the first guess.
+_ITERATIONS = 100
+_PULL = 0.05
 #: An attempt is given up after this many iterations that hardly improve.
 _STALL = 8
 
@@ -158,13 +161,9 @@ def _solve_spd(h: Array, g: Array, x: Array) -> None:
 def solve_ik(
     target: Array,
     start: Array,
-    posture: Array,
-    posture_weight: float,
     position_only: bool,
     tolerance: tuple[float, float],
-    iterations: int,
     restarts: int,
-    seed: int,
     lower: Array,
     upper: Array,
     placements: Array,
@@ -172,19 +171,16 @@ def solve_ik(
     prismatic: NDArray[np.bool_],
     tip: Array,
     best: Array,
-) -> tuple[bool, float, float, int]:
+) -> tuple[bool, float, float]:
     """Levenberg-Marquardt with damping by the squared error (Sugihara 2011), joints held at limits they push into.
 
     Args:
         target: (4, 4) tool pose.
-        start: (n,) first guess; further guesses are uniform within the limits, drawn from `seed`.
-        posture: (n,) configuration that redundant motion is pulled towards.
-        posture_weight: Strength of that pull; it vanishes with the error, so the solution stays exact.
+        start: (n,) first guess, which redundant motion is pulled towards; the pull vanishes with the error, so the
+            solution stays exact. Further guesses are uniform within the limits, the same each time.
         position_only: Ignore the rotation.
         tolerance: Position (m) and rotation (rad).
-        iterations: Per guess.
         restarts: Further guesses after the first.
-        seed: Of the guesses.
         lower: (n,) limits.
         upper: (n,) limits.
         placements: Chain, see the module's head.
@@ -194,10 +190,10 @@ def solve_ik(
         best: (n,) output: the solution, or the configuration with the smallest error found.
 
     Returns:
-        Solved, position error (m), rotation error (rad) of `best`, and the number of restarts used.
+        Solved, position error (m) and rotation error (rad) of `best`.
     """
     n = start.shape[0]
-    np.random.seed(seed)
+    np.random.seed(0)
     x = np.empty(n)
     pose = np.empty((4, 4))
     origins = np.empty((n, 3))
@@ -213,9 +209,9 @@ def solve_ik(
     for i in range(n):
         x[i] = min(upper[i], max(lower[i], start[i]))
         best[i] = x[i]
-    for attempt in range(restarts + 1):
+    for _ in range(restarts + 1):
         least, stall = np.inf, 0
-        for _ in range(iterations):
+        for _ in range(_ITERATIONS):
             forward(x, placements, axes, prismatic, tip, origins, directions, pose)
             _pose_error(target, pose, e)
             error_p = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
@@ -226,7 +222,7 @@ def solve_ik(
                 for i in range(n):
                     best[i] = x[i]
             if error_p < tolerance[0] and (position_only or error_r < tolerance[1]):
-                return True, error_p, error_r, attempt
+                return True, error_p, error_r
             if cost < 0.98 * least:
                 least, stall = cost, 0
             else:
@@ -239,9 +235,9 @@ def solve_ik(
                 for i in range(n):
                     jac[row, i] *= w
             damping = 0.5 * cost + 1e-7
-            pull = posture_weight * cost
+            pull = _PULL * cost
             for i in range(n):
-                s = pull * (posture[i] - x[i])
+                s = pull * (start[i] - x[i])
                 for row in range(6):
                     s += jac[row, i] * e[row]
                 g[i] = s
@@ -266,4 +262,4 @@ def solve_ik(
                 x[i] = min(upper[i], max(lower[i], x[i] + scale * dx[i]))
         for i in range(n):
             x[i] = lower[i] + (upper[i] - lower[i]) * np.random.random()
-    return False, best_p, best_r, restarts
+    return False, best_p, best_r
