@@ -20,6 +20,7 @@ from openarm_motion.timing.trajectory import (
     JointLimits,
     Profile,
     Trajectory,
+    at_rest,
     joined,
     segments,
     straight_profile,
@@ -107,9 +108,7 @@ def time_blended(names: Sequence[str], waypoints: Array, limits: JointLimits, pe
     q, v, a = (np.sum([part[k] for part in parts], axis=0) for k in range(3))
     q += waypoints[0]
     q[-1] = waypoints[-1]
-    v[[0, -1]] = 0.0
-    a[[0, -1]] = 0.0
-    return Trajectory(tuple(names), t, q, v, a)
+    return at_rest(tuple(names), t, q, v, a)
 
 
 def time_quintic(names: Sequence[str], waypoints: Array, limits: JointLimits, period: float = 0.02) -> Trajectory:

@@ -193,7 +193,7 @@ def time_polyline(names: Sequence[str], waypoints: Array, limits: JointLimits, p
         s, ds, dds, _ = way.at(t)
         q = start + s[:, None] * difference
         q[-1] = end
-        parts.append(_at_rest(tuple(names), t, q, ds[:, None] * difference, dds[:, None] * difference))
+        parts.append(at_rest(tuple(names), t, q, ds[:, None] * difference, dds[:, None] * difference))
     return joined(tuple(names), parts, waypoints[0], period)
 
 
@@ -235,7 +235,7 @@ def time_path(
     q1, q2 = d1(x[:, 0]), d2(x[:, 0])
     q = np.asarray(curve(x[:, 0]))
     q[0], q[-1] = path[0], path[-1]
-    return _at_rest(tuple(names), t, q, q1 * dx, q2 * dx**2 + q1 * ddx)
+    return at_rest(tuple(names), t, q, q1 * dx, q2 * dx**2 + q1 * ddx)
 
 
 def segments(waypoints: Array) -> Iterator[tuple[Array, Array, Array]]:
@@ -255,7 +255,7 @@ def _sample_times(way: Profile, period: float) -> Array:
     return np.sort(np.concatenate([grid[far], borders]))
 
 
-def _at_rest(names: tuple[str, ...], t: Array, q: Array, v: Array, a: Array) -> Trajectory:
+def at_rest(names: tuple[str, ...], t: Array, q: Array, v: Array, a: Array) -> Trajectory:
     """A trajectory whose ends are at rest to the last bit: controllers refuse one that ends with a velocity."""
     v[[0, -1]] = 0.0
     a[[0, -1]] = 0.0
