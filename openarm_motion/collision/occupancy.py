@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from openarm_common.octree import distance_kernels as kernels
 from openarm_common.octree.distance_field import DistanceField
 from openarm_common.octree.lattice import Lattice
-from openarm_common.robot.description import Primitive, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array, Floats
-from openarm_motion.collision.solids import Box, Solid
+from openarm_motion.collision.solids import Box, Solid, solid_from
 
 #: Distances are cut here: more than the largest sphere of a link with its clearance needs, m.
 _REACH = 0.2
@@ -138,21 +138,14 @@ class Environment:
 NOTHING = Environment()
 
 
-def robot_bodies(description: RobotDescription, state: Mapping[str, float]) -> list[Box]:
-    """Boxes about the robot's collision shapes in a state, base frame."""
+def robot_bodies(description: RobotDescription, state: Mapping[str, float]) -> list[Solid]:
+    """The robot's collision shapes in a state, base frame."""
     poses = description.link_poses(state)
-    boxes: list[Box] = []
-    for link in description.links.values():
-        for shape in link.collision:
-            boxes.append(Box(link.name, poses[link.name] @ shape.T_link_primitive, _edges(shape)))
-    return boxes
-
-
-def _edges(shape: Primitive) -> Array:
-    if shape.kind == "box":
-        return np.array(shape.size)
-    radius, length = shape.size[0], shape.size[1] if shape.kind == "cylinder" else 2.0 * shape.size[0]
-    return np.array([2.0 * radius, 2.0 * radius, length])
+    return [
+        solid_from(link.name, poses[link.name] @ shape.T_link_primitive, shape)
+        for link in description.links.values()
+        for shape in link.collision
+    ]
 
 
 def carried(held: Sequence[Box], T_base_tool: Array) -> list[Box]:

@@ -15,9 +15,9 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import Primitive, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
-from openarm_motion.collision.solids import Box
+from openarm_motion.collision.solids import Box, solid_from
 from openarm_motion.kinematics.chain import ArmKinematics, ArmLinks
 
 
@@ -107,7 +107,8 @@ class CollisionRobot:
             frame = self.model.frames[self.model.getFrameId(link.name, pin.FrameType.BODY)]
             for shape in link.collision:
                 placement = frame.placement * pin.SE3(shape.T_link_primitive)
-                item = pin.GeometryObject(shape.name, frame.parentJoint, placement, _geometry_of(shape))
+                geometry = solid_from(shape.name, shape.T_link_primitive, shape).geometry
+                item = pin.GeometryObject(shape.name, frame.parentJoint, placement, geometry)
                 self.geometry.addGeometryObject(item)
                 yield link.name
 
@@ -122,14 +123,6 @@ class CollisionRobot:
                 if not description.srdf and frozenset((body[a], body[b])) in self.arm.neighbours:
                     continue
                 yield i, j
-
-
-def _geometry_of(shape: Primitive) -> coal.ShapeBase:
-    if shape.kind == "box":
-        return coal.Box(*shape.size)
-    if shape.kind == "cylinder":
-        return coal.Cylinder(*shape.size)
-    return coal.Sphere(*shape.size)
 
 
 def _half_diagonal(shape: coal.CollisionGeometry) -> float:

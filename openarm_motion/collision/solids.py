@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import Primitive
 from openarm_common.types import Array
 
 
@@ -189,3 +190,10 @@ def box_from(id: str, p: ArrayLike, size: ArrayLike, R: Array | None = None) -> 
     if R is not None:
         T[:3, :3] = R
     return Box(id, T, np.asarray(size, dtype=np.float64))
+
+
+def solid_from(id: str, T: Array, shape: Primitive) -> Solid:
+    """Body of a shape of the robot description; `T` (4, 4) is its pose."""
+    if shape.kind == "box":
+        return Box(id, T, np.array(shape.size))
+    return Cylinder(id, T, *shape.size[:2]) if shape.kind == "cylinder" else Sphere(id, T, shape.size[0])

@@ -16,7 +16,7 @@ from ompl import util as ou
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.planning.planner import PlannedPath, PlanQuery, cancelled
+from openarm_motion.planning.planner import RANGE, SHORTENINGS, PlannedPath, PlanQuery, cancelled
 
 #: Two configurations nearer than this in every joint are one, rad.
 _SAME = 1e-6
@@ -25,16 +25,7 @@ _SEED_LOCK = threading.Lock()
 
 
 class OmplPlanner:
-    """Straight line first, then OMPL's RRTConnect.
-
-    Args:
-        range_: Longest edge of the trees, rad: small is better in clutter.
-        shortenings: Attempts to shorten what was found.
-    """
-
-    def __init__(self, range_: float = 0.8, shortenings: int = 60) -> None:
-        self._range = range_
-        self._shortenings = shortenings
+    """Straight line first, then OMPL's RRTConnect."""
 
     def plan(self, query: PlanQuery) -> PlannedPath:
         """See `Planner`."""
@@ -49,7 +40,7 @@ class OmplPlanner:
         goal = int(np.argmin(distances))
         # the search works with values moved into its bounds; the ends are those that were asked for
         path[0], path[-1] = query.start, query.goals[goal]
-        path = shorten(path, edges.free, query.cost, self._shortenings, np.random.default_rng(query.seed))
+        path = shorten(path, edges.free, query.cost, SHORTENINGS, np.random.default_rng(query.seed))
         return PlannedPath(path, goal, edges.count)
 
     def _search(self, query: PlanQuery, edges: _Counter) -> Array:
@@ -83,7 +74,7 @@ class OmplPlanner:
         with _SEED_LOCK:
             ou.RNG.setSeed(max(query.seed, 1))
             planner = og.RRTConnect(information)
-            planner.setRange(self._range)
+            planner.setRange(RANGE)
             planner.setProblemDefinition(problem)
             planner.setup()
         end, samples = time.monotonic() + query.time_limit, itertools.count()

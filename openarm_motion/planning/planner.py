@@ -25,6 +25,10 @@ _PLANNERS = {
     "fast": "openarm_motion.planning.rrt:FastPlanner",
     "ompl": "openarm_motion.planning.ompl_planner:OmplPlanner",
 }
+#: Longest edge of the searches' trees, rad: small is better in clutter.
+RANGE = 0.8
+#: Attempts to shorten what a search found.
+SHORTENINGS = 60
 
 
 def never() -> bool:

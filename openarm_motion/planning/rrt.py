@@ -18,7 +18,7 @@ from openarm_motion.collision.clearance_kernels import workspace
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.planning import search_kernels as kernels
 from openarm_motion.planning.ompl_planner import OmplPlanner
-from openarm_motion.planning.planner import PlannedPath, Planner, PlanQuery, cancelled
+from openarm_motion.planning.planner import RANGE, SHORTENINGS, PlannedPath, PlanQuery, cancelled
 
 #: Two configurations nearer than this in every joint are one, rad.
 _SAME = 1e-6
@@ -34,23 +34,12 @@ _SHARE = 0.5
 
 
 class FastPlanner:
-    """See the module's head.
-
-    Args:
-        range_: Longest edge of the trees, rad: small is better in clutter.
-        shortenings: Attempts to shorten what was found.
-        fallback: Asked where the fast layer has no answer; OMPL by default.
-    """
-
-    def __init__(self, range_: float = 0.8, shortenings: int = 60, fallback: Planner | None = None) -> None:
-        self._range = range_
-        self._shortenings = shortenings
-        self._fallback = fallback or OmplPlanner(range_, shortenings)
+    """See the module's head."""
 
     def plan(self, query: PlanQuery) -> PlannedPath:
         """See `Planner`."""
         if query.fast is None:
-            return self._fallback.plan(query)
+            return OmplPlanner().plan(query)
         begin = time.monotonic()
         scene = query.fast()
         step, travel = query.resolution
@@ -68,7 +57,7 @@ class FastPlanner:
             if all(scene.edge_free(a, b, step, travel) for a, b in itertools.pairwise(found.waypoints)):
                 return found
         left = max(query.time_limit - (time.monotonic() - begin), 0.05)
-        return self._fallback.plan(replace(query, time_limit=left))
+        return OmplPlanner().plan(replace(query, time_limit=left))
 
     def _search(self, query: PlanQuery, scene: FastScene, steps: tuple[float, float], end: float) -> PlannedPath | None:
         roots = np.flatnonzero(scene.free_many(query.goals))
@@ -88,7 +77,7 @@ class FastPlanner:
                 parents,
                 counts,
                 bounds,
-                self._range,
+                RANGE,
                 resolution,
                 scene.levers,
                 scene.model,
@@ -112,7 +101,7 @@ class FastPlanner:
         count = kernels.shorten(
             points,
             len(path),
-            self._shortenings,
+            SHORTENINGS,
             query.seed,
             limits,
             resolution,
@@ -131,7 +120,7 @@ def warm_search(scene: FastScene, q: Array) -> None:
     trees, parents = np.stack([ends, ends]), np.full((2, 2), -1, np.int64)
     grid, work = np.array((0.05, 0.02)), workspace(scene.model)
     counts = np.array([1, 1], np.int64)
-    kernels.grow(trees, parents, counts, ends, 0.8, grid, scene.levers, scene.model, work, 1, 1)
+    kernels.grow(trees, parents, counts, ends, RANGE, grid, scene.levers, scene.model, work, 1, 1)
     kernels.shorten(ends, 2, 1, 1, np.ones((3, q.size)), grid, scene.levers, scene.model, work)
 
 
