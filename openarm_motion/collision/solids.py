@@ -196,4 +196,6 @@ def solid_from(id: str, T: Array, shape: Primitive) -> Solid:
     """Body of a shape of the robot description; `T` (4, 4) is its pose."""
     if shape.kind == "box":
         return Box(id, T, np.array(shape.size))
-    return Cylinder(id, T, *shape.size[:2]) if shape.kind == "cylinder" else Sphere(id, T, shape.size[0])
+    if shape.kind == "cylinder":
+        return Cylinder(id, T, shape.size[0], shape.size[1])
+    return Sphere(id, T, shape.size[0])
