@@ -63,7 +63,15 @@ class Verdict:
         return self.code is Code.OK
 
 
-def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> Verdict:
+class GripperVerdict(Verdict):
+    """What the gripper says of the object in the hand."""
+
+
+class CameraVerdict(Verdict):
+    """What a camera says of the object and its place."""
+
+
+def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> GripperVerdict:
     """Whether the hand holds the object: GRASP_MISSED, when it is empty or moves; HAND_COLLISION; GRASP_LOST.
 
     Args:
@@ -75,24 +83,28 @@ def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> Ve
     gap, width = f"gap {e.gap * 1e3:.1f} mm", f"the object's {e.expected * 1e3:.1f} mm"
     if e.tcp_error > config.max_tcp_error:
         off, limit = e.tcp_error * 1e3, config.max_tcp_error * 1e3
-        return Verdict(Code.HAND_COLLISION, f"the hand is {off:.1f} mm from the grasp, expected at most {limit:.0f} mm")
+        return GripperVerdict(
+            Code.HAND_COLLISION, f"the hand is {off:.1f} mm from the grasp, expected at most {limit:.0f} mm"
+        )
     if e.gap <= config.closed_below:
-        return Verdict(empty, f"{gap}: the fingers are closed on nothing")
+        return GripperVerdict(empty, f"{gap}: the fingers are closed on nothing")
     if e.gap > e.expected + config.width_tolerance:
-        return Verdict(Code.HAND_COLLISION, f"{gap} is wider than {width}: the fingers are not around it")
+        return GripperVerdict(Code.HAND_COLLISION, f"{gap} is wider than {width}: the fingers are not around it")
     if e.gap < e.expected - config.width_tolerance:
-        return Verdict(empty, f"{gap} is narrower than {width}: something else is between the fingers")
+        return GripperVerdict(empty, f"{gap} is narrower than {width}: something else is between the fingers")
     if abs(e.speed) >= config.max_speed:
-        return Verdict(Code.GRASP_MISSED, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest")
+        return GripperVerdict(Code.GRASP_MISSED, f"{gap} changes by {abs(e.speed) * 1e3:.1f} mm/s, expected rest")
     if config.use_effort and abs(e.effort) <= config.min_effort:
-        return Verdict(
+        return GripperVerdict(
             empty, f"{gap}, but the fingers press with {abs(e.effort):.1f} N, expected over {config.min_effort:g} N"
         )
     if config.use_finger_force and min(e.pads, default=0.0) < config.min_pad_force:
         felt = f"a finger pad feels {min(e.pads):.1f} N" if e.pads else "no sensor tells what the finger pads feel"
-        return Verdict(empty, f"{gap}, but {felt}, expected {config.min_pad_force:g} N on each (held.use_finger_force)")
+        return GripperVerdict(
+            empty, f"{gap}, but {felt}, expected {config.min_pad_force:g} N on each (held.use_finger_force)"
+        )
     force = f", {abs(e.effort):.0f} N" if config.use_effort else ""
-    return Verdict(Code.OK, f"{gap} for {e.expected * 1e3:.1f} mm{force}: held")
+    return GripperVerdict(Code.OK, f"{gap} for {e.expected * 1e3:.1f} mm{force}: held")
 
 
 def judge_sight(
@@ -102,7 +114,7 @@ def judge_sight(
     *,
     match_radius: float,
     others: Sequence[Detection] = (),
-) -> Verdict:
+) -> CameraVerdict:
     """Whether the object has left its place: GRASP_MISSED, when it is still there or held elsewhere; STALE_DATA.
 
     Args:
@@ -113,7 +125,7 @@ def judge_sight(
         others: What else stood there; those like the object are not taken for it.
     """
     if not frames:
-        return Verdict(Code.STALE_DATA, "no camera frame after the lift")
+        return CameraVerdict(Code.STALE_DATA, "no camera frame after the lift")
     twins = [d for d in others if d.label == before.label]
     same = [
         d
@@ -122,7 +134,7 @@ def judge_sight(
         if d.label == before.label and all(apart(d, twin) > match_radius for twin in twins)
     ]
     if not same:
-        return Verdict(Code.OK, f"{before.label!r} has gone from its place")
+        return CameraVerdict(Code.OK, f"{before.label!r} has gone from its place")
     # The top counts: a detector may take the visible part of a lifted object for a box that reaches down to the table.
     highest = max(same, key=lambda d: d.top)
     risen = highest.top - before.top
@@ -131,16 +143,16 @@ def judge_sight(
         off = sticks_out(highest, before)
         if off > config.askew:
             limit = f"expected at most {config.askew * 1e3:.0f} mm"
-            return Verdict(
+            return CameraVerdict(
                 Code.GRASP_MISSED, f"{text}, {off * 1e3:.0f} mm out of where the hand should hold it, {limit}"
             )
-        return Verdict(Code.OK, text)
+        return CameraVerdict(Code.OK, text)
     distance = min(apart(d, before) for d in same)
     if distance <= match_radius:
-        return Verdict(
+        return CameraVerdict(
             Code.GRASP_MISSED, f"{before.label!r} still stands at its place ({distance * 1e3:.0f} mm from it)"
         )
-    return Verdict(Code.OK, f"{before.label!r} has left its place ({distance * 1e3:.0f} mm)")
+    return CameraVerdict(Code.OK, f"{before.label!r} has left its place ({distance * 1e3:.0f} mm)")
 
 
 def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) -> tuple[bool, str]:
@@ -163,7 +175,7 @@ def judge_still(before: Detection, frames: Sequence[Frame], config: HeldConfig) 
     return True, f"{before.label!r} still stands there"
 
 
-def judge_lift(gripper: Verdict, camera: Verdict) -> Verdict:
+def judge_lift(gripper: GripperVerdict, camera: CameraVerdict) -> Verdict:
     """A lift counts only when gripper and camera agree."""
     if not gripper.ok:
         return gripper
@@ -177,7 +189,7 @@ def judge_place(
     tolerance: float,
     yaw: float | None = None,
     height: float | None = None,
-) -> Verdict:
+) -> CameraVerdict:
     """Whether the camera sees the object at the place target after the arm has left.
 
     Args:
@@ -189,24 +201,24 @@ def judge_place(
         height: Of the object as it stood, m: one of another height lies on its side. None: it is not judged.
     """
     if not frames:
-        return Verdict(Code.STALE_DATA, "no camera frame after the place")
+        return CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
     same = next(
         (found for frame in reversed(frames) if (found := [d for d in frame.detections if d.label == label])), ()
     )
     if not same:
-        return Verdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
+        return CameraVerdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
     nearest = min(same, key=lambda d: float(np.linalg.norm((d.p_base - p_target)[:2])))
     distance = float(np.linalg.norm((nearest.p_base - p_target)[:2]))
     text = f"{label!r} stands {distance * 1e3:.0f} mm from its target"
     if distance > tolerance:
-        return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
+        return CameraVerdict(Code.PLACE_FAILED, f"{text}, expected at most {tolerance * 1e3:.0f} mm")
     top = nearest.top - float(p_target[2])
     if height is not None and abs(top - height) > UPRIGHT_WITHIN:
         was = f"it is {top * 1e3:.0f} mm high there and was {height * 1e3:.0f} mm"
-        return Verdict(Code.PLACE_FAILED, f"{label!r} has fallen over: {was}", final=True)
+        return CameraVerdict(Code.PLACE_FAILED, f"{label!r} has fallen over: {was}", final=True)
     if yaw is not None and abs(float(nearest.size[0] - nearest.size[1])) > SQUARE_WITHIN:
         off = abs((nearest.yaw - yaw + np.pi / 2.0) % np.pi - np.pi / 2.0)
         text += f", turned {np.degrees(off):.0f}° from what was asked"
         if off > YAW_TOLERANCE:
-            return Verdict(Code.PLACE_FAILED, f"{text}, expected at most {np.degrees(YAW_TOLERANCE):.0f}°")
-    return Verdict(Code.OK, text)
+            return CameraVerdict(Code.PLACE_FAILED, f"{text}, expected at most {np.degrees(YAW_TOLERANCE):.0f}°")
+    return CameraVerdict(Code.OK, text)

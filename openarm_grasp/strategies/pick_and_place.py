@@ -20,7 +20,7 @@ from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.evidence import verdicts
-from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict, Verdict
 from openarm_grasp.perception.detections import Frame, Sighting, apart, find, labels_in_view, on_table
 from openarm_grasp.planning import candidates
 from openarm_grasp.planning.arms import ARMS, arm_order, out_of_reach
@@ -63,7 +63,7 @@ class Placed:
     """
 
     target: PlaceTarget
-    gripper: Verdict
+    gripper: GripperVerdict
     reason: str
     failure: Verdict | None = None
 
@@ -278,7 +278,7 @@ async def _attempts(run: Run) -> GraspOutcome:
         why = run.start_again(grasp.sighting.target, grasp.candidate)
 
 
-def succeeded(run: Run, message: str, *, gripper: Verdict, camera: Verdict) -> GraspOutcome:
+def succeeded(run: Run, message: str, *, gripper: GripperVerdict, camera: CameraVerdict) -> GraspOutcome:
     """Say that what was asked for has happened: the only place that can.
 
     Args:
@@ -622,7 +622,7 @@ async def close(run: Run, grasp: Grasp, why: str) -> str:
     return gripper.reason
 
 
-async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Verdict, Verdict, str]:
+async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[GripperVerdict, CameraVerdict, str]:
     """Lift straight up, then judge by gripper and camera whether the object has come along.
 
     Returns:
@@ -798,7 +798,7 @@ def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[candidate
     return (*others, candidates.Box(f"placed/{run.label}", placed.target.T_base_tcp @ held.T_frame_box, held.size))
 
 
-async def verify(run: Run, placed: Placed) -> Verdict:
+async def verify(run: Run, placed: Placed) -> CameraVerdict:
     """Judge by the camera, from home, whether the object is at its place.
 
     Raises:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
 from openarm_grasp.planning.arms import arm_order
 from openarm_grasp.planning.options import Option
 
@@ -67,8 +67,8 @@ class Proof:
         OpenArmError: INTERNAL, when one of them says otherwise.
     """
 
-    gripper: Verdict
-    camera: Verdict
+    gripper: GripperVerdict
+    camera: CameraVerdict
 
     def __post_init__(self) -> None:
         if not (self.gripper.ok and self.camera.ok):

@@ -12,11 +12,11 @@ import pytest
 
 import openarm_grasp
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
 from openarm_grasp.strategies.request import Feasible, GraspOutcome, Proof
 
-HELD = Verdict(Code.OK, "held")
-AT_PLACE = Verdict(Code.OK, "2 mm from its target")
+HELD = GripperVerdict(Code.OK, "held")
+AT_PLACE = CameraVerdict(Code.OK, "2 mm from its target")
 
 
 @pytest.mark.parametrize("grip", [Code.OK, Code.GRASP_MISSED, Code.HAND_COLLISION, Code.GRASP_LOST])
@@ -24,17 +24,19 @@ AT_PLACE = Verdict(Code.OK, "2 mm from its target")
 @pytest.mark.requirement("P-08")
 def test_a_lift_is_proven_by_a_hand_that_holds_and_a_camera_that_sees_the_object_gone(grip, sight):
     if grip is Code.OK and sight is Code.OK:
-        Proof(Verdict(grip, "a"), Verdict(sight, "b"))
+        Proof(GripperVerdict(grip, "a"), CameraVerdict(sight, "b"))
         return
     with pytest.raises(OpenArmError, match="success without evidence") as error:
-        Proof(Verdict(grip, "a"), Verdict(sight, "b"))
+        Proof(GripperVerdict(grip, "a"), CameraVerdict(sight, "b"))
     assert error.value.code is Code.INTERNAL
 
 
 @pytest.mark.requirement("P-09")
 def test_a_place_is_proven_by_the_camera_and_the_hand_that_carried():
     Proof(HELD, AT_PLACE)
-    for gripper, camera in product((HELD, Verdict(Code.GRASP_LOST, "")), (AT_PLACE, Verdict(Code.PLACE_FAILED, ""))):
+    for gripper, camera in product(
+        (HELD, GripperVerdict(Code.GRASP_LOST, "")), (AT_PLACE, CameraVerdict(Code.PLACE_FAILED, ""))
+    ):
         if (gripper, camera) != (HELD, AT_PLACE):
             with pytest.raises(OpenArmError, match="success without evidence"):
                 Proof(gripper, camera)
