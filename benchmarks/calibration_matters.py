@@ -68,7 +68,7 @@ def shipped_mounts() -> Mounts:
 def calibrated_mounts(seed: int, folder: Path) -> Mounts:
     """Of any mount seed, calibrated now."""
     blank = Task("matters", seed, load_scene("empty"), ())
-    return with_mounts(blank, [seed], folder, CAMERAS)[1]
+    return with_mounts(blank, [seed], folder)[1]
 
 
 def compare(scene: str, label: str, seed: int, mounts: Mounts) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -139,8 +139,8 @@ def test_two_objects_are_picked_at_once_and_the_arms_keep_20_mm_apart(observer: 
     after_ns = observer.reset_world("demo", 0)
     red, blue = run_pair(observer, client, scene, ("red", "blue"), after_ns=after_ns)
     for trial, arm in ((red, "right"), (blue, "left")):
-        assert trial.outcome == "placed", trial.message
-        assert trial.arm == arm
+        assert trial.outcome == "placed", trial.answer.message
+        assert trial.answer.arm == arm
     assert least_clearance(observer.joints()) >= LEAST_CLEARANCE
     began = {step.label: step.t_ns for step in observer.steps() if step.state == "MOVE_TO_PREGRASP"}
     ended = {step.label: step.t_ns for step in observer.steps() if step.state == "RESET"}

@@ -8,12 +8,16 @@ vision_msgs 4.1.1), not from ours. A hash that differs means fields that a peer 
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 
 import pytest
 from rclpy.action import ActionServer
+from rosbags.rosbag2 import Reader
 from type_description_interfaces.srv import GetTypeDescription
 
-from openarm_bringup.bags.bag import Types
+from openarm_bringup.bags.bag import BagWriter
+from openarm_bringup.bags.ros.recorder import from_profile
+from openarm_common.ros.node import QOS_SENSOR
 
 _MESSAGES = {
     "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
@@ -56,10 +60,11 @@ def test_the_graph_reports_the_upstream_hash_of_a_message(ros, name: str, sha256
 
 
 @pytest.mark.parametrize(("name", "sha256"), _MESSAGES.items(), ids=_MESSAGES)
-def test_a_bag_declares_the_upstream_hash_of_a_message(name: str, sha256: str) -> None:
-    types = Types()
-    types.add(name)
-    assert types.store.hash_rihs01(name) == f"RIHS01_{sha256}"
+def test_a_bag_declares_the_upstream_hash_of_a_message(tmp_path: Path, name: str, sha256: str) -> None:
+    with BagWriter(tmp_path / "bag", {}) as writer:
+        writer.add_topic("/contract", name, from_profile(QOS_SENSOR))
+    with Reader(tmp_path / "bag") as reader:
+        assert [connection.digest for connection in reader.connections] == [f"RIHS01_{sha256}"]
 
 
 @pytest.mark.parametrize(("name", "sha256"), (_SERVICES | _ACTIONS).items(), ids=_SERVICES | _ACTIONS)
