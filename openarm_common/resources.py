@@ -41,11 +41,11 @@ def config_dir() -> Path:
     return resource_root() / "config"
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_whole(path: Path, data: bytes, code: Code = Code.ENVIRONMENT) -> None:
     """Write a file under another name, then rename it: a reader gets the old or the new one, never a part.
 
     Raises:
-        OpenArmError: ENVIRONMENT, when it can't be written.
+        OpenArmError: With `code`, when it can't be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -56,4 +56,4 @@ def write_whole(path: Path, data: bytes) -> None:
         Path(file.name).chmod(0o644)
         os.replace(file.name, path)
     except OSError as error:
-        raise OpenArmError(Code.ENVIRONMENT, f"can't write {path}: {error.strerror}") from error
+        raise OpenArmError(code, f"can't write {path}: {error.strerror}") from error

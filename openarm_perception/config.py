@@ -5,9 +5,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.config import AT_RUN_TIME, Config
-from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import load_scene
 from openarm_perception.detection.detector import Policy
 from openarm_perception.detection.kinds import DetectorKind
@@ -91,17 +89,3 @@ class CloudNodeConfig(Config):
         if self.color and not self.organised:
             raise ValueError("color needs organised: true")
         return self
-
-
-def camera_of(name: str) -> CameraConfig:
-    """Return a camera of the suite.
-
-    Raises:
-        OpenArmError: CONFIG_INVALID, listing the cameras that there are.
-    """
-    cameras = load_cameras()
-    if name not in cameras:
-        raise OpenArmError(Code.CONFIG_INVALID, f"camera {name!r} is unknown; cameras: {', '.join(cameras)}")
-    if not cameras[name].depth:
-        raise OpenArmError(Code.CONFIG_INVALID, f"camera {name!r} has no depth, which this node needs")
-    return cameras[name]

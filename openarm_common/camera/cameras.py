@@ -21,7 +21,7 @@ from openarm_common import se3
 from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-from openarm_common.types import Array
+from openarm_common.types import Array, Floats
 
 Vector3 = tuple[float, float, float]
 
@@ -56,6 +56,12 @@ class Intrinsics:
     def matrix(self) -> Array:
         """K, (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def rays(self) -> tuple[Floats, Floats]:
+        """Directions of columns (x over z) and of rows (y over z)."""
+        x = ((np.arange(self.width) - self.cx) / self.fx).astype(np.float32)
+        return x, ((np.arange(self.height) - self.cy) / self.fy).astype(np.float32)
 
     def project(self, points_optical: ArrayLike) -> Array:
         """Return the pixels (..., 2) of points (..., 3) in the optical frame; NaN behind the camera."""
@@ -148,6 +154,20 @@ def load_cameras(path: Path | None = None) -> dict[str, CameraConfig]:
         names = sorted(camera.name for camera in cameras)
         raise OpenArmError(Code.CONFIG_INVALID, f"{source}:cameras: names must be unique, got {', '.join(names)}")
     return by_name
+
+
+def depth_camera(name: str) -> CameraConfig:
+    """Return a camera of the suite that has depth.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, listing those that there are.
+    """
+    cameras = {key: camera for key, camera in load_cameras().items() if camera.depth}
+    if name not in cameras:
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"camera {name!r} is unknown or has no depth; cameras: {', '.join(cameras)}"
+        )
+    return cameras[name]
 
 
 def true_mount(camera: CameraConfig, mount_seed: int | None) -> Array:

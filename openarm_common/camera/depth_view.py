@@ -62,9 +62,7 @@ class DepthView:
     @property
     def rays(self) -> tuple[Floats, Floats]:
         """Directions of columns (x over z) and of rows (y over z)."""
-        k = self.intrinsics
-        x = ((np.arange(k.width) - k.cx) / k.fx).astype(np.float32)
-        return x, ((np.arange(k.height) - k.cy) / k.fy).astype(np.float32)
+        return self.intrinsics.rays
 
     @property
     def scale(self) -> np.float32:

@@ -8,9 +8,7 @@ equal bytes. Cells are in the frame of the map, see `openarm_common.octree.latti
 
 from __future__ import annotations
 
-import os
 import re
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree import codec_kernels as kernels
 from openarm_common.octree.lattice import DEPTH, Lattice
+from openarm_common.resources import write_whole
 from openarm_common.types import Bytes, Floats, Ints
 
 ScalarT = TypeVar("ScalarT", bound=np.generic)
@@ -127,10 +126,8 @@ class OctreeEncoder:
 
 def encode_states(lattice: Lattice, states: Bytes) -> Payload:
     """Write any box of states once; `OctreeEncoder` is the faster way for a box that is written again and again."""
-    before = [k % 2 for k in lattice.key_min]
-    after = [(k + n) % 2 for k, n in zip(lattice.key_min, lattice.shape, strict=True)]
-    padded = np.pad(states, list(zip(before, after, strict=True)))
-    x, y, z = (k - b for k, b in zip(lattice.key_min, before, strict=True))
+    padded = np.pad(states, [(k % 2, (k + n) % 2) for k, n in zip(lattice.key_min, lattice.shape, strict=True)])
+    x, y, z = (k - k % 2 for k in lattice.key_min)
     return OctreeEncoder(Lattice(lattice.resolution, (x, y, z), padded.shape)).binary(padded)
 
 
@@ -214,19 +211,9 @@ def write_file(path: Path, payload: Payload, resolution: float) -> None:
     if path.suffix != suffix:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{path.name}: the {suffix[1:]} form needs the suffix {suffix}")
     text = f"{_FIRST_LINE[suffix]}\n{_NOTE}\nid {TREE_ID}\nsize {payload.nodes}\nres {resolution:g}\ndata\n"
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(text.encode("ascii"))
-                file.write(payload.data.tobytes())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except OSError:
-            os.unlink(temporary)
-            raise
-    except OSError as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} can't be written: {error}") from error
+    if not path.parent.is_dir():
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} can't be written: there is no folder {path.parent}")
+    write_whole(path, text.encode("ascii") + payload.data.tobytes(), Code.INVALID_ARGUMENT)
 
 
 def read_file(path: Path) -> Leaves:

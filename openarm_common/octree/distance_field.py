@@ -191,11 +191,6 @@ class DistanceFieldWriter:
         self._slots = _slots(self._map, lattice)
         self._version = 0
 
-    @property
-    def version(self) -> int:
-        """Number of the current version; 0 before the first."""
-        return self._version
-
     def begin(self) -> Floats:
         """Return the slot to compute into, (nx, ny, nz); readers do not use it before `commit`."""
         slot = self._next

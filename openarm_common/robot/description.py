@@ -184,8 +184,9 @@ class RobotDescription:
         """
         poses: dict[str, Array] = {self.root: np.eye(4)}
         for chain in self._chains.values():
-            for joint in chain[_known(chain, poses) :]:
-                poses[joint.child] = poses[joint.parent] @ self._joint_pose(joint, q)
+            for joint in chain:
+                if joint.child not in poses:
+                    poses[joint.child] = poses[joint.parent] @ self._joint_pose(joint, q)
         return {link: poses[link] for link in self.links}
 
     def group_state(self, group: str, name: str) -> dict[str, float]:
@@ -224,14 +225,6 @@ def _chain_of(link: str, parent_joint: Mapping[str, Joint]) -> tuple[Joint, ...]
             raise fault(f"the joints form a loop through link {link!r}")
         seen.add(link)
     return tuple(reversed(chain))
-
-
-def _known(chain: tuple[Joint, ...], poses: Mapping[str, Array]) -> int:
-    """Return how many joints of a chain, from the root, have a child with a known pose."""
-    count = len(chain)
-    while count and chain[count - 1].child not in poses:
-        count -= 1
-    return count
 
 
 def _check_semantics(semantics: Semantics, links: Mapping[str, Link], joints: Mapping[str, Joint]) -> None:

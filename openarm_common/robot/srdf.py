@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from openarm_common.robot.xml_text import attribute, floats, parse_root, unique
+from openarm_common.robot.xml_text import attribute, by_name, floats, parse_root
 
 
 @dataclass(frozen=True)
@@ -28,14 +28,13 @@ def parse_srdf(text: str) -> Semantics:
     """
     root = parse_root(text, "SRDF") if text else ET.Element("robot")
     groups = frozenset(attribute(e, "name") for e in root.findall("group"))
-    states: dict[tuple[str, str], Mapping[str, float]] = {}
-    for element in root.findall("group_state"):
-        key = (attribute(element, "group"), attribute(element, "name"))
-        unique("group_state", " ".join(key), {" ".join(k) for k in states})
-        states[key] = MappingProxyType(
-            {attribute(e, "name"): floats(attribute(e, "value"), 1, e)[0] for e in element.findall("joint")}
-        )
+    states = by_name("group_state", map(_state, root.findall("group_state")))
     pairs = frozenset(
         frozenset((attribute(e, "link1"), attribute(e, "link2"))) for e in root.findall("disable_collisions")
     )
     return Semantics(groups, MappingProxyType(states), pairs)
+
+
+def _state(element: ET.Element) -> tuple[tuple[str, str], Mapping[str, float]]:
+    joints = {attribute(e, "name"): floats(attribute(e, "value"), 1, e)[0] for e in element.findall("joint")}
+    return (attribute(element, "group"), attribute(element, "name")), MappingProxyType(joints)

@@ -10,19 +10,28 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.robot.xml_text import attribute, fault, floats, parse_root, unique
+from openarm_common.robot.xml_text import attribute, by_name, fault, floats, parse_root
 from openarm_common.types import Array
 
 Rgba = tuple[float, float, float, float]
 JointType = Literal["revolute", "continuous", "prismatic", "fixed"]
 ShapeKind = Literal["box", "cylinder", "sphere"]
+
+
+_SHAPE_TAGS = ("visual", "collision")
+#: Attributes that give the size of a shape, each with its number of values.
+_SIZES: Mapping[str, Sequence[tuple[str, int]]] = {
+    "box": (("size", 3),),
+    "cylinder": (("radius", 1), ("length", 1)),
+    "sphere": (("radius", 1),),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,23 +104,11 @@ def parse_urdf(text: str) -> tuple[str, dict[str, Link], dict[str, Joint]]:
     """
     root = parse_root(text, "URDF")
     colors = {m.get("name", ""): _rgba(m) for m in root.findall("material")}
-    links: dict[str, Link] = {}
-    joints: dict[str, Joint] = {}
-    shape_names: set[str] = set()
-    for element in root.findall("link"):
-        link = _link(element, colors)
-        unique("link", link.name, links)
-        links[link.name] = link
-        for tag in ("visual", "collision"):
-            for shape in element.findall(tag):
-                name = shape.get("name")
-                if name is not None:
-                    unique("visual or collision", name, shape_names)
-                    shape_names.add(name)
-    for element in root.findall("joint"):
-        joint = _joint(element)
-        unique("joint", joint.name, joints)
-        joints[joint.name] = joint
+    links = by_name("link", ((attribute(element, "name"), _link(element, colors)) for element in root.findall("link")))
+    shapes = [shape for tag in _SHAPE_TAGS for shape in root.findall(f"link/{tag}")]
+    by_name("visual or collision", ((shape.get("name"), shape) for shape in shapes if "name" in shape.attrib))
+    joints = by_name("joint", ((attribute(element, "name"), _joint(element)) for element in root.findall("joint")))
+    for joint in joints.values():
         for role, name in (("parent", joint.parent), ("child", joint.child)):
             if name not in links:
                 raise fault(f"joint {joint.name!r} has the {role} link {name!r}, which does not exist")
@@ -144,41 +141,22 @@ def _primitive(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Primit
     if geometry is None or len(geometry) != 1:
         raise fault(f"<{element.tag} {element.attrib}>: expected one <geometry> with one shape")
     shape = geometry[0]
-    size: tuple[float, ...]
-    kind: ShapeKind
-    if shape.tag == "box":
-        kind, size = "box", floats(attribute(shape, "size"), 3, shape)
-    elif shape.tag == "cylinder":
-        kind = "cylinder"
-        size = tuple(floats(attribute(shape, key), 1, shape)[0] for key in ("radius", "length"))
-    elif shape.tag == "sphere":
-        kind, size = "sphere", floats(attribute(shape, "radius"), 1, shape)
-    elif shape.tag == "mesh":
+    if shape.tag == "mesh":
         return None
-    else:
-        raise fault(f"<{element.tag} {element.attrib}>: <{shape.tag}> is none of box, cylinder, sphere, mesh")
+    if shape.tag not in _SIZES:
+        raise fault(f"<{element.tag} {element.attrib}>: <{shape.tag}> is none of {', '.join(_SIZES)}, mesh")
+    kind = cast(ShapeKind, shape.tag)
+    size = tuple(value for key, count in _SIZES[kind] for value in floats(attribute(shape, key), count, shape))
     material = element.find("material")
-    name = material.get("name", "") if material is not None else ""
-    rgba = _rgba(material) if material is not None else None
+    name, rgba = ("", None) if material is None else (material.get("name", ""), _rgba(material))
     return Primitive(element.get("name", ""), kind, size, _origin(element), name, rgba or colors.get(name))
 
 
 def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
-    shapes: dict[str, list[Primitive]] = {"visual": [], "collision": []}
-    meshes: list[str] = []
-    for tag, found in shapes.items():
-        for shape in element.findall(tag):
-            primitive = _primitive(shape, colors)
-            if primitive is None:
-                meshes.append(shape.get("name", tag))
-            else:
-                found.append(primitive)
-    return Link(
-        name=attribute(element, "name"),
-        collision=tuple(shapes["collision"]),
-        visual=tuple(shapes["visual"]),
-        meshes=tuple(meshes),
-    )
+    shapes = {tag: [(shape, _primitive(shape, colors)) for shape in element.findall(tag)] for tag in _SHAPE_TAGS}
+    visual, collision = (tuple(one for _, one in found if one is not None) for found in shapes.values())
+    meshes = (shape.get("name", tag) for tag, found in shapes.items() for shape, one in found if one is None)
+    return Link(attribute(element, "name"), collision, visual, tuple(meshes))
 
 
 def _child(element: ET.Element, tag: str, key: str) -> str:

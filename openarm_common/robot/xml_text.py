@@ -5,9 +5,13 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Container
+from collections.abc import Iterable
+from typing import TypeVar
 
 from openarm_common.errors import Code, OpenArmError
+
+KeyT = TypeVar("KeyT", str, tuple[str, str])
+ItemT = TypeVar("ItemT")
 
 
 def fault(message: str) -> OpenArmError:
@@ -26,10 +30,15 @@ def parse_root(text: str, what: str) -> ET.Element:
     return root
 
 
-def unique(kind: str, name: str, taken: Container[str]) -> None:
-    """Refuse a name that is taken."""
-    if name in taken:
-        raise fault(f"{kind} name {name!r} is used twice; names must be unique")
+def by_name(kind: str, items: Iterable[tuple[KeyT, ItemT]]) -> dict[KeyT, ItemT]:
+    """Collect items by their names; `kind` is what they are, for the error at a name that is used twice."""
+    found: dict[KeyT, ItemT] = {}
+    for name, item in items:
+        if name in found:
+            text = name if isinstance(name, str) else " ".join(name)
+            raise fault(f"{kind} name {text!r} is used twice; names must be unique")
+        found[name] = item
+    return found
 
 
 def attribute(element: ET.Element, key: str) -> str:

@@ -18,6 +18,7 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamp
 from numpy.typing import ArrayLike, NDArray
 from rclpy.duration import Duration as RclDuration
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -48,6 +49,11 @@ def ns_to_stamp(t_ns: int) -> Time:
     return Time(sec=t_ns // 1_000_000_000, nanosec=t_ns % 1_000_000_000)
 
 
+def header(frame_id: str, t_ns: int) -> Header:
+    """Make the header of a frame and a stamp."""
+    return Header(frame_id=frame_id, stamp=ns_to_stamp(t_ns))
+
+
 # --- geometry
 def pose_to_matrix(pose: Pose) -> Array:
     """Convert a pose to (4, 4).
@@ -67,8 +73,12 @@ def pose_to_matrix(pose: Pose) -> Array:
 
 def matrix_to_pose(T: Array) -> Pose:
     """Convert (4, 4) to a pose."""
-    x, y, z, w = (float(v) for v in se3.quat_xyzw_from_matrix(T[:3, :3]))
-    return Pose(position=point(T[:3, 3]), orientation=Quaternion(x=x, y=y, z=z, w=w))
+    return Pose(position=point(T[:3, 3]), orientation=_quaternion(T))
+
+
+def _quaternion(T: Array) -> Quaternion:
+    x, y, z, w = se3.quat_xyzw_from_matrix(T[:3, :3]).tolist()
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def point(p: ArrayLike) -> Point:
@@ -103,13 +113,8 @@ def matrix_to_transform(parent: str, child: str, T_parent_child: Array, t_ns: in
         T_parent_child: (4, 4), m.
         t_ns: Stamp.
     """
-    message = TransformStamped(child_frame_id=child)
-    message.header.frame_id = parent
-    message.header.stamp = ns_to_stamp(t_ns)
-    x, y, z, w = (float(v) for v in se3.quat_xyzw_from_matrix(T_parent_child[:3, :3]))
-    message.transform.translation = vector(T_parent_child[:3, 3])
-    message.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
-    return message
+    transform = Transform(translation=vector(T_parent_child[:3, 3]), rotation=_quaternion(T_parent_child))
+    return TransformStamped(header=header(parent, t_ns), child_frame_id=child, transform=transform)
 
 
 # --- images
@@ -157,12 +162,11 @@ def array_to_image(pixels: NDArray[np.generic], encoding: str, frame_id: str, t_
         raise OpenArmError(
             Code.BAD_IMAGE, f"{encoding} needs {channels} × {dtype.__name__}, got {pixels.dtype} {pixels.shape}"
         )
-    message = Image(height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
+    height, width = pixels.shape[:2]
+    message = Image(header=header(frame_id, t_ns), height=height, width=width, encoding=encoding)
     message.is_bigendian = int(sys.byteorder == "big")
-    message.step = pixels.shape[1] * channels * pixels.itemsize
+    message.step = width * channels * pixels.itemsize
     message.data = byte_array(pixels)
-    message.header.frame_id = frame_id
-    message.header.stamp = ns_to_stamp(t_ns)
     return message
 
 
@@ -225,9 +229,8 @@ def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int) -> Ca
         frame_id: Optical frame.
         t_ns: Stamp.
     """
-    info = CameraInfo(height=intrinsics.height, width=intrinsics.width, distortion_model="plumb_bob")
-    info.header.frame_id = frame_id
-    info.header.stamp = ns_to_stamp(t_ns)
+    info = CameraInfo(header=header(frame_id, t_ns), height=intrinsics.height, width=intrinsics.width)
+    info.distortion_model = "plumb_bob"
     fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
     info.d = [0.0] * 5
     info.k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
@@ -246,23 +249,33 @@ def cloud_from_points(points: Floats, frame_id: str, t_ns: int, rgb: Bytes | Non
         t_ns: Stamp.
         rgb: Colours of the same leading shape, uint8; becomes the field `rgb` as RViz reads it.
     """
-    names = ["x", "y", "z"] + (["rgb"] if rgb is not None else [])
-    height, width = points.shape[:2] if points.ndim == 3 else (1, points.shape[0])
     if rgb is None:
-        data = points
-    else:
-        colour = rgb.astype(np.uint32)
-        packed = (colour[..., 0] << 16 | colour[..., 1] << 8 | colour[..., 2]).view(np.float32)
-        data = np.concatenate([points, packed[..., None]], axis=-1)
-    message = PointCloud2(height=height, width=width, point_step=4 * len(names), row_step=4 * len(names) * width)
+        return cloud_from_fields(("x", "y", "z"), points, frame_id, t_ns)
+    colour = rgb.astype(np.uint32)
+    packed = (colour[..., 0] << 16 | colour[..., 1] << 8 | colour[..., 2]).view(np.float32)
+    data = np.concatenate([points, packed[..., None]], axis=-1)
+    return cloud_from_fields(("x", "y", "z", "rgb"), data, frame_id, t_ns)
+
+
+def cloud_from_fields(names: Sequence[str], data: Floats, frame_id: str, t_ns: int) -> PointCloud2:
+    """Make a PointCloud2 of float32 fields (n, k) or, organised, (height, width, k); the first three are x, y, z, m.
+
+    Args:
+        names: Of the fields, (k,).
+        data: Their values.
+        frame_id: Frame of the points.
+        t_ns: Stamp.
+    """
+    height, width = data.shape[:2] if data.ndim == 3 else (1, data.shape[0])
+    step = 4 * len(names)
+    message = PointCloud2(header=header(frame_id, t_ns), height=height, width=width)
+    message.point_step, message.row_step = step, step * width
     message.fields = [
         PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1) for i, name in enumerate(names)
     ]
     message.is_bigendian = sys.byteorder == "big"
-    message.is_dense = bool(np.isfinite(points).all())
+    message.is_dense = bool(np.isfinite(data[..., :3]).all())
     message.data = byte_array(data)
-    message.header.frame_id = frame_id
-    message.header.stamp = ns_to_stamp(t_ns)
     return message
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detections to and from vision_msgs/Detection3DArray: all that is known of /detections_3d stands here.
+"""Detections to and from vision_msgs/Detection3DArray: all that is known of /detections_3d is here.
 
 The first hypothesis is the label; others of the same score name the shape (box, cylinder, sphere, cube, can). An object
 that was detected but not measured has covariance[0] = -1, the mark of ROS for an unknown value; its box encloses its
@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovariance
-from std_msgs.msg import Header
 from vision_msgs.msg import (
     BoundingBox3D,
     Detection3D,
@@ -22,7 +21,7 @@ from vision_msgs.msg import (
 )
 
 from openarm_common.detection import WIDER, Detection
-from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, pose_to_matrix, vector, xyz
+from openarm_common.ros.convert import header, matrix_to_pose, pose_to_matrix, vector, xyz
 from openarm_common.types import Array
 
 #: First element of the covariance of a pose that was not measured.
@@ -42,7 +41,7 @@ def detections_to_msg(
         frame_id: Of the poses.
         t_ns: Stamp of the image.
     """
-    message = Detection3DArray(header=Header(frame_id=frame_id, stamp=ns_to_stamp(t_ns)))
+    message = Detection3DArray(header=header(frame_id, t_ns))
     ids = numbered([detection.label for detection in detections])
     for name, detection, covariance in zip(ids, detections, covariances, strict=True):
         pose = matrix_to_pose(detection.T_base_object)

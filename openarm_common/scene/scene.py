@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -216,7 +217,7 @@ class Scene(Config):
 
 
 def parse_scene(data: Mapping[str, Any], where: str) -> Scene:
-    """Validate a scene; `where` stands in front of every fault.
+    """Validate a scene; `where` begins each fault.
 
     Raises:
         OpenArmError: SCENE_INVALID, naming each wrong key, and each object that is not on the table, overlaps another,
@@ -347,8 +348,7 @@ def _off_table(item: SceneObject, table: Table) -> list[str]:
 
 
 def _duplicates(what: str, values: Iterable[str]) -> list[str]:
-    seen: set[str] = set()
-    twice = [value for value in values if value in seen or seen.add(value)]
+    twice = [value for value, count in Counter(values).items() if count > 1]
     return [f"{what} {value!r} is used twice; {what}s must be unique in a scene" for value in twice]
 
 

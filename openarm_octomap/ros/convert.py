@@ -10,23 +10,18 @@ from geometry_msgs.msg import Point, Pose
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMsg
 from numpy.typing import NDArray
 from octomap_msgs.msg import Octomap
-from sensor_msgs.msg import PointCloud2, PointField
-from std_msgs.msg import ColorRGBA, Header
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.octree.codec import TREE_ID, Payload
 from openarm_common.octree.lattice import Lattice
-from openarm_common.ros.convert import byte_array, cloud_from_points, ns_to_stamp
+from openarm_common.ros.convert import cloud_from_fields, cloud_from_points, header
 from openarm_common.ros.node import BASE_FRAME
 from openarm_octomap.kernels import FREE, OCCUPIED
 
 #: Colours of cells from the bottom of the workspace to its top.
 _BOTTOM, _TOP = np.array([0.12, 0.35, 0.75]), np.array([0.95, 0.65, 0.20])
-
-
-def header(t_ns: int) -> Header:
-    """Return the header in the base frame."""
-    return Header(frame_id=BASE_FRAME, stamp=ns_to_stamp(t_ns))
 
 
 def octomap_msg(payload: Payload, resolution: float, t_ns: int) -> Octomap:
@@ -37,7 +32,7 @@ def octomap_msg(payload: Payload, resolution: float, t_ns: int) -> Octomap:
         resolution: Edge of a cell, m.
         t_ns: Stamp.
     """
-    message = Octomap(header=header(t_ns), binary=payload.binary, id=TREE_ID, resolution=resolution)
+    message = Octomap(header=header(BASE_FRAME, t_ns), binary=payload.binary, id=TREE_ID, resolution=resolution)
     # an array of the field's own type is taken as it is; a list costs a thousand times more
     message.data = array.array("b", payload.data.tobytes())
     return message
@@ -68,14 +63,7 @@ def changes_msg(lattice: Lattice, states: NDArray[np.uint8], changed: NDArray[np
     rows = np.empty((changed.size, 4), np.float32)
     rows[:, :3] = lattice.centres(index)
     rows[:, 3] = states.reshape(-1)[changed]
-    message = PointCloud2(header=header(t_ns), height=1, width=changed.size, point_step=16, row_step=16 * changed.size)
-    message.fields = [
-        PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
-        for i, name in enumerate(("x", "y", "z", "state"))
-    ]
-    message.is_dense = True
-    message.data = byte_array(rows)
-    return message
+    return cloud_from_fields(("x", "y", "z", "state"), rows, BASE_FRAME, t_ns)
 
 
 def markers_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> MarkerArray:
@@ -86,7 +74,7 @@ def markers_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> Marke
         states: (nx, ny, nz).
         t_ns: Stamp.
     """
-    marker = Marker(header=header(t_ns), ns="occupied", type=Marker.CUBE_LIST, action=Marker.ADD)
+    marker = Marker(header=header(BASE_FRAME, t_ns), ns="occupied", type=Marker.CUBE_LIST, action=Marker.ADD)
     marker.pose.orientation.w = 1.0
     marker.scale.x = marker.scale.y = marker.scale.z = lattice.resolution
     centres = lattice.centres(np.argwhere(states == OCCUPIED))
@@ -112,7 +100,7 @@ def projected_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> Occ
     """
     occupied, free = (states == OCCUPIED).any(axis=2), (states == FREE).any(axis=2)
     cells = np.where(occupied, 100, np.where(free, 0, -1)).astype(np.int8)
-    message = OccupancyGridMsg(header=header(t_ns))
+    message = OccupancyGridMsg(header=header(BASE_FRAME, t_ns))
     message.info.map_load_time = message.header.stamp
     message.info.resolution = lattice.resolution
     message.info.width, message.info.height = lattice.shape[0], lattice.shape[1]

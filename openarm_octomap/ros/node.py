@@ -11,9 +11,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from openarm_common.camera.cameras import load_cameras
+from openarm_common.camera.cameras import depth_camera, load_cameras
 from openarm_common.camera.housings import with_housings
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import OpenArmError
 from openarm_common.octree.distance_field import CameraMoment, DistanceFieldWriter, field_path
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.posture import JointNeed
@@ -42,7 +42,8 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         )
         need: JointNeed = "required" if config.filter.enabled else "none"
         topics = {"depth": config.depth_topic, "info": config.info_topic}
-        self._cameras = [depth_source(self, self._states, c, topics, need) for c in _cameras(config.cameras)]
+        cameras = [depth_camera(name) for name in config.cameras]
+        self._cameras = [depth_source(self, self._states, camera, topics, need) for camera in cameras]
         self._sources: list[Source] = [*self._cameras]
         if config.cloud_topic:
             self._sources.append(cloud_source(self, self._states, config.cloud_topic, need))
@@ -183,15 +184,6 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         path = field_path(self.config.field.name or domain)
         names = [camera.name for camera in self._cameras]
         return DistanceFieldWriter(path, self._mapper.lattice, self.config.field.reach, BASE_FRAME, names)
-
-
-def _cameras(names: tuple[str, ...]) -> list[Any]:
-    cameras = load_cameras()
-    for name in names:
-        if name not in cameras or not cameras[name].depth:
-            there = ", ".join(key for key, camera in cameras.items() if camera.depth)
-            raise OpenArmError(Code.CONFIG_INVALID, f"camera {name!r} is unknown or has no depth; cameras: {there}")
-    return [cameras[name] for name in names]
 
 
 def main() -> None:

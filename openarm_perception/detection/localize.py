@@ -28,7 +28,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_perception.detection.detector import Detection2D, Mask
 from openarm_perception.geometry import footprint, plane
-from openarm_perception.geometry.depth import DepthImage, DepthLimits
+from openarm_perception.geometry.depth import DepthLimits, View
 from openarm_perception.geometry.patch import Patch, cut
 
 #: As many points of the sides as this are enough; tall objects show thousands.
@@ -101,16 +101,9 @@ class Localizer:
         self.table_height = table_height
         self._heights = config.known_heights()
 
-    def cut(
-        self,
-        found: Detection2D,
-        depth: DepthImage,
-        intrinsics: Intrinsics,
-        T_base_camera: Array,
-        robot: Mask | None = None,
-    ) -> Patch:
-        """Cut out the neighbourhood of a detection, for the methods below; arguments and errors as `patch.cut`."""
-        return cut(found, depth, intrinsics, T_base_camera, self.limits, self.config.top_band, robot)
+    def cut(self, found: Detection2D, view: View) -> Patch:
+        """Cut out the neighbourhood of a detection, for the methods below; errors as `patch.cut`."""
+        return cut(found, view, self.limits, self.config.top_band)
 
     def locate(self, patch: Patch) -> LocatedObject:
         """Locate the object of a detection.
@@ -121,10 +114,7 @@ class Localizer:
         """
         found = patch.found
         if found.truncated:
-            raise OpenArmError(
-                Code.BAD_IMAGE,
-                f"{found.label} at pixel {_pixel(found)} is cut by the border of the image; its size is unknown",
-            )
+            raise _refusal(found, Code.BAD_IMAGE, " is cut by the border of the image; its size is unknown")
         if found.label in self._heights and self._valid(patch).sum() < self.config.min_points:
             return self.locate_on_plane(found, self._heights[found.label], patch.intrinsics, patch.T_base_camera)
         solid = self._solid(patch)
@@ -141,8 +131,7 @@ class Localizer:
             if shape.rms > self.config.prism_rms:
                 shape = footprint.bound(patch.points[solid][:, :2], pixel)
         except OpenArmError as error:
-            where = f"{found.label} at pixel {_pixel(found)}"
-            raise OpenArmError(error.code, f"{where}: {error.message}") from error
+            raise _refusal(found, error.code, f": {error.message}") from error
         return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
 
     def enclose(self, patch: Patch) -> LocatedObject:
@@ -183,7 +172,7 @@ class Localizer:
             if shape.rms > self.config.prism_rms:
                 shape = footprint.bound(points, 0.0)
         except OpenArmError as error:
-            raise OpenArmError(error.code, f"{found.label} at pixel {_pixel(found)}: {error.message}") from error
+            raise _refusal(found, error.code, f": {error.message}") from error
         # a wrong height moves the object along the view: half of it, as its bottom stays where it is
         lean = 0.5 * self.config.height_std * float(np.linalg.norm(middle[:2] - camera[:2])) / (camera[2] - top)
         stds = (math.hypot(shape.centre_std[0], lean), math.hypot(shape.centre_std[1], lean))
@@ -199,11 +188,8 @@ class Localizer:
         found, valid = patch.found, self._valid(patch)
         count = int(np.count_nonzero(valid))
         if count < self.config.min_points:
-            raise OpenArmError(
-                Code.BAD_IMAGE,
-                f"{found.label} at pixel {_pixel(found)} has {count} of {found.area} pixels with a depth of"
-                f" {self.limits.near} to {self.limits.far} m, expected at least {self.config.min_points}",
-            )
+            text = f" has {count} of {found.area} pixels with a depth of {self.limits.near} to {self.limits.far} m"
+            raise _refusal(found, Code.BAD_IMAGE, f"{text}, expected at least {self.config.min_points}")
         gate = np.abs(patch.z - np.median(patch.z[valid])) <= self.config.depth_gate
         return valid & gate
 
@@ -212,20 +198,14 @@ class Localizer:
         found = patch.found
         share = float(np.count_nonzero(patch.robot & patch.coloured)) / found.area
         if share > _MOSTLY:
-            raise OpenArmError(
-                Code.NOTHING_DETECTED,
-                f"{found.label} at pixel {_pixel(found)} is to {share:.0%} the robot or what it holds; it does not"
-                " stand on the table",
-            )
+            text = f" is to {share:.0%} the robot or what it holds; it does not stand on the table"
+            raise _refusal(found, Code.NOTHING_DETECTED, text)
         solid = self._on_object(patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
         count = int(np.count_nonzero(solid))
         if count < self.config.min_points:
-            raise OpenArmError(
-                Code.NOTHING_DETECTED,
-                f"{found.label} at pixel {_pixel(found)} has {count} points above the table at"
-                f" {self.table_height:.3f} m, expected at least {self.config.min_points};"
-                " is it flat, or is the table height wrong?",
-            )
+            text = f" has {count} points above the table at {self.table_height:.3f} m, expected at least"
+            text += f" {self.config.min_points}; is it flat, or is the table height wrong?"
+            raise _refusal(found, Code.NOTHING_DETECTED, text)
         return solid
 
     @staticmethod
@@ -300,5 +280,5 @@ def _shape(found: Detection2D, method: footprint.Kind) -> str:
     return outline if found.kind == "" or (found.kind, outline) == ("box", "cylinder") else found.kind
 
 
-def _pixel(found: Detection2D) -> str:
-    return f"({found.centre[0]:.0f}, {found.centre[1]:.0f})"
+def _refusal(found: Detection2D, code: Code, text: str) -> OpenArmError:
+    return OpenArmError(code, f"{found.label} at pixel ({found.centre[0]:.0f}, {found.centre[1]:.0f}){text}")

@@ -22,42 +22,8 @@ from openarm_perception.detection.detector import ColorDetector, Detection2D, De
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer, LocatedObject
 from openarm_perception.detection.network import NetworkConfig, NetworkDetector
-from openarm_perception.geometry.depth import DepthImage, DepthLimits, check_size, unit_scale
+from openarm_perception.geometry.depth import DepthImage, View, check_size, unit_scale
 from openarm_perception.geometry.table import TableMeasurement, measure_table, of_block
-
-
-@dataclass(frozen=True)
-class View:
-    """Aligned images and where they were taken.
-
-    Attributes:
-        rgb: (h, w, 3) uint8.
-        depth: (h, w) uint16 millimetres or float32 metres, planar.
-        intrinsics: Of both.
-        T_base_camera: (4, 4) optical frame in the base frame.
-        robot: (h, w) pixels that show the robot or what it holds; None when it was not searched for.
-    """
-
-    rgb: Image
-    depth: DepthImage
-    intrinsics: Intrinsics
-    T_base_camera: NDArray[np.float64]
-    robot: Mask | None = None
-
-    def heights(self, limits: DepthLimits, window: tuple[slice, slice] | None = None) -> NDArray[np.float32]:
-        """Return the heights (h, w) of the pixels in the base frame, m; NaN without a depth that counts.
-
-        Args:
-            limits: Depths that count.
-            window: Rows and columns; all without it.
-        """
-        rows, columns = window or (slice(0, self.intrinsics.height), slice(0, self.intrinsics.width))
-        z = self.depth[rows, columns].astype(np.float32) * np.float32(unit_scale(self.depth))
-        z[~((z >= limits.near) & (z <= limits.far))] = np.nan
-        lens, up = self.intrinsics, self.T_base_camera[2]
-        x = (np.arange(rows.start, rows.stop) - lens.cy) / lens.fy * up[1] + up[2]
-        y = (np.arange(columns.start, columns.stop) - lens.cx) / lens.fx * up[0]
-        return z * (x[:, None] + y).astype(np.float32) + np.float32(up[3])
 
 
 @dataclass(frozen=True)
@@ -140,13 +106,14 @@ class Pipeline:
         check_size("depth image", depth.shape, intrinsics)
         unit_scale(depth)
         size = (intrinsics.width, intrinsics.height)
-        detected = self.detect(View(rgb, depth, intrinsics, T_base_camera, robot))
+        view = View(rgb, depth, intrinsics, T_base_camera, robot)
+        detected = self.detect(view)
         found = rank(detected.found, self.policy, size, self.label)
         located: list[LocatedObject] = []
         refused: list[str] = []
         unmeasured: list[LocatedObject] = []
         for detection, doubt in [*((one, "") for one in found), *((one.found, one.why) for one in detected.doubts)]:
-            patch = self.localizer.cut(detection, depth, intrinsics, T_base_camera, robot)
+            patch = self.localizer.cut(detection, view)
             try:
                 if doubt:
                     raise OpenArmError(Code.NOTHING_DETECTED, doubt)

@@ -8,6 +8,8 @@ limits of the camera.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.depth_view import DepthImage
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array, Bytes, Mask
 
 Points = NDArray[np.float32]
 
@@ -111,15 +114,42 @@ def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> Non
         )
 
 
-def _frozen(depth: DepthImage) -> NDArray[np.uint16 | np.float32]:
-    """The same image as a contiguous read-only array: what a message gives, so that kernels are compiled once."""
-    view = np.ascontiguousarray(depth).view()
-    view.flags.writeable = False
-    return view
+@dataclass(frozen=True)
+class View:
+    """Aligned images and where they were taken.
+
+    Attributes:
+        rgb: (h, w, 3) uint8.
+        depth: (h, w) uint16 millimetres or float32 metres, planar.
+        intrinsics: Of both.
+        T_base_camera: (4, 4) optical frame in the base frame.
+        robot: (h, w) pixels that show the robot or what it holds; None when it was not searched for.
+    """
+
+    rgb: Bytes
+    depth: DepthImage
+    intrinsics: Intrinsics
+    T_base_camera: Array
+    robot: Mask | None = None
+
+    def heights(self, limits: DepthLimits, window: tuple[slice, slice] | None = None) -> NDArray[np.float32]:
+        """Return the heights (h, w) of the pixels in the base frame, m; NaN without a depth that counts.
+
+        Args:
+            limits: Depths that count.
+            window: Rows and columns; all without it.
+        """
+        rows, columns = window or (slice(0, self.intrinsics.height), slice(0, self.intrinsics.width))
+        z = self.depth[rows, columns].astype(np.float32) * np.float32(unit_scale(self.depth))
+        z[~((z >= limits.near) & (z <= limits.far))] = np.nan
+        lens, up = self.intrinsics, self.T_base_camera[2]
+        x = (np.arange(rows.start, rows.stop) - lens.cy) / lens.fy * up[1] + up[2]
+        y = (np.arange(columns.start, columns.stop) - lens.cx) / lens.fx * up[0]
+        return z * (x[:, None] + y).astype(np.float32) + np.float32(up[3])
 
 
 class Deprojector:
-    """Turns depth images into points; keeps the ray of every row and column until the intrinsics change.
+    """Turns depth images into points.
 
     Args:
         limits: Depths that count.
@@ -127,9 +157,6 @@ class Deprojector:
 
     def __init__(self, limits: DepthLimits) -> None:
         self.limits = limits
-        self._intrinsics: Intrinsics | None = None
-        self._ray_x: Points = np.empty(0, np.float32)
-        self._ray_y: Points = np.empty(0, np.float32)
 
     def organised(self, depth: DepthImage, intrinsics: Intrinsics, out: Points | None = None) -> Points:
         """Return points of every pixel.
@@ -145,30 +172,27 @@ class Deprojector:
         Raises:
             OpenArmError: BAD_IMAGE, for an unknown encoding or a size other than the intrinsics'.
         """
-        scale = self._prepare(depth, intrinsics)
-        depth = _frozen(depth)
+        pixels = self._pixels(depth, intrinsics)
         if out is None:
             out = np.empty((*depth.shape, 3), np.float32)
-        near, far = np.float32(self.limits.near), np.float32(self.limits.far)
-        _organise(depth, scale, near, far, self._ray_x, self._ray_y, out)
+        _organise(*pixels, *intrinsics.rays, out)
         return out
 
     def valid_points(self, depth: DepthImage, intrinsics: Intrinsics) -> Points:
         """Points (n, 3) float32 of the pixels with a valid depth, in row order; arguments and errors as `organised`."""
-        scale = self._prepare(depth, intrinsics)
-        depth = _frozen(depth)
-        near, far = np.float32(self.limits.near), np.float32(self.limits.far)
+        pixels = self._pixels(depth, intrinsics)
         # counting first costs 0.1 ms; a buffer for all pixels and a copy of its head cost up to 3 ms in page faults
-        out = np.empty((_count(depth, scale, near, far), 3), np.float32)
-        _filter(depth, scale, near, far, self._ray_x, self._ray_y, out)
+        out = np.empty((_count(*pixels), 3), np.float32)
+        _filter(*pixels, *intrinsics.rays, out)
         return out
 
-    def _prepare(self, depth: DepthImage, intrinsics: Intrinsics) -> np.float32:
-        scale = np.float32(unit_scale(depth))
+    def _pixels(
+        self, depth: DepthImage, intrinsics: Intrinsics
+    ) -> tuple[NDArray[np.uint16 | np.float32], np.float32, np.float32, np.float32]:
+        """Return what the kernels take of an image: depth, scale, limits."""
+        scale = unit_scale(depth)
         check_size("depth image", depth.shape, intrinsics)
-        if intrinsics != self._intrinsics:
-            # a pinhole without distortion: x depends on the column alone and y on the row alone
-            self._ray_x = ((np.arange(intrinsics.width) - intrinsics.cx) / intrinsics.fx).astype(np.float32)
-            self._ray_y = ((np.arange(intrinsics.height) - intrinsics.cy) / intrinsics.fy).astype(np.float32)
-            self._intrinsics = intrinsics
-        return scale
+        # contiguous and read-only, as what a message gives, so that kernels are compiled once
+        pixels = np.ascontiguousarray(depth).view()
+        pixels.flags.writeable = False
+        return pixels, np.float32(scale), np.float32(self.limits.near), np.float32(self.limits.far)

@@ -11,7 +11,7 @@ import numpy as np
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.types import Array
 from openarm_perception.detection.detector import Detection2D, Mask
-from openarm_perception.geometry.depth import DepthImage, DepthLimits, check_size, unit_scale
+from openarm_perception.geometry.depth import DepthLimits, View, check_size, unit_scale
 
 #: Depth with less noise than this is used as it is, m; 16UC1 alone rounds by 0.3 mm (1 sigma).
 _CLEAN = 0.0006
@@ -43,37 +43,26 @@ class Patch:
         return self.coloured & ~self.robot
 
 
-def cut(
-    found: Detection2D,
-    depth: DepthImage,
-    intrinsics: Intrinsics,
-    T_base_camera: Array,
-    limits: DepthLimits,
-    top_band: float,
-    robot: Mask | None = None,
-) -> Patch:
+def cut(found: Detection2D, view: View, limits: DepthLimits, top_band: float) -> Patch:
     """Return the patch of a detection.
 
     Args:
-        found: In the colour image that the depth is aligned with.
-        depth: (h, w) uint16 millimetres or float32 metres, planar.
-        intrinsics: Of both.
-        T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image.
+        found: In the colour image.
+        view: The frame; what is the robot is no part of the object, but may hide it.
         limits: Depths that count.
         top_band: Heights within this of the top are top where the depth is clean, m.
-        robot: (h, w) pixels that show the robot or what it holds: no part of the object, but they may hide it; none
-            without it.
 
     Raises:
         OpenArmError: BAD_IMAGE, when image and intrinsics disagree.
     """
-    scale = unit_scale(depth)
-    check_size("depth image", depth.shape, intrinsics)
+    intrinsics, T_base_camera = view.intrinsics, view.T_base_camera
+    scale = unit_scale(view.depth)
+    check_size("depth image", view.depth.shape, intrinsics)
     # with a margin: edges are found between a pixel of the object and one that is not
     (u, v), (w, h) = found.origin, found.size
     u0, u1 = max(u - _MARGIN, 0), min(u + w + _MARGIN, intrinsics.width)
     v0, v1 = max(v - _MARGIN, 0), min(v + h + _MARGIN, intrinsics.height)
-    z = depth[v0:v1, u0:u1] * scale
+    z = view.depth[v0:v1, u0:u1] * scale
     z = np.where((z >= limits.near) & (z <= limits.far), z, np.nan)
     z, noise = _denoise(z)
     x = (np.arange(u0, u1) - intrinsics.cx) / intrinsics.fx
@@ -82,7 +71,7 @@ def cut(
     rays = in_camera @ T_base_camera[:3, :3].T
     coloured = np.zeros(z.shape, np.bool_)
     coloured[v - v0 : v - v0 + h, u - u0 : u - u0 + w] = found.mask
-    hidden = np.zeros(z.shape, np.bool_) if robot is None else robot[v0:v1, u0:u1]
+    hidden = np.zeros(z.shape, np.bool_) if view.robot is None else view.robot[v0:v1, u0:u1]
     band = max(top_band, 3.0 * noise)
     points = rays * z[..., None] + T_base_camera[:3, 3]
     return Patch(found, intrinsics, T_base_camera, rays, z, points, coloured, hidden, band)

@@ -20,8 +20,8 @@ SEARCH = 0.08
 #: Points this near to the plane belong to it, m.
 _BAND = 0.008
 _BIN = 0.004
-#: More are no more exact.
-_POINTS = 40_000
+#: Fewest points of a table; more than the second are no more exact.
+_MIN_POINTS, _POINTS = 2000, 40_000
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,7 @@ class TableMeasurement:
 
 
 def measure_table(
-    depth: DepthImage,
-    intrinsics: Intrinsics,
-    T_base_camera: Array,
-    limits: DepthLimits,
-    expected: float,
-    min_points: int = 2000,
+    depth: DepthImage, intrinsics: Intrinsics, T_base_camera: Array, limits: DepthLimits, expected: float
 ) -> TableMeasurement:
     """Fit the largest level surface near the expected height; objects and robot on it do not matter.
 
@@ -57,7 +52,6 @@ def measure_table(
         T_base_camera: (4, 4) optical frame in the base frame.
         limits: Depths that count.
         expected: Height of the table so far, m.
-        min_points: Fewest points of a table.
 
     Raises:
         OpenArmError: BAD_IMAGE, when depth and intrinsics do not fit; NOTHING_DETECTED, when there is no such surface.
@@ -72,11 +66,11 @@ def measure_table(
     used = near[np.abs(near[:, 2] - level) <= 2.0 * _BAND]
     middle, normal, residual = np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(0)
     for _ in range(4):
-        if len(used) < min_points:
+        if len(used) < _MIN_POINTS:
             raise OpenArmError(
                 Code.NOTHING_DETECTED,
                 f"{len(used)} points of a level surface within {SEARCH:g} m of {expected:.3f} m, expected at least"
-                f" {min_points}; does the camera see the table?",
+                f" {_MIN_POINTS}; does the camera see the table?",
             )
         middle = used.mean(axis=0)
         normal = np.linalg.svd(used - middle, full_matrices=False)[2][2]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
+from openarm_common.camera.cameras import depth_camera
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.camera.stream import Frame
 from openarm_common.errors import Code, OpenArmError
@@ -20,7 +21,7 @@ from openarm_common.ros.camera_stream import CameraStream
 from openarm_common.ros.convert import cloud_from_points, depth_image, intrinsics_from_info, rgb_image
 from openarm_common.ros.node import QOS_SENSOR, BaseNode, run
 from openarm_common.ros.tf import RobotStateListener
-from openarm_perception.config import CloudNodeConfig, camera_of
+from openarm_perception.config import CloudNodeConfig
 from openarm_perception.detection.robot import RobotFinder
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 from openarm_perception.geometry.filters import CloudFilter
@@ -39,7 +40,7 @@ class _Camera:
     def __init__(
         self, node: CloudNode, name: str, states: RobotStateListener | None, finder: RobotFinder | None
     ) -> None:
-        camera, config = camera_of(name), node.config
+        camera, config = depth_camera(name), node.config
         self._node, self._name, self._finder = node, name, finder
         self._deprojector = Deprojector(DepthLimits(near=camera.near, far=camera.far))
         self._filter = CloudFilter(config.filter)

@@ -9,12 +9,12 @@ import numpy as np
 from geometry_msgs.msg import Pose
 from numpy.typing import NDArray
 from rclpy.duration import Duration
-from std_msgs.msg import ColorRGBA, Header
+from std_msgs.msg import ColorRGBA
 from vision_msgs.msg import BoundingBox2D, Detection2DArray
 from vision_msgs.msg import Detection2D as Detection2DMsg
 from visualization_msgs.msg import Marker, MarkerArray
 
-from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, vector
+from openarm_common.ros.convert import header, matrix_to_pose, vector
 from openarm_common.ros.detections import hypothesis, numbered
 from openarm_perception.detection.detector import Detection2D
 from openarm_perception.detection.localize import LocatedObject
@@ -22,11 +22,6 @@ from openarm_perception.detection.pipeline import Perceived
 
 #: Markers of objects vanish this long after the last frame that showed them, s.
 MARKER_LIFETIME = 2.0
-
-
-def header(frame_id: str, t_ns: int) -> Header:
-    """Return the header of a frame and a stamp."""
-    return Header(frame_id=frame_id, stamp=ns_to_stamp(t_ns))
 
 
 def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Detection2DArray:

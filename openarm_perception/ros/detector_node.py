@@ -18,7 +18,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from vision_msgs.msg import Detection2DArray, Detection3DArray
 from visualization_msgs.msg import MarkerArray
 
-from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.cameras import Intrinsics, depth_camera
 from openarm_common.camera.depth_view import DepthImage, DepthView
 from openarm_common.camera.stream import Frame
 from openarm_common.config import load_config
@@ -31,13 +31,13 @@ from openarm_common.ros.convert import array_to_image, depth_image, intrinsics_f
 from openarm_common.ros.detections import detections_to_msg
 from openarm_common.ros.node import BASE_FRAME, QOS_SENSOR, BaseNode, reliable, run
 from openarm_common.ros.tf import RobotStateListener
-from openarm_perception.config import DetectNodeConfig, camera_of
+from openarm_perception.config import DetectNodeConfig
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
 from openarm_perception.detection.draw import annotate
 from openarm_perception.detection.localize import Localizer
-from openarm_perception.detection.pipeline import Perceived, Pipeline, View, make_pipeline
+from openarm_perception.detection.pipeline import Perceived, Pipeline, make_pipeline
 from openarm_perception.detection.robot import RobotFinder
-from openarm_perception.geometry.depth import DepthLimits
+from openarm_perception.geometry.depth import DepthLimits, View
 from openarm_perception.ros import convert
 
 #: A measurement is made of an image that is not older than this, s.
@@ -52,7 +52,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("detector", DetectNodeConfig, **kwargs)
         config = self.config
-        camera = camera_of(config.camera)
+        camera = depth_camera(config.camera)
         self._optical_frame = camera.optical_frame
         colors = Path(config.colors) if config.colors else config_dir() / "params" / "detector.yaml"
         #: Why objects are detected by colour though something else was configured.

@@ -164,5 +164,5 @@ def test_what_does_not_fit_is_named_and_dropped(ros, pixels, encoding, frame, te
 
 def test_an_unknown_camera_is_named(ros) -> None:
     """With those that there are."""
-    with pytest.raises(OpenArmError, match="'rear' is unknown; cameras: overhead, wrist"):
+    with pytest.raises(OpenArmError, match="'rear' is unknown or has no depth; cameras: overhead, wrist"):
         CloudNode(parameter_overrides=[Parameter("cameras", value=["rear"])])

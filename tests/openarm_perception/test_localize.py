@@ -16,7 +16,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
-from openarm_perception.geometry.depth import DepthLimits
+from openarm_perception.geometry.depth import DepthLimits, View
 from openarm_perception.geometry.patch import Patch
 
 SHAPES = [
@@ -51,7 +51,8 @@ def locate(localizer: Localizer, detector: ColorDetector, view, label: str, dept
 
 def patch_of(localizer: Localizer, found, view, depth=None) -> Patch:
     """The surroundings of a detection, with another depth image where one is given."""
-    return localizer.cut(found, view.depth if depth is None else depth, view.intrinsics, view.T_base_camera)
+    depth = view.depth if depth is None else depth
+    return localizer.cut(found, View(view.rgb, depth, view.intrinsics, view.T_base_camera))
 
 
 def errors(thing, found) -> dict[str, float]:
@@ -186,7 +187,7 @@ def test_the_given_intrinsics_decide(tabletop, detector, localizer) -> None:
     view = tabletop.render([thing])
     (found,) = detector.detect(view.rgb)
     wrong = replace(view.intrinsics, fx=1.1 * view.intrinsics.fx)
-    point = localizer.locate(localizer.cut(found, view.depth, wrong, view.T_base_camera)).p_base
+    point = localizer.locate(patch_of(localizer, found, replace(view, intrinsics=wrong))).p_base
     assert np.linalg.norm(point[:2] - thing.position[:2]) > 0.02
 
 

@@ -16,7 +16,7 @@ from openarm_common.resources import config_dir
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.localize import Localizer, LocalizerConfig, LocatedObject
 from openarm_perception.geometry import plane
-from openarm_perception.geometry.depth import DepthLimits
+from openarm_perception.geometry.depth import DepthLimits, View
 
 K = Intrinsics.from_fovy(640, 480, 60.0)
 FLAT = (0.0, 0.0, 1.0)
@@ -63,7 +63,8 @@ def blind(tabletop, height: float) -> Localizer:
 
 def without_depth(localizer: Localizer, found, seen) -> LocatedObject:
     """The object of a detection in a view whose depth image is empty."""
-    return localizer.locate(localizer.cut(found, np.zeros_like(seen.depth), seen.intrinsics, seen.T_base_camera))
+    view = View(seen.rgb, np.zeros_like(seen.depth), seen.intrinsics, seen.T_base_camera)
+    return localizer.locate(localizer.cut(found, view))
 
 
 VIEWS = {  # position, target, right: from straight above to 30 degrees over the table, and rolled
