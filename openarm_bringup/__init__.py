@@ -19,25 +19,16 @@ from typing import TYPE_CHECKING
 from openarm_common.lazy import attach
 
 if TYPE_CHECKING:
-    from openarm_bringup.bags.bag import Bag, BagWriter, open_bag
-    from openarm_bringup.outcome import Outcome
-    from openarm_bringup.supervision.graph import Graph, load_graph
-    from openarm_bringup.supervision.runs import RunRecord, new_run_dir, running
-    from openarm_bringup.supervision.session import running_graph
-    from openarm_bringup.supervision.supervisor import Supervisor
-
-__all__ = [
-    "Bag",
-    "BagWriter",
-    "Graph",
-    "Outcome",
-    "RunRecord",
-    "Supervisor",
-    "load_graph",
-    "new_run_dir",
-    "open_bag",
-    "running",
-    "running_graph",
-]
+    from openarm_bringup.bags.bag import Bag as Bag
+    from openarm_bringup.bags.bag import BagWriter as BagWriter
+    from openarm_bringup.bags.bag import open_bag as open_bag
+    from openarm_bringup.outcome import Outcome as Outcome
+    from openarm_bringup.supervision.graph import Graph as Graph
+    from openarm_bringup.supervision.graph import load_graph as load_graph
+    from openarm_bringup.supervision.runs import RunRecord as RunRecord
+    from openarm_bringup.supervision.runs import new_run_dir as new_run_dir
+    from openarm_bringup.supervision.runs import running as running
+    from openarm_bringup.supervision.session import running_graph as running_graph
+    from openarm_bringup.supervision.supervisor import Supervisor as Supervisor
 
 __getattr__, __dir__ = attach(__name__, __file__)

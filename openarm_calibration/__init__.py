@@ -18,27 +18,17 @@ from typing import TYPE_CHECKING
 from openarm_common.lazy import attach
 
 if TYPE_CHECKING:
-    from openarm_calibration.board.board import Charuco, CircleGrid
-    from openarm_calibration.handeye.offline import Result, calibrate, calibrate_together
-    from openarm_calibration.handeye.verdict import Limits
-    from openarm_calibration.ros.client import CalibrationClient
-    from openarm_calibration.sampling.next_pose import PoseSearch
-    from openarm_calibration.sampling.samples import SampleSet, load_session
-    from openarm_calibration.store.store import CalibrationStore, StoredCalibration
-
-__all__ = [
-    "CalibrationClient",
-    "CalibrationStore",
-    "Charuco",
-    "CircleGrid",
-    "Limits",
-    "PoseSearch",
-    "Result",
-    "SampleSet",
-    "StoredCalibration",
-    "calibrate",
-    "calibrate_together",
-    "load_session",
-]
+    from openarm_calibration.board.board import Charuco as Charuco
+    from openarm_calibration.board.board import CircleGrid as CircleGrid
+    from openarm_calibration.handeye.offline import Result as Result
+    from openarm_calibration.handeye.offline import calibrate as calibrate
+    from openarm_calibration.handeye.offline import calibrate_together as calibrate_together
+    from openarm_calibration.handeye.verdict import Limits as Limits
+    from openarm_calibration.ros.client import CalibrationClient as CalibrationClient
+    from openarm_calibration.sampling.next_pose import PoseSearch as PoseSearch
+    from openarm_calibration.sampling.samples import SampleSet as SampleSet
+    from openarm_calibration.sampling.samples import load_session as load_session
+    from openarm_calibration.store.store import CalibrationStore as CalibrationStore
+    from openarm_calibration.store.store import StoredCalibration as StoredCalibration
 
 __getattr__, __dir__ = attach(__name__, __file__)

@@ -16,27 +16,17 @@ from typing import TYPE_CHECKING
 from openarm_common.lazy import attach
 
 if TYPE_CHECKING:
-    from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
-    from openarm_common.config import Config, load_config
-    from openarm_common.errors import Code, OpenArmError
-    from openarm_common.octree.distance_field import DistanceFieldReader
-    from openarm_common.robot.description import RobotDescription
-    from openarm_common.robot.robot_state import RobotStateBuffer
-    from openarm_common.scene.scene import Scene, load_scene
-
-__all__ = [
-    "CameraConfig",
-    "Code",
-    "Config",
-    "DistanceFieldReader",
-    "Intrinsics",
-    "OpenArmError",
-    "RobotDescription",
-    "RobotStateBuffer",
-    "Scene",
-    "load_cameras",
-    "load_config",
-    "load_scene",
-]
+    from openarm_common.camera.cameras import CameraConfig as CameraConfig
+    from openarm_common.camera.cameras import Intrinsics as Intrinsics
+    from openarm_common.camera.cameras import load_cameras as load_cameras
+    from openarm_common.config import Config as Config
+    from openarm_common.config import load_config as load_config
+    from openarm_common.errors import Code as Code
+    from openarm_common.errors import OpenArmError as OpenArmError
+    from openarm_common.octree.distance_field import DistanceFieldReader as DistanceFieldReader
+    from openarm_common.robot.description import RobotDescription as RobotDescription
+    from openarm_common.robot.robot_state import RobotStateBuffer as RobotStateBuffer
+    from openarm_common.scene.scene import Scene as Scene
+    from openarm_common.scene.scene import load_scene as load_scene
 
 __getattr__, __dir__ = attach(__name__, __file__)

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from openarm_common.errors import Code, OpenArmError
 
@@ -67,8 +68,9 @@ def metres_by_name(items: Sequence[str], field: str, example: str, low: float, h
     return found
 
 
-#: `json_schema_extra` of a field that may change while a node runs.
+#: `json_schema_extra` of a field that may change while a node runs, and `Field` with it.
 AT_RUN_TIME: dict[str, JsonValue] = {"at_run_time": True}
+RunTimeField = partial(Field, json_schema_extra=AT_RUN_TIME)
 
 
 def validate(model: type[ConfigT], data: dict[str, Any], where: str, code: Code = Code.CONFIG_INVALID) -> ConfigT:

@@ -13,8 +13,8 @@ from pathlib import Path
 def attach(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
     """Return the `__getattr__` and `__dir__` of a package.
 
-    The public names are those that the package imports under `if TYPE_CHECKING:`, from absolute modules; each is
-    imported when it is first used.
+    The public names are those that the package imports under `if TYPE_CHECKING:`, from absolute modules, in the form
+    `import Name as Name`, which type checkers read as an export; each is imported when it is first used.
 
     Args:
         package: `__name__` in the `__init__.py` of the package.
@@ -31,6 +31,8 @@ def attach(package: str, file: str) -> tuple[Callable[[str], object], Callable[[
         return {alias.name: node.module or "" for node in imports for alias in node.names}
 
     def getattr_(name: str) -> object:
+        if name == "__all__":
+            return sorted(modules())
         if name.startswith("__") or name not in modules():
             names = ", ".join(sorted(modules()))
             raise AttributeError(f"module {package!r} has no attribute {name!r}; public names: {names}")

@@ -17,29 +17,17 @@ from typing import TYPE_CHECKING
 from openarm_common.lazy import attach
 
 if TYPE_CHECKING:
-    from openarm_evaluation.campaign.agree import compare
-    from openarm_evaluation.campaign.campaign import Campaign, run_campaign
-    from openarm_evaluation.campaign.options import CampaignOptions
-    from openarm_evaluation.campaign.tasks.suites import make_task
-    from openarm_evaluation.campaign.tasks.task import Task
-    from openarm_evaluation.demo.demo import run_demo
-    from openarm_evaluation.demo.options import DemoOptions
-    from openarm_evaluation.judging.judge import JudgeConfig, Verdict, judge
-    from openarm_evaluation.judging.statistics import summarise
-
-__all__ = [
-    "Campaign",
-    "CampaignOptions",
-    "DemoOptions",
-    "JudgeConfig",
-    "Task",
-    "Verdict",
-    "compare",
-    "judge",
-    "make_task",
-    "run_campaign",
-    "run_demo",
-    "summarise",
-]
+    from openarm_evaluation.campaign.agree import compare as compare
+    from openarm_evaluation.campaign.campaign import Campaign as Campaign
+    from openarm_evaluation.campaign.campaign import run_campaign as run_campaign
+    from openarm_evaluation.campaign.options import CampaignOptions as CampaignOptions
+    from openarm_evaluation.campaign.tasks.suites import make_task as make_task
+    from openarm_evaluation.campaign.tasks.task import Task as Task
+    from openarm_evaluation.demo.demo import run_demo as run_demo
+    from openarm_evaluation.demo.options import DemoOptions as DemoOptions
+    from openarm_evaluation.judging.judge import JudgeConfig as JudgeConfig
+    from openarm_evaluation.judging.judge import Verdict as Verdict
+    from openarm_evaluation.judging.judge import judge as judge
+    from openarm_evaluation.judging.statistics import summarise as summarise
 
 __getattr__, __dir__ = attach(__name__, __file__)

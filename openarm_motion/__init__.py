@@ -19,27 +19,17 @@ from typing import TYPE_CHECKING
 from openarm_common.lazy import attach
 
 if TYPE_CHECKING:
-    from openarm_motion.collision.solids import Box
-    from openarm_motion.config import MotionConfig
-    from openarm_motion.planning.approach import ApproachRequest, plan_approach
-    from openarm_motion.planning.arm import Arm
-    from openarm_motion.planning.moves import RequestBoxes, to_named, to_pose
-    from openarm_motion.ros.client import MotionClient
-    from openarm_motion.service.motion_service import MotionService, make_arms, table_box
-
-__all__ = [
-    "ApproachRequest",
-    "Arm",
-    "Box",
-    "MotionClient",
-    "MotionConfig",
-    "MotionService",
-    "RequestBoxes",
-    "make_arms",
-    "plan_approach",
-    "table_box",
-    "to_named",
-    "to_pose",
-]
+    from openarm_motion.collision.solids import Box as Box
+    from openarm_motion.config import MotionConfig as MotionConfig
+    from openarm_motion.planning.approach import ApproachRequest as ApproachRequest
+    from openarm_motion.planning.approach import plan_approach as plan_approach
+    from openarm_motion.planning.arm import Arm as Arm
+    from openarm_motion.planning.moves import RequestBoxes as RequestBoxes
+    from openarm_motion.planning.moves import to_named as to_named
+    from openarm_motion.planning.moves import to_pose as to_pose
+    from openarm_motion.ros.client import MotionClient as MotionClient
+    from openarm_motion.service.motion_service import MotionService as MotionService
+    from openarm_motion.service.motion_service import make_arms as make_arms
+    from openarm_motion.service.motion_service import table_box as table_box
 
 __getattr__, __dir__ = attach(__name__, __file__)

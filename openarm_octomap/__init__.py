@@ -21,22 +21,15 @@ from typing import TYPE_CHECKING
 from openarm_common.lazy import attach
 
 if TYPE_CHECKING:
-    from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig, OctomapNodeConfig
-    from openarm_octomap.distance import DistanceTransform
-    from openarm_octomap.grid import CloudScan, DepthScan, OccupancyGrid
-    from openarm_octomap.mapper import Frame, Mapper
-
-__all__ = [
-    "CloudScan",
-    "DepthScan",
-    "DistanceTransform",
-    "FieldConfig",
-    "FilterConfig",
-    "Frame",
-    "GridConfig",
-    "Mapper",
-    "OccupancyGrid",
-    "OctomapNodeConfig",
-]
+    from openarm_octomap.config import FieldConfig as FieldConfig
+    from openarm_octomap.config import FilterConfig as FilterConfig
+    from openarm_octomap.config import GridConfig as GridConfig
+    from openarm_octomap.config import OctomapNodeConfig as OctomapNodeConfig
+    from openarm_octomap.distance import DistanceTransform as DistanceTransform
+    from openarm_octomap.grid import CloudScan as CloudScan
+    from openarm_octomap.grid import DepthScan as DepthScan
+    from openarm_octomap.grid import OccupancyGrid as OccupancyGrid
+    from openarm_octomap.mapper import Frame as Frame
+    from openarm_octomap.mapper import Mapper as Mapper
 
 __getattr__, __dir__ = attach(__name__, __file__)

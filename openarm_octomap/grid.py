@@ -272,7 +272,7 @@ class OccupancyGrid:
         return max(1, min(int(pixels), self.config.no_return_block))
 
     def _milliseconds(self, t_ns: int) -> int:
-        """Return the time since the first scan; a clock that was set back begins anew."""
+        """Return the time since the first scan; a clock that was set back begins again."""
         if self._epoch_ns is None or t_ns < self._epoch_ns:
             self._epoch_ns = t_ns
             self.seen[...] = 0

@@ -88,21 +88,17 @@ class Report:
     Attributes:
         snapshot: The map afterwards.
         changed: Flat indices of the cells whose state changed.
-        sources: Whose frames are in it.
         removed: Pixels or points that each link (or held box) took, by source.
         flying: Pixels that were left out because they float between surfaces, by source.
         reset: Cells that the robot filled.
-        valid: Valid pixels or points.
         ends: Cells that rays ended in.
     """
 
     snapshot: Snapshot
     changed: NDArray[np.int32]
-    sources: tuple[str, ...]
     removed: Mapping[str, Mapping[str, int]] = field(default_factory=dict[str, Mapping[str, int]])
     flying: Mapping[str, int] = field(default_factory=dict[str, int])
     reset: int = 0
-    valid: int = 0
     ends: int = 0
 
 
@@ -180,11 +176,9 @@ class Mapper:
             return Report(
                 snapshot=self._snapshot(wanted),
                 changed=np.unique(np.concatenate(changes)),
-                sources=tuple(frame.source for frame in frames),
                 removed=removed,
                 flying=flying,
                 reset=int(changes[-1].size) if shapes is not None else 0,
-                valid=update.valid,
                 ends=update.ends,
             )
 

@@ -22,25 +22,17 @@ from typing import TYPE_CHECKING
 from openarm_common.lazy import attach
 
 if TYPE_CHECKING:
-    from openarm_perception.config import CloudNodeConfig, DetectNodeConfig
-    from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Detection2D
-    from openarm_perception.detection.localize import Localizer, LocalizerConfig, LocatedObject
-    from openarm_perception.detection.pipeline import Pipeline, make_pipeline
-    from openarm_perception.geometry.depth import Deprojector, DepthLimits
-
-__all__ = [
-    "CloudNodeConfig",
-    "ColorDetector",
-    "ColorDetectorConfig",
-    "Deprojector",
-    "DepthLimits",
-    "DetectNodeConfig",
-    "Detection2D",
-    "Localizer",
-    "LocalizerConfig",
-    "LocatedObject",
-    "Pipeline",
-    "make_pipeline",
-]
+    from openarm_perception.config import CloudNodeConfig as CloudNodeConfig
+    from openarm_perception.config import DetectNodeConfig as DetectNodeConfig
+    from openarm_perception.detection.detector import ColorDetector as ColorDetector
+    from openarm_perception.detection.detector import ColorDetectorConfig as ColorDetectorConfig
+    from openarm_perception.detection.detector import Detection2D as Detection2D
+    from openarm_perception.detection.localize import Localizer as Localizer
+    from openarm_perception.detection.localize import LocalizerConfig as LocalizerConfig
+    from openarm_perception.detection.localize import LocatedObject as LocatedObject
+    from openarm_perception.detection.pipeline import Pipeline as Pipeline
+    from openarm_perception.detection.pipeline import make_pipeline as make_pipeline
+    from openarm_perception.geometry.depth import Deprojector as Deprojector
+    from openarm_perception.geometry.depth import DepthLimits as DepthLimits
 
 __getattr__, __dir__ = attach(__name__, __file__)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from openarm_common.config import AT_RUN_TIME, Config
+from openarm_common.config import Config, RunTimeField
 from openarm_common.scene.scene import load_scene
 from openarm_perception.detection.detector import Policy
 from openarm_perception.detection.kinds import DetectorKind
@@ -32,20 +32,15 @@ class DetectNodeConfig(Config):
     table_height: float | None = Field(
         default=None, ge=-1.0, le=2.0, description="of the table in the base frame, m; without one, the scene's"
     )
-    detector: DetectorKind = Field(
+    detector: DetectorKind = RunTimeField(
         default="color",
         description="what finds objects: their colour, a network, both checking each other, or depth alone (anything)",
-        json_schema_extra=AT_RUN_TIME,
     )
     network: NetworkConfig = NetworkConfig()
-    policy: Policy = Field(
-        default="score",
-        description="which detection comes first: most certain, or nearest to the centre",
-        json_schema_extra=AT_RUN_TIME,
+    policy: Policy = RunTimeField(
+        default="score", description="which detection comes first: most certain, or nearest to the centre"
     )
-    label: str = Field(
-        default="", description="only objects of this name; empty takes all", json_schema_extra=AT_RUN_TIME
-    )
+    label: str = RunTimeField(default="", description="only objects of this name; empty takes all")
     max_rate: float = Field(
         default=10.0, gt=0.0, le=60.0, description="most frames processed a second of the stamps, Hz"
     )

@@ -16,30 +16,17 @@ from typing import TYPE_CHECKING
 from openarm_common.lazy import attach
 
 if TYPE_CHECKING:
-    from openarm_sim_bridge.cameras.cameras import SimulatedCameras
-    from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
-    from openarm_sim_bridge.control.controller import RobotController
-    from openarm_sim_bridge.faults.faults import Fault, checked_fault
-    from openarm_sim_bridge.robot import SimulatedRobot
-    from openarm_sim_bridge.simulation import Simulation
-    from openarm_sim_bridge.world.export import render
-    from openarm_sim_bridge.world.model import PhysicsConfig, compile_model
-    from openarm_sim_bridge.world.stage import Stage
-    from openarm_sim_bridge.world.world import World
-
-__all__ = [
-    "Fault",
-    "PhysicsConfig",
-    "RobotController",
-    "SimulatedCameras",
-    "SimulatedRobot",
-    "Simulation",
-    "SnapshotRenderer",
-    "Stage",
-    "World",
-    "checked_fault",
-    "compile_model",
-    "render",
-]
+    from openarm_sim_bridge.cameras.cameras import SimulatedCameras as SimulatedCameras
+    from openarm_sim_bridge.cameras.renderer import SnapshotRenderer as SnapshotRenderer
+    from openarm_sim_bridge.control.controller import RobotController as RobotController
+    from openarm_sim_bridge.faults.faults import Fault as Fault
+    from openarm_sim_bridge.faults.faults import checked_fault as checked_fault
+    from openarm_sim_bridge.robot import SimulatedRobot as SimulatedRobot
+    from openarm_sim_bridge.simulation import Simulation as Simulation
+    from openarm_sim_bridge.world.export import render as render
+    from openarm_sim_bridge.world.model import PhysicsConfig as PhysicsConfig
+    from openarm_sim_bridge.world.model import compile_model as compile_model
+    from openarm_sim_bridge.world.stage import Stage as Stage
+    from openarm_sim_bridge.world.world import World as World
 
 __getattr__, __dir__ = attach(__name__, __file__)

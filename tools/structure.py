@@ -188,16 +188,10 @@ def longest_chain(graph: Mapping[str, Iterable[str]]) -> tuple[str, ...]:
 
 
 def exported(package: Path) -> int:
-    """Return how many names `__all__` of a package lists."""
-    for node in ast.walk(ast.parse((package / "__init__.py").read_text(encoding="utf-8"))):
-        targets = (
-            node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
-        )
-        if any(isinstance(target, ast.Name) and target.id == "__all__" for target in targets):
-            assert isinstance(node, (ast.Assign, ast.AnnAssign))
-            if isinstance(node.value, (ast.List, ast.Tuple)):
-                return len(node.value.elts)
-    return 0
+    """Return how many names the `__init__.py` of a package exports, as `import Name as Name`."""
+    tree = ast.parse((package / "__init__.py").read_text(encoding="utf-8"))
+    aliases = [alias for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names]
+    return sum(alias.asname == alias.name for alias in aliases)
 
 
 def structure(root: Path) -> dict[str, Row]:

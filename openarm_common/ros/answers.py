@@ -11,6 +11,11 @@ from openarm_common.errors import Code, OpenArmError
 ResponseT = TypeVar("ResponseT")
 
 
+def answering(work: Callable[[Any, ResponseT], str]) -> Callable[[Any, ResponseT], ResponseT]:
+    """Return the callback of a service whose work takes request and response, and returns the message."""
+    return lambda request, response: answer(response, lambda: work(request, response))
+
+
 def answer(response: ResponseT, work: Callable[[], str]) -> ResponseT:
     """Return the response with the message that the work returns, or with the error that it raises."""
     try:

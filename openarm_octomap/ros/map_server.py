@@ -18,7 +18,7 @@ from std_srvs.srv import Empty
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.lattice import DEPTH
-from openarm_common.ros.answers import answer
+from openarm_common.ros.answers import answering
 from openarm_common.ros.convert import ns_to_stamp, xyz
 from openarm_octomap.config import UnknownPolicy
 from openarm_octomap.kernels import FREE, UNKNOWN
@@ -53,10 +53,10 @@ class MapServices:
             node.create_service(GetOctomap, f"~/depth_{depth}/octomap_binary", self._answer_at(depth))
         node.create_service(BoundingBoxQuery, "~/clear_bbox", self._on_clear_bbox)
         node.create_service(Empty, "~/reset", self._on_reset)
-        node.create_service(ClearMap, "~/clear", self._on_clear)
-        node.create_service(QueryMap, "~/query", self._on_query)
-        node.create_service(MapFile, "~/save", self._on_save)
-        node.create_service(MapFile, "~/load", self._on_load)
+        node.create_service(ClearMap, "~/clear", answering(self._clear))
+        node.create_service(QueryMap, "~/query", answering(self._query))
+        node.create_service(MapFile, "~/save", answering(self._save))
+        node.create_service(MapFile, "~/load", answering(self._load))
 
     # --- octomap_server's
     def _on_full(self, _: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
@@ -89,42 +89,30 @@ class MapServices:
         return response
 
     # --- the suite's
-    def _on_clear(self, request: ClearMap.Request, response: ClearMap.Response) -> ClearMap.Response:
-        def clear() -> str:
-            state = _choose("state", request.state or "free", _STATES)
-            response.cells = self._mapper.clear_box(xyz(request.min), xyz(request.max), state)
-            self._show()
-            return f"{response.cells} cells are {request.state or 'free'}"
+    def _clear(self, request: ClearMap.Request, response: ClearMap.Response) -> str:
+        state = _choose("state", request.state or "free", _STATES)
+        response.cells = self._mapper.clear_box(xyz(request.min), xyz(request.max), state)
+        self._show()
+        return f"{response.cells} cells are {request.state or 'free'}"
 
-        return answer(response, clear)
+    def _query(self, request: QueryMap.Request, response: QueryMap.Response) -> str:
+        policy = _choose("unknown", request.unknown or "occupied", _POLICIES)
+        points = np.array([(p.x, p.y, p.z) for p in request.points], np.float64).reshape(-1, 3)
+        found = self._mapper.query(points, request.resolution, policy)
+        response.resolution, response.stamp = found.resolution, ns_to_stamp(self._stamp())
+        response.states, response.blocked = found.states.tolist(), found.blocked.tolist()
+        return f"{int(found.blocked.sum())} of {len(points)} points are blocked at {found.resolution:g} m"
 
-    def _on_query(self, request: QueryMap.Request, response: QueryMap.Response) -> QueryMap.Response:
-        def query() -> str:
-            policy = _choose("unknown", request.unknown or "occupied", _POLICIES)
-            points = np.array([(p.x, p.y, p.z) for p in request.points], np.float64).reshape(-1, 3)
-            found = self._mapper.query(points, request.resolution, policy)
-            response.resolution, response.stamp = found.resolution, ns_to_stamp(self._stamp())
-            response.states, response.blocked = found.states.tolist(), found.blocked.tolist()
-            return f"{int(found.blocked.sum())} of {len(points)} points are blocked at {found.resolution:g} m"
+    def _save(self, request: MapFile.Request, response: MapFile.Response) -> str:
+        path = _path(request.path)
+        response.nodes = self._mapper.save(path)
+        return f"{path}: {response.nodes} nodes"
 
-        return answer(response, query)
-
-    def _on_save(self, request: MapFile.Request, response: MapFile.Response) -> MapFile.Response:
-        def save() -> str:
-            path = _path(request.path)
-            response.nodes = self._mapper.save(path)
-            return f"{path}: {response.nodes} nodes"
-
-        return answer(response, save)
-
-    def _on_load(self, request: MapFile.Request, response: MapFile.Response) -> MapFile.Response:
-        def load() -> str:
-            path = _path(request.path)
-            response.nodes, response.outside = self._mapper.load(path)
-            self._show()
-            return f"{path}: {response.nodes} nodes; {response.outside} leaves outside of the workspace"
-
-        return answer(response, load)
+    def _load(self, request: MapFile.Request, response: MapFile.Response) -> str:
+        path = _path(request.path)
+        response.nodes, response.outside = self._mapper.load(path)
+        self._show()
+        return f"{path}: {response.nodes} nodes; {response.outside} leaves outside of the workspace"
 
 
 ChoiceT = TypeVar("ChoiceT")

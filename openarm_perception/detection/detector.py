@@ -52,10 +52,8 @@ class Detection2D:
     @property
     def origin(self) -> tuple[int, int]:
         """(u, v) of the top-left pixel of the box."""
-        return (
-            round(self.centre[0] - (self.size[0] - 1) / 2.0),
-            round(self.centre[1] - (self.size[1] - 1) / 2.0),
-        )
+        (u, v), (width, height) = self.centre, self.size
+        return round(u - (width - 1) / 2.0), round(v - (height - 1) / 2.0)
 
     @property
     def area(self) -> int:

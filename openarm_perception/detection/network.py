@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from openarm_common.config import AT_RUN_TIME, Config, load_yaml
+from openarm_common.config import Config, RunTimeField, load_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_perception.detection.boxes import Candidates, Letterbox, blob, decode
@@ -35,28 +35,14 @@ _LAYOUT = "expected the layout of YOLOv8: input (1, 3, h, w), output (1, 4 + cla
 class NetworkConfig(Config):
     """Which network, and what counts as found."""
 
-    model: str = Field(
-        default="shapes_640x480",
-        description="ONNX file, or a name in models/detector",
-        json_schema_extra=AT_RUN_TIME,
+    model: str = RunTimeField(default="shapes_640x480", description="ONNX file, or a name in models/detector")
+    names: tuple[str, ...] = RunTimeField(
+        default=(), description="of the classes; empty: those of the file, or `names` of the YAML next to it"
     )
-    names: tuple[str, ...] = Field(
-        default=(),
-        description="of the classes; empty: those of the file, or `names` of the YAML next to it",
-        json_schema_extra=AT_RUN_TIME,
-    )
-    classes: tuple[str, ...] = Field(
-        default=(), description="classes that are detected; empty: all", json_schema_extra=AT_RUN_TIME
-    )
-    threshold: float = Field(
-        default=0.5, gt=0.0, lt=1.0, description="least score, 0..1", json_schema_extra=AT_RUN_TIME
-    )
-    max_overlap: float = Field(
-        default=0.6,
-        gt=0.0,
-        lt=1.0,
-        description="boxes of one class that overlap more are one object (IoU)",
-        json_schema_extra=AT_RUN_TIME,
+    classes: tuple[str, ...] = RunTimeField(default=(), description="classes that are detected; empty: all")
+    threshold: float = RunTimeField(default=0.5, gt=0.0, lt=1.0, description="least score, 0..1")
+    max_overlap: float = RunTimeField(
+        default=0.6, gt=0.0, lt=1.0, description="boxes of one class that overlap more are one object (IoU)"
     )
     width: int = Field(
         default=640, ge=32, le=1920, multiple_of=32, description="of the input, where the file leaves it free, pixels"

@@ -24,7 +24,7 @@ class RobotConfig(SelfFilterConfig):
 
 
 class CloudRobotConfig(RobotConfig):
-    """The same for clouds, which are published without delay unless the robot shall be cut out."""
+    """The same for clouds, which are published without delay unless the robot must be cut out."""
 
     enabled: bool = Field(default=False, description="cut the robot and what it holds out of the clouds")
 

@@ -25,7 +25,7 @@ from openarm_common.config import load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.robot.posture import JointNeed, Posture
-from openarm_common.ros.answers import answer
+from openarm_common.ros.answers import answering
 from openarm_common.ros.camera_stream import CameraStream
 from openarm_common.ros.convert import array_to_image, depth_image, intrinsics_from_info, rgb_image
 from openarm_common.ros.detections import detections_to_msg
@@ -92,7 +92,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self._markers = self.create_publisher(MarkerArray, "/detection_markers", reliable(5))
         self.create_timer(0.1, self._follow_demand, clock=self.steady_clock)
         self.diagnose(True, "idle: no subscribers", **self._counts)
-        self.create_service(MeasureTable, "~/measure_table", self._on_measure_table)
+        self.create_service(MeasureTable, "~/measure_table", answering(self._measure_table))
 
     def _make(self, config: DetectNodeConfig, before: Pipeline | None = None) -> Pipeline:
         return make_pipeline(
@@ -205,28 +205,22 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         span = self._began[-1] - self._began[0]
         return f"{(len(self._began) - 1) / span:.1f}" if span > 0.0 else "0"
 
-    def _on_measure_table(
-        self, request: MeasureTable.Request, response: MeasureTable.Response
-    ) -> MeasureTable.Response:
+    def _measure_table(self, request: MeasureTable.Request, response: MeasureTable.Response) -> str:
         self._asked_until = time.monotonic() + 5.0
-
-        def measure() -> str:
-            if self._newest is None or not self.measurable:
-                camera = self.config.camera
-                raise OpenArmError(
-                    Code.NOT_READY, f"no image of {camera} yet; it is subscribed to now: ask again in a second"
-                )
-            table = self._pipeline.measure_table(self._newest, request.block_height, request.label)
-            response.height, response.std, response.tilt = table.height, table.std, table.tilt
-            response.points = table.points
-            before = self._localizer.table_height
-            message = f"the table is {table.height:.4f} m high; the detector took it for {before:.4f} m"
-            if request.apply:
-                self._localizer.table_height = table.height
-                message += ", and takes what was measured now"
-            return message
-
-        return answer(response, measure)
+        if self._newest is None or not self.measurable:
+            camera = self.config.camera
+            raise OpenArmError(
+                Code.NOT_READY, f"no image of {camera} yet; it is subscribed to now: ask again in a second"
+            )
+        table = self._pipeline.measure_table(self._newest, request.block_height, request.label)
+        response.height, response.std, response.tilt = table.height, table.std, table.tilt
+        response.points = table.points
+        before = self._localizer.table_height
+        message = f"the table is {table.height:.4f} m high; the detector took it for {before:.4f} m"
+        if request.apply:
+            self._localizer.table_height = table.height
+            message += ", and takes what was measured now"
+        return message
 
     def _refuse(self, error: OpenArmError) -> None:
         late = error.code in (Code.STALE_DATA, Code.NO_TRANSFORM)
