@@ -16,6 +16,42 @@ from openarm_common.types import Array, Floats
 DepthImage = NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.uint16 | np.float32]
 
 
+def unit_scale(depth: DepthImage) -> float:
+    """Return metres of one count of a depth image.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, when the image is neither 16UC1 nor 32FC1.
+    """
+    if depth.ndim == 2 and depth.dtype == np.uint16:
+        return 1e-3
+    if depth.ndim == 2 and depth.dtype == np.float32:
+        return 1.0
+    raise OpenArmError(
+        Code.BAD_IMAGE,
+        f"depth image has shape {depth.shape} and type {depth.dtype}; expected (h, w) of uint16 millimetres (16UC1) or "
+        "float32 metres (32FC1)",
+    )
+
+
+def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> None:
+    """Refuse an image that does not belong to the intrinsics.
+
+    Args:
+        what: Name of the image.
+        shape: Of the image.
+        intrinsics: Of its CameraInfo.
+
+    Raises:
+        OpenArmError: BAD_IMAGE, naming the image and both sizes.
+    """
+    if shape[:2] != (intrinsics.height, intrinsics.width):
+        raise OpenArmError(
+            Code.BAD_IMAGE,
+            f"{what} is {shape[1]}x{shape[0]} pixels, but its CameraInfo says {intrinsics.width}x{intrinsics.height}; "
+            "both must come from the same stream",
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class DepthView:
     """A depth image and where it was taken.
@@ -40,18 +76,8 @@ class DepthView:
         Raises:
             OpenArmError: BAD_IMAGE, naming what does not.
         """
-        if self.depth.ndim != 2 or self.depth.dtype.name not in ("uint16", "float32"):
-            raise OpenArmError(
-                Code.BAD_IMAGE,
-                f"depth image is {self.depth.dtype} {self.depth.shape}; expected (h, w) of uint16 mm or float32 m",
-            )
-        size = (self.intrinsics.height, self.intrinsics.width)
-        if self.depth.shape != size:
-            raise OpenArmError(
-                Code.BAD_IMAGE,
-                f"depth image is {self.depth.shape[1]}x{self.depth.shape[0]} pixels, but its CameraInfo says"
-                f" {size[1]}x{size[0]}",
-            )
+        unit_scale(self.depth)
+        check_size("depth image", self.depth.shape, self.intrinsics)
         if not (self.intrinsics.fx > 0.0 and self.intrinsics.fy > 0.0):
             raise OpenArmError(
                 Code.BAD_IMAGE, f"focal lengths are {self.intrinsics.fx}, {self.intrinsics.fy}; expected > 0"
@@ -67,4 +93,4 @@ class DepthView:
     @property
     def scale(self) -> np.float32:
         """Metres of one count."""
-        return np.float32(1e-3 if self.depth.dtype == np.uint16 else 1.0)
+        return np.float32(unit_scale(self.depth))

@@ -154,10 +154,7 @@ class Leaves:
             OpenArmError: INVALID_ARGUMENT, when the resolutions differ.
         """
         if abs(lattice.resolution - self.resolution) > 1e-6 * self.resolution:
-            raise OpenArmError(
-                Code.INVALID_ARGUMENT,
-                f"the map has cells of {self.resolution:g} m, expected {lattice.resolution:g} m",
-            )
+            raise _invalid(f"the map has cells of {self.resolution:g} m, expected {lattice.resolution:g} m")
         out = np.full(lattice.shape, np.nan, np.float32)
         outside = kernels.paint(self.cells, self.log_odds, np.array(lattice.key_min, np.int64), out)
         return out, outside
@@ -209,10 +206,10 @@ def write_file(path: Path, payload: Payload, resolution: float) -> None:
     """
     suffix = ".bt" if payload.binary else ".ot"
     if path.suffix != suffix:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path.name}: the {suffix[1:]} form needs the suffix {suffix}")
+        raise _invalid(f"{path.name}: the {suffix[1:]} form needs the suffix {suffix}")
     text = f"{_FIRST_LINE[suffix]}\n{_NOTE}\nid {TREE_ID}\nsize {payload.nodes}\nres {resolution:g}\ndata\n"
     if not path.parent.is_dir():
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} can't be written: there is no folder {path.parent}")
+        raise _invalid(f"{path} can't be written: there is no folder {path.parent}")
     write_whole(path, text.encode("ascii") + payload.data.tobytes(), Code.INVALID_ARGUMENT)
 
 
@@ -225,10 +222,10 @@ def read_file(path: Path) -> Leaves:
     try:
         size = path.stat().st_size
         if size > MAX_FILE_BYTES:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} has {size} bytes, expected at most {MAX_FILE_BYTES}")
+            raise _invalid(f"{path} has {size} bytes, expected at most {MAX_FILE_BYTES}")
         content = path.read_bytes()
     except OSError as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} can't be read: {error}") from error
+        raise _invalid(f"{path} can't be read: {error}") from error
     try:
         return _parse(content)
     except OpenArmError as error:
@@ -240,20 +237,17 @@ def _parse(content: bytes) -> Leaves:
     lines = head.decode("ascii", errors="replace").splitlines() if found else []
     forms = [suffix for suffix, first in _FIRST_LINE.items() if lines and lines[0].startswith(first)]
     if not forms:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT,
-            f"not an octree file: expected it to begin with {' or '.join(repr(v) for v in _FIRST_LINE.values())}"
-            " and to have a line 'data'",
-        )
+        first = " or ".join(map(repr, _FIRST_LINE.values()))
+        raise _invalid(f"not an octree file: expected it to begin with {first} and to have a line 'data'")
     fields = dict(line.split(None, 1) for line in lines if re.fullmatch(r"[a-z]+\s+\S.*", line))
     if fields.get("id") != TREE_ID:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"tree is of class {fields.get('id')!r}, expected {TREE_ID!r}")
+        raise _invalid(f"tree is of class {fields.get('id')!r}, expected {TREE_ID!r}")
     try:
         resolution, nodes = float(fields["res"]), int(fields["size"])
     except (KeyError, ValueError) as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"header needs numbers 'size' and 'res': {error}") from error
+        raise _invalid(f"header needs numbers 'size' and 'res': {error}") from error
     if not 1e-4 <= resolution <= 100.0:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"res is {resolution} m, expected 0.0001 .. 100")
+        raise _invalid(f"res is {resolution} m, expected 0.0001 .. 100")
     leaves = decode(data, resolution, binary=forms[0] == ".bt")
     if leaves.nodes != nodes:
         raise _damaged(f"has {leaves.nodes} nodes, its header says {nodes}")
@@ -261,4 +255,8 @@ def _parse(content: bytes) -> Leaves:
 
 
 def _damaged(what: str) -> OpenArmError:
-    return OpenArmError(Code.INVALID_ARGUMENT, f"octree is damaged: it {what}")
+    return _invalid(f"octree is damaged: it {what}")
+
+
+def _invalid(message: str) -> OpenArmError:
+    return OpenArmError(Code.INVALID_ARGUMENT, message)

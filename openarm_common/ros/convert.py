@@ -125,17 +125,14 @@ def image_to_array(message: Image) -> NDArray[np.generic]:
         OpenArmError: BAD_IMAGE, when the encoding is unknown or the data do not have the size that the header says.
     """
     if message.encoding not in ENCODINGS:
-        raise OpenArmError(
-            Code.BAD_IMAGE, f"image encoding {message.encoding!r} is not supported; valid: {', '.join(ENCODINGS)}"
-        )
+        raise _bad_image(f"image encoding {message.encoding!r} is not supported; valid: {', '.join(ENCODINGS)}")
     dtype, channels = ENCODINGS[message.encoding]
     size = np.dtype(dtype).itemsize
     row = message.width * channels * size
     if message.height == 0 or row == 0 or message.step < row or len(message.data) != message.step * message.height:
-        raise OpenArmError(
-            Code.BAD_IMAGE,
+        raise _bad_image(
             f"image {message.width}×{message.height} {message.encoding} has step {message.step} and {len(message.data)}"
-            f" bytes, expected step >= {row} and step × height bytes",
+            f" bytes, expected step >= {row} and step × height bytes"
         )
     rows = np.frombuffer(message.data, dtype=np.uint8).reshape(message.height, message.step)[:, :row]
     if size > 1 and bool(message.is_bigendian) != (sys.byteorder == "big"):
@@ -143,6 +140,10 @@ def image_to_array(message: Image) -> NDArray[np.generic]:
     pixels = (rows if rows.flags.c_contiguous else np.ascontiguousarray(rows)).view(dtype)
     shape = (message.height, message.width, channels) if channels > 1 else (message.height, message.width)
     return pixels.reshape(shape)
+
+
+def _bad_image(message: str) -> OpenArmError:
+    return OpenArmError(Code.BAD_IMAGE, message)
 
 
 def array_to_image(pixels: NDArray[np.generic], encoding: str, frame_id: str, t_ns: int) -> Image:
@@ -159,9 +160,7 @@ def array_to_image(pixels: NDArray[np.generic], encoding: str, frame_id: str, t_
     """
     dtype, channels = ENCODINGS[encoding]
     if pixels.dtype != dtype or (pixels.shape[2] if pixels.ndim == 3 else 1) != channels:
-        raise OpenArmError(
-            Code.BAD_IMAGE, f"{encoding} needs {channels} × {dtype.__name__}, got {pixels.dtype} {pixels.shape}"
-        )
+        raise _bad_image(f"{encoding} needs {channels} × {dtype.__name__}, got {pixels.dtype} {pixels.shape}")
     height, width = pixels.shape[:2]
     message = Image(header=header(frame_id, t_ns), height=height, width=width, encoding=encoding)
     message.is_bigendian = int(sys.byteorder == "big")
@@ -186,7 +185,7 @@ def rgb_image(message: Image) -> Bytes:
     """
     pixels = cast("NDArray[np.uint8]", image_to_array(message))
     if message.encoding not in ("rgb8", "bgr8"):
-        raise OpenArmError(Code.BAD_IMAGE, f"colour image is {message.encoding!r}; valid: rgb8, bgr8")
+        raise _bad_image(f"colour image is {message.encoding!r}; valid: rgb8, bgr8")
     return pixels if message.encoding == "rgb8" else np.ascontiguousarray(pixels[..., ::-1])
 
 
@@ -197,7 +196,7 @@ def depth_image(message: Image) -> NDArray[np.uint16] | Floats:
         OpenArmError: BAD_IMAGE, for another encoding, or from `image_to_array`.
     """
     if message.encoding not in ("16UC1", "32FC1"):
-        raise OpenArmError(Code.BAD_IMAGE, f"depth encoding {message.encoding!r} is not supported; valid: 16UC1, 32FC1")
+        raise _bad_image(f"depth encoding {message.encoding!r} is not supported; valid: 16UC1, 32FC1")
     return cast("NDArray[np.uint16]", image_to_array(message))
 
 
@@ -207,17 +206,11 @@ def intrinsics_from_info(info: CameraInfo) -> Intrinsics:
     Raises:
         OpenArmError: BAD_IMAGE, when the camera is not calibrated (K is zero) or has distortion that is not removed.
     """
-    k = info.k
+    k, name = info.k, f"camera_info of {info.header.frame_id!r}"
     if not (k[0] > 0.0 and k[4] > 0.0 and info.width > 0 and info.height > 0):
-        raise OpenArmError(
-            Code.BAD_IMAGE,
-            f"camera_info of {info.header.frame_id!r} is not calibrated: fx={k[0]}, fy={k[4]}, expected > 0",
-        )
+        raise _bad_image(f"{name} is not calibrated: fx={k[0]}, fy={k[4]}, expected > 0")
     if any(d != 0.0 for d in info.d):
-        raise OpenArmError(
-            Code.BAD_IMAGE,
-            f"camera_info of {info.header.frame_id!r} has distortion {list(info.d)}; rectify the image first",
-        )
+        raise _bad_image(f"{name} has distortion {list(info.d)}; rectify the image first")
     return Intrinsics(info.width, info.height, k[0], k[4], k[2], k[5])
 
 

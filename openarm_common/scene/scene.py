@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
@@ -231,8 +231,7 @@ def parse_scene(data: Mapping[str, Any], where: str) -> Scene:
         depth = _overlap(a, b, scene.table)
         if depth > _TOUCH:
             faults.append(f"{_place(a)} and {_place(b)} overlap by {depth * 1e3:.1f} mm; move one of them")
-    if faults:
-        raise OpenArmError(Code.SCENE_INVALID, "; ".join(f"{where}: {fault}" for fault in faults))
+    _refuse(faults, where)
     return scene
 
 
@@ -248,10 +247,13 @@ def parse_object(data: Mapping[str, Any], table: Table, where: str) -> SceneObje
         OpenArmError: SCENE_INVALID, naming each wrong key, or that it is not on the table.
     """
     item = validate(SceneObject, dict(data), where, Code.SCENE_INVALID)
-    faults = _off_table(item, table)
+    _refuse(_off_table(item, table), where)
+    return item
+
+
+def _refuse(faults: Sequence[str], where: str) -> None:
     if faults:
         raise OpenArmError(Code.SCENE_INVALID, "; ".join(f"{where}: {fault}" for fault in faults))
-    return item
 
 
 def load_scene(source: str | Path, seed: int = 0) -> Scene:

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.depth_view import DepthImage, check_size, unit_scale
 from openarm_common.errors import Code, OpenArmError
 from openarm_perception.detection.detector import ColorDetector, Detection2D, Detector, Image, Mask, Policy, rank
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer, LocatedObject
 from openarm_perception.detection.network import NetworkConfig, NetworkDetector
-from openarm_perception.geometry.depth import DepthImage, View, check_size, unit_scale
+from openarm_perception.geometry.depth import View
 from openarm_perception.geometry.table import TableMeasurement, measure_table, of_block
 
 

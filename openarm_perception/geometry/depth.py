@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from openarm_common.camera.cameras import Intrinsics
-from openarm_common.camera.depth_view import DepthImage
+from openarm_common.camera.depth_view import DepthImage, check_size, unit_scale
 from openarm_common.config import Config
-from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array, Bytes, Mask
 
 Points = NDArray[np.float32]
@@ -76,42 +75,6 @@ def _filter(
                 out[n, 1] = ray_y[v] * z
                 out[n, 2] = z
                 n += 1
-
-
-def unit_scale(depth: DepthImage) -> float:
-    """Return metres of one count of a depth image.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, when the image is neither 16UC1 nor 32FC1.
-    """
-    if depth.ndim == 2 and depth.dtype == np.uint16:
-        return 1e-3
-    if depth.ndim == 2 and depth.dtype == np.float32:
-        return 1.0
-    raise OpenArmError(
-        Code.BAD_IMAGE,
-        f"depth image has shape {depth.shape} and type {depth.dtype}; expected (h, w) of uint16 millimetres (16UC1) or "
-        "float32 metres (32FC1)",
-    )
-
-
-def check_size(what: str, shape: tuple[int, ...], intrinsics: Intrinsics) -> None:
-    """Refuse an image that does not belong to the intrinsics.
-
-    Args:
-        what: Name of the image.
-        shape: Of the image.
-        intrinsics: Of its CameraInfo.
-
-    Raises:
-        OpenArmError: BAD_IMAGE, naming the image and both sizes.
-    """
-    if shape[:2] != (intrinsics.height, intrinsics.width):
-        raise OpenArmError(
-            Code.BAD_IMAGE,
-            f"{what} is {shape[1]}x{shape[0]} pixels, but its CameraInfo says {intrinsics.width}x{intrinsics.height}; "
-            "both must come from the same stream",
-        )
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 from scipy.spatial import KDTree
 
+from openarm_common.camera.depth_view import DepthImage, unit_scale
 from openarm_common.camera.flying_pixels import label_lonely
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Ints
-from openarm_perception.geometry.depth import DepthImage, Points, unit_scale
+from openarm_perception.geometry.depth import Points
 
 #: Cells along an axis that a packed key distinguishes, half of them on each side of zero.
 _HALF = 1 << 20

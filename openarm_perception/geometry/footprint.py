@@ -119,18 +119,16 @@ def _fit_rectangle(outline: Array, spacing: float) -> tuple[Footprint | str, flo
     half = np.array([width, height]) * 0.5e-3
     yaw = math.radians(angle_deg)
     sides: list[Array] = []
-    names = ("first", "second")
     for step in range(6):
         local = _to_local(outline, centre, yaw)
         # one stray point stretches the first rectangle, so the first assignment is generous and the later ones are not
         sides = _assign(local, half, spacing, 0.3 * float(half.min()) * 0.5**step)
-        for axis, name in enumerate(names):
-            for sign in (0, 1):
-                side = sides[2 * axis + sign]
-                # the direction comes from all sides, so a short piece is enough to locate its side
-                if len(side) < 6:
-                    text = f"an edge across the {name} axis of the outline is in view at {len(side)} points only"
-                    return text + "; something hides the object", _rectangle_rms(local, half)
+        for index, side in enumerate(sides):
+            # the direction comes from all sides, so a short piece is enough to locate its side
+            if len(side) < 6:
+                text = f"an edge across the {('first', 'second')[index // 2]} axis of the outline is in view at"
+                text += f" {len(side)} points only; something hides the object"
+                return text, _rectangle_rms(local, half)
         # one direction for all four sides in closed form: turn two of them by a right angle and add the scatter
         scatter = np.zeros((2, 2))
         for index, side in enumerate(sides):

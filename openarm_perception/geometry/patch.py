@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.camera.depth_view import check_size, unit_scale
 from openarm_common.types import Array
 from openarm_perception.detection.detector import Detection2D, Mask
-from openarm_perception.geometry.depth import DepthLimits, View, check_size, unit_scale
+from openarm_perception.geometry.depth import DepthLimits, View
 
 #: Depth with less noise than this is used as it is, m; 16UC1 alone rounds by 0.3 mm (1 sigma).
 _CLEAN = 0.0006
