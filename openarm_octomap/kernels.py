@@ -282,6 +282,19 @@ def cell_distance(x: Whole, y: Whole, z: Whole, key_min: Ints, resolution: float
     )
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _first_step(
+    index: Whole, first: Whole, origin: np.float32, direction: np.float32, resolution: float
+) -> tuple[int, float, float]:
+    """Return the step of a ray along an axis, where on the ray the first border is, and how far apart borders are."""
+    step = 1 if direction > 0 else (-1 if direction < 0 else 0)
+    if step == 0:
+        return step, _HUGE, _HUGE
+    border = (np.float64(index + first - KEY_ZERO) + 0.5) * resolution
+    border += np.float64(np.float32(step * resolution * 0.5))
+    return step, (border - np.float64(origin)) / np.float64(direction), resolution / abs(np.float64(direction))
+
+
 @njit(cache=True, nogil=True)
 def walk_rays(
     ends: NDArray[np.int32], count: int, resolution: float, key_min: Ints, origin: Floats, max_range: float,
@@ -343,25 +356,9 @@ def walk_rays(
         d0 /= length32
         d1 /= length32
         d2 /= length32
-        sx = 1 if d0 > 0 else (-1 if d0 < 0 else 0)
-        sy = 1 if d1 > 0 else (-1 if d1 < 0 else 0)
-        sz = 1 if d2 > 0 else (-1 if d2 < 0 else 0)
-        tx, ty, tz, ax, ay, az = _HUGE, _HUGE, _HUGE, _HUGE, _HUGE, _HUGE
-        if sx != 0:
-            border = (np.float64(gx + key_min[0] - KEY_ZERO) + 0.5) * resolution
-            border += np.float64(np.float32(sx * resolution * 0.5))
-            tx = (border - np.float64(o0)) / np.float64(d0)
-            ax = resolution / abs(np.float64(d0))
-        if sy != 0:
-            border = (np.float64(gy + key_min[1] - KEY_ZERO) + 0.5) * resolution
-            border += np.float64(np.float32(sy * resolution * 0.5))
-            ty = (border - np.float64(o1)) / np.float64(d1)
-            ay = resolution / abs(np.float64(d1))
-        if sz != 0:
-            border = (np.float64(gz + key_min[2] - KEY_ZERO) + 0.5) * resolution
-            border += np.float64(np.float32(sz * resolution * 0.5))
-            tz = (border - np.float64(o2)) / np.float64(d2)
-            az = resolution / abs(np.float64(d2))
+        sx, tx, ax = _first_step(gx, key_min[0], o0, d0, resolution)
+        sy, ty, ay = _first_step(gy, key_min[1], o1, d1, resolution)
+        sz, tz, az = _first_step(gz, key_min[2], o2, d2, resolution)
         left = abs(qx - gx) + abs(qy - gy) + abs(qz - gz)
         done = False
         if not begins_inside:

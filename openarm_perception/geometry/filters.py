@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field
 from scipy.spatial import KDTree
 
 from openarm_common.camera.depth_view import DepthImage, unit_scale
@@ -33,7 +33,7 @@ _SAME_SURFACE = 3
 class FilterConfig(Config):
     """Which filters a cloud goes through, in this order; all are off by default."""
 
-    median: int = Field(default=0, description="median of the depth image over so many pixels a side: 0 (off), 3 or 5")
+    median: Literal[0, 3, 5] = Field(default=0, description="median of the depth over so many pixels a side; 0 off")
     flying: float = Field(
         default=0.0, ge=0.0, le=0.5, description="a pixel this far from its neighbours is dropped, m/m; 0 off"
     )
@@ -48,13 +48,6 @@ class FilterConfig(Config):
     outliers_by: Literal["scipy", "open3d"] = Field(
         default="scipy", description="whose search finds outliers, by the same rule; open3d where it is installed"
     )
-
-    @field_validator("median")
-    @classmethod
-    def _odd(cls, value: int) -> int:
-        if value not in (0, 3, 5):
-            raise ValueError("expected 0, 3 or 5")
-        return value
 
 
 def median_depth(depth: DepthImage, size: int) -> DepthImage:
