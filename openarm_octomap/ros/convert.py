@@ -75,7 +75,6 @@ def markers_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> Marke
         t_ns: Stamp.
     """
     marker = Marker(header=header(BASE_FRAME, t_ns), ns="occupied", type=Marker.CUBE_LIST, action=Marker.ADD)
-    marker.pose.orientation.w = 1.0
     marker.scale.x = marker.scale.y = marker.scale.z = lattice.resolution
     centres = lattice.centres(np.argwhere(states == OCCUPIED))
     height = np.clip((centres[:, 2] - lattice.lower[2]) / (lattice.upper[2] - lattice.lower[2]), 0.0, 1.0)
@@ -106,6 +105,5 @@ def projected_msg(lattice: Lattice, states: NDArray[np.uint8], t_ns: int) -> Occ
     message.info.width, message.info.height = lattice.shape[0], lattice.shape[1]
     x, y, z = lattice.lower.tolist()
     message.info.origin = Pose(position=Point(x=x, y=y, z=z))
-    message.info.origin.orientation.w = 1.0
     message.data = array.array("b", np.ascontiguousarray(cells.T).tobytes())  # rows run along x
     return message

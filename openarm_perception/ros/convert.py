@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from geometry_msgs.msg import Pose
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 from std_msgs.msg import ColorRGBA
@@ -77,7 +76,6 @@ def markers(located: Sequence[LocatedObject], frame_id: str, t_ns: int) -> Marke
         text = Marker(header=header(frame_id, t_ns), ns="labels", id=i, lifetime=lifetime)
         text.type = Marker.TEXT_VIEW_FACING
         text.text = f"{detection.label} {detection.score:.2f}"
-        text.pose = Pose()
         text.pose.position.x, text.pose.position.y = body.pose.position.x, body.pose.position.y
         text.pose.position.z = body.pose.position.z + detection.size[2] / 2.0 + 0.03
         text.scale.z = 0.025

@@ -147,5 +147,5 @@ def test_all_filters_together() -> None:
     points = cloud_filter.points(deproject.valid_points(cloud_filter.depth(step()), K))
     assert 2000 < len(points) < 160 * 120
     assert not ((points[:, 2] > 0.65) & (points[:, 2] < 0.95)).any()
-    with pytest.raises(ValueError, match="expected 0, 3 or 5"):
+    with pytest.raises(ValueError, match="should be 0, 3 or 5"):
         FilterConfig(median=4)
