@@ -106,7 +106,7 @@ def parse_urdf(text: str) -> tuple[str, dict[str, Link], dict[str, Joint]]:
     colors = {m.get("name", ""): _rgba(m) for m in root.findall("material")}
     links = by_name("link", ((attribute(element, "name"), _link(element, colors)) for element in root.findall("link")))
     shapes = [shape for tag in _SHAPE_TAGS for shape in root.findall(f"link/{tag}")]
-    by_name("visual or collision", ((shape.get("name"), shape) for shape in shapes if "name" in shape.attrib))
+    by_name("visual or collision", ((attribute(shape, "name"), shape) for shape in shapes if "name" in shape.attrib))
     joints = by_name("joint", ((attribute(element, "name"), _joint(element)) for element in root.findall("joint")))
     for joint in joints.values():
         for role, name in (("parent", joint.parent), ("child", joint.child)):
