@@ -21,10 +21,10 @@ from typing import Any
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.campaign import cluster, report
-from openarm_evaluation.campaign.one_task import run_one
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.tasks.suites import make_task
+from openarm_evaluation.campaign.trial import run_one
 from openarm_evaluation.judging import provenance
 
 ROWS = "rows.jsonl"

@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_evaluation.campaign.one_task import run_one
+from openarm_evaluation.campaign.mounts import with_mounts
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.tasks.suites import make_task
+from openarm_evaluation.campaign.trial import run_one
 from openarm_evaluation.judging import provenance
 
 Files = dict[str, bytes]
@@ -132,8 +133,6 @@ def _prepare_mounts(options: CampaignOptions, seeds: Sequence[int], folder: Path
     """Calibrate here what is missing, once, instead of on every machine."""
     if not options.mount_seeds:
         return
-    from openarm_evaluation.campaign.mounts import with_mounts
-
     first = {options.mount_seeds[seed % len(options.mount_seeds)]: seed for seed in seeds}
     for seed in first.values():
         with_mounts(make_task(options.set_name, seed), options.mount_seeds, folder / "mounts")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The grasp's link to the robot in this process: the motion service and the controllers are called, time is ticks."""
+"""The robot of the grasp in this process: motion service and controllers are called directly, time is ticks."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import RobotDescription
-from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.types import Array
 from openarm_evaluation.campaign.robot import PLANNING_S, SimRobot
 from openarm_grasp.config import GraspConfig
@@ -38,7 +36,7 @@ T = TypeVar("T")
 AnswerT = TypeVar("AnswerT", bound=MotionAnswer)
 
 
-class DirectLink:
+class InProcessRobot:
     """Implements `openarm_grasp.robot.interface.RobotInterface`.
 
     Args:
@@ -48,25 +46,27 @@ class DirectLink:
 
     def __init__(self, robot: SimRobot, config: GraspConfig) -> None:
         self.robot = robot
+        self.description, self.states = robot.description, robot.states
+        self.base_frame = robot.description.root
+        self.together = robot.together
         self._config = config
-        self.warnings: list[str] = []
         self.cancelled = ""
         self.deadline_ns = 0
-        #: Longest start delay of a motion next to the other arm, s; 0: both never move at once.
+        #: Longest start delay of a motion until the other arm leaves clearance, s; 0: the arms never move at once.
         self.max_start_delay = 0.0
         #: So many plans fail, by fault injection.
         self.plans_to_fail = 0
         #: Called after each tick; what it raises ends what is waited for.
         self.watch: Callable[[], None] = lambda: None
 
-    def beside(self, max_start_delay: float) -> DirectLink:
-        """Return another link to the same robot, for an arm that moves while another does."""
-        link = copy(self)
-        link.max_start_delay = max_start_delay
-        return link
+    def next_to_other(self) -> InProcessRobot:
+        """The same for an arm that moves while the other does: its motions may start later, its deadline is its own."""
+        robot = copy(self)
+        robot.max_start_delay = self._config.limits.beside_wait
+        return robot
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """Carry out a coroutine of this link, one tick a turn."""
+        """Carry out a coroutine of this robot, one tick a turn."""
         while True:
             try:
                 work.send(None)
@@ -76,29 +76,9 @@ class DirectLink:
 
     # --- the robot
     @property
-    def description(self) -> RobotDescription:
-        """The robot."""
-        return self.robot.description
-
-    @property
-    def states(self) -> RobotStateBuffer:
-        """Its joint states."""
-        return self.robot.states
-
-    @property
-    def base_frame(self) -> str:
-        """Name of the base frame."""
-        return self.robot.description.root
-
-    @property
     def now_ns(self) -> int:
         """Stamp of the newest joint state."""
-        return self.robot.states.latest()[0]
-
-    @property
-    def planning_s(self) -> list[float]:
-        """How long plans took, s of wall clock."""
-        return self.robot.planning_s
+        return self.states.latest()[0]
 
     def effort(self, joint: str) -> float:
         """Newest effort of a joint, N or N m."""
@@ -110,7 +90,7 @@ class DirectLink:
         return tuple(float(np.linalg.norm(self.robot.world.pad_wrench(link)[0])) for link in links)
 
     def check(self) -> None:
-        """Raise when the grasp shall not go on: CANCELLED, ROBOT_LOST."""
+        """Raise when the grasp must not go on: CANCELLED, ROBOT_LOST."""
         self.watch()
         if self.cancelled:
             raise OpenArmError(Code.CANCELLED, self.cancelled)
@@ -120,10 +100,9 @@ class DirectLink:
             raise OpenArmError(Code.ROBOT_LOST, f"joint states have been silent for {silent_s:.1f} s")
 
     def warn(self, text: str) -> None:
-        """Keep a warning for the report."""
-        self.warnings.append(text)
+        """Drop it: a row has no place for warnings."""
 
-    # --- waiting and looking
+    # --- waiting and observing
     async def until(
         self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
     ) -> None:
@@ -137,10 +116,6 @@ class DirectLink:
                 raise OpenArmError(Code.TIMEOUT, f"{what}: not done within {limit:g} s")
             await self.robot.pause()
 
-    async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
-        """Carry out several things at once."""
-        await self.robot.together(parts)
-
     async def observe(self, count: int, *, near: bool = False) -> Frames:
         """Frames that are taken from now on.
 
@@ -149,7 +124,7 @@ class DirectLink:
         """
         since_ns, robot = self.now_ns, self.robot
         config = self._config
-        robot.look(config.near.camera if near else config.camera)
+        robot.observe(config.near.camera if near else config.camera)
         robot.frames.clear()
         limit = config.near.timeout if near else config.detect.frame_timeout
 
@@ -157,7 +132,7 @@ class DirectLink:
             return [frame for frame in robot.frames if frame.t_ns >= since_ns]
 
         try:
-            await self.until(lambda: len(fresh()) >= count, limit, "looking")
+            await self.until(lambda: len(fresh()) >= count, limit, "observing")
         except OpenArmError as error:
             if error.code is not Code.TIMEOUT:
                 raise
@@ -167,7 +142,7 @@ class DirectLink:
 
     def stop_observing(self) -> None:
         """Nothing is detected for now."""
-        self.robot.look("")
+        self.robot.observe("")
 
     # --- planning
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:

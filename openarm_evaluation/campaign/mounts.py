@@ -33,7 +33,7 @@ from openarm_common.types import Array
 from openarm_evaluation.campaign.robot import shared_renderer
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_sim_bridge.world.model import build_spec
-from openarm_sim_bridge.world.world import Snapshot
+from openarm_sim_bridge.world.world import Snapshot, start_qpos
 
 HAND = "openarm_right_link7"
 #: The board between the fingers, for a fixed camera; and lying on the table, for one on the hand.
@@ -166,7 +166,6 @@ class Bench:
         return {**self._home, **dict(zip(self.samples.joint_names, q.tolist(), strict=True))}
 
     def _free(self, joints: dict[str, float]) -> bool:
-        for name, value in joints.items():
-            self._data.qpos[self._model.joint(name).qposadr[0]] = value
+        self._data.qpos[:] = start_qpos(self._model, joints)
         mujoco.mj_forward(self._model, self._data)
         return self._data.ncon == 0

@@ -61,14 +61,9 @@ class Keeper:
             grid = OccupancyGrid(GridConfig())
             grid.integrate([self._scan], 0)
             write_file(folder / "map.bt", grid.binary(), grid.lattice.resolution)
-        trace = list(self._robot.trace)
-        np.savez_compressed(
-            folder / "joints.npz",
-            joint_names=np.array(self._robot.world.joint_names),
-            t_ns=np.array([t for t, _, _ in trace]),
-            position=np.array([q for _, q, _ in trace]),
-            effort=np.array([e for _, _, e in trace]),
-        )
+        t_ns, position, effort = map(np.array, zip(*self._robot.trace, strict=True))
+        names = np.array(self._robot.world.joint_names)
+        np.savez_compressed(folder / "joints.npz", joint_names=names, t_ns=t_ns, position=position, effort=effort)
         (folder / "row.json").write_text(json.dumps({**row, "transitions": list(steps)}, indent=1), encoding="utf-8")
         truth = "; ".join(row["reasons"]) or "as asked"
         text = f"{row['outcome']}: {row['code']}: {row['message']}\nground truth: {truth}\nagain: {row['again']}\n"

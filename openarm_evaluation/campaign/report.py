@@ -14,7 +14,7 @@ from openarm_evaluation.judging.statistics import interval, rate_of, spread
 
 Row = Mapping[str, Any]
 
-_COLUMNS = (
+_COLUMNS: Sequence[str] = (
     "set", "seed", "kind", "scene_hash", "objects", "targets", "outcome", "as_expected", "code", "arm", "attempts",
     "place_error_mm", "sim_s", "wall_s", "message", "again",
 )  # fmt: skip
@@ -51,7 +51,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "attempts": dict(sorted(Counter(int(row["attempts"]) for row in placed).items())),
         "causes": dict(Counter(_cause(row) for row in failed).most_common()),
         "kinds": _kinds(rows),
-        "arms": _arms(grasps),
+        "arms": {arm: rate_of(g["placed"] for g in grasps if g["arm"] == arm) for arm in ("left", "right")},
         "place_error_mm": spread(grasp["place_error_mm"] for grasp in done),
         "cycle_s": spread(grasp["sim_s"] for grasp in done),
         "state_s": _states(done),
@@ -79,10 +79,6 @@ def _kinds(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def _arms(grasps: Sequence[Row]) -> dict[str, Any]:
-    return {arm: rate_of(g["placed"] for g in grasps if g["arm"] == arm) for arm in ("left", "right")}
-
-
 def _states(grasps: Sequence[Row]) -> dict[str, float]:
     """Mean time a placed object spent in each state, s."""
     total: dict[str, float] = defaultdict(float)
@@ -95,9 +91,9 @@ def _states(grasps: Sequence[Row]) -> dict[str, float]:
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Write one line a scene."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(_COLUMNS)
-        writer.writerows([row.get(key, "") for key in _COLUMNS] for row in rows)
+        writer = csv.DictWriter(file, _COLUMNS, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def figures(data: Mapping[str, Any]) -> list[tuple[str, str]]:

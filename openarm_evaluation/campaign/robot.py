@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Generator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from types import coroutine
 from typing import TypeVar
 
 import numpy as np
@@ -79,11 +80,10 @@ class SimulatedSenses(Config):
         return (noise, *(f"{node}.detector={self.detector}" for node in ("detector", "wrist_detector")), *self.sets)
 
 
-class _Turn:
-    """Awaited by coroutines of this process: gives one control tick."""
-
-    def __await__(self) -> Generator[None, None, None]:
-        yield
+@coroutine
+def _turn() -> Generator[None, None, None]:
+    """Give one control tick; for coroutines of this process."""
+    yield
 
 
 class SimRobot:
@@ -120,33 +120,31 @@ class SimRobot:
         self.world = self.simulated.world
         self.world_faults = self.simulated.faults
         self._rng = np.random.default_rng([seed, 77])
-        self._drawing = SimulatedCameras(
-            shared_renderer, self.cameras, bridge.depth_noise, bridge.colour_noise, self._rng
-        )
+        noise = (bridge.depth_noise, bridge.colour_noise)
+        self._drawing = SimulatedCameras(shared_renderer, self.cameras, *noise, self._rng)
         self.camera_faults = self._drawing.faults
         self.states = RobotStateBuffer(self.description)
         self.efforts: dict[str, float] = {}
         self.tracks: dict[str, list[Sample]] = {item.name: [] for item in scene.objects}
         self.trace: deque[tuple[int, Array, Array]] = deque(maxlen=int(_TRACE_S * 1e9) // self.world.period_ns)
         self.images: dict[str, tuple[int, NDArray[np.uint8], DepthImage]] = {}
-        #: Share of the frames in which the detector misses an object, on purpose.
+        #: Share of the frames in which the detector misses an object: an injected fault.
         self.missed = 0.0
         self._mounts = dict(mounts or {})
         self._arriving: deque[tuple[int, Frame]] = deque()
         self.frames: deque[Frame] = deque(maxlen=64)
         #: What the hands hold, as the planner believes; the detector takes it for a part of the robot.
         self.held: tuple[HeldBox, ...] = ()
-        self._looking = ""
+        self._observing = ""
         self._detected_ns = -(10**12)
         self._table_z = scene.table.top_z
-        self._told_ns = 0
+        self._published_ns = 0
         #: How long plans took, s of wall clock.
         self.planning_s: list[float] = []
         self.map = SimulatedMap(self.description, suite.octomap)
         self._controllers = {arm: _ArmController(self, arm) for arm in self.simulated.controller.arms}
         arms = arms_behind(self._sets, scene.table)
-        frames = (self.description.root,)
-        self.motion = MotionService(self, suite.motion, arms, self.map, frames)
+        self.motion = MotionService(self, suite.motion, arms, self.map, (self.description.root,))
         self.motion.on_held = self._take_held
         self._note()
 
@@ -178,7 +176,7 @@ class SimRobot:
         if self.world_faults.publishes_joints(state.t_ns):
             self.states.add_joint_state(state.t_ns, self.world.joint_names, state.position.tolist())
             self.efforts = dict(zip(self.world.joint_names, state.effort.tolist(), strict=True))
-            self._told_ns = state.t_ns
+            self._published_ns = state.t_ns
         if state.t_ns % _TRUTH_NS == 0:
             for readout in self.world.objects():
                 q = se3.quat_xyzw_from_matrix(readout.T_world_object[:3, :3])
@@ -187,8 +185,8 @@ class SimRobot:
 
     # --- what the motion service asks (openarm_motion.service.robot.RobotInterface)
     def state_age(self) -> float:
-        """How long no joint state has come, s."""
-        return (self.t_ns - self._told_ns) * 1e-9
+        """Time since the newest joint state, s."""
+        return (self.t_ns - self._published_ns) * 1e-9
 
     def now(self) -> float:
         """Simulated time, s."""
@@ -200,13 +198,13 @@ class SimRobot:
 
     async def pause(self) -> None:
         """Let one control tick pass."""
-        await _Turn()
+        await _turn()
 
     async def wait(self, seconds: float) -> None:
         """Let simulated time pass."""
         end_ns = self.t_ns + round(seconds * 1e9)
         while self.t_ns < end_ns:
-            await _Turn()
+            await _turn()
 
     async def compute(self, work: Callable[[], T], nominal: float = PLANNING_S) -> T:
         """Run work now; a constant time passes for the robot."""
@@ -232,7 +230,7 @@ class SimRobot:
                     left.remove(work)
                     faults.append(error)
             if left:
-                await _Turn()
+                await _turn()
         if faults:
             raise faults[0]
 
@@ -252,11 +250,11 @@ class SimRobot:
         else:
             self.world_faults.inject(fault, self.world)
 
-    # --- seeing
-    def look(self, camera: str) -> None:
+    # --- perception
+    def observe(self, camera: str) -> None:
         """Begin to detect in the images of a camera, or stop with ""; what was seen before is forgotten."""
-        if camera != self._looking:
-            self._looking = camera
+        if camera != self._observing:
+            self._observing = camera
             self._arriving.clear()
         if not camera:
             self.frames.clear()
@@ -267,16 +265,15 @@ class SimRobot:
             self.map.update(self.t_ns, [scan for scan in scans if scan is not None], self.held)
         while self._arriving and self._arriving[0][0] <= self.t_ns:
             self.frames.append(self._arriving.popleft()[1])
-        if not self._looking:
-            return
-        if self.t_ns - self._detected_ns < 0.999e9 / self.suite.detectors[self._looking].max_rate:
+        camera = self._observing
+        if not camera or self.t_ns - self._detected_ns < 0.999e9 / self.suite.detectors[camera].max_rate:
             return
         self._detected_ns = self.t_ns
-        if self.camera_faults.drops(self._looking):
+        if self.camera_faults.drops(camera):
             return
-        frame = self.detect(self._looking)
+        frame = self.detect(camera)
         if frame is not None:
-            late = self._latency_s + self.camera_faults.delay_s(self._looking)
+            late = self._latency_s + self.camera_faults.delay_s(camera)
             self._arriving.append((self.t_ns + round(late * 1e9), frame))
 
     def detect(self, name: str) -> Frame | None:
@@ -299,7 +296,7 @@ class SimRobot:
     def _scan(self, name: str) -> MapFrame | None:
         """What the map takes of a camera now; None when the frame is lost or its posture is not known."""
         camera = self.cameras[name]
-        # of the frames since the last update the newest counts: all of them must be lost
+        # The newest frame since the last update counts: all of them must be lost.
         if all(self.camera_faults.drops(name) for _ in range(_FRAMES)):
             return None
         stamp_ns = self.camera_faults.stamp_ns(name, self.t_ns)

@@ -18,8 +18,12 @@ from openarm_common.robot.description import Side
 from openarm_common.types import Array
 from openarm_evaluation.campaign import record
 from openarm_evaluation.campaign.arm_clearance import LEAST_CLEARANCE, watch_clearance
-from openarm_evaluation.campaign.link import DirectLink
+from openarm_evaluation.campaign.link import InProcessRobot
+from openarm_evaluation.campaign.mounts import with_mounts
+from openarm_evaluation.campaign.options import CampaignOptions, Row
+from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
+from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import MISSES, PLAN_FAILS, Task
 from openarm_evaluation.judging.judge import RULES, at_rest, end_of, judge
 from openarm_evaluation.judging.provenance import scene_hash
@@ -39,7 +43,7 @@ from openarm_sim_bridge.faults.faults import checked_fault
 
 _SETTLE_S = 0.5
 _REST_LIMIT_S = 5.0
-#: Directions that a push tries before something stands in its way on every side.
+#: Directions that a push tries before it counts as blocked on every side.
 _DIRECTIONS = 12
 
 
@@ -70,13 +74,13 @@ class Trials:
         self.robot = SimRobot(
             task.scene, senses, mount_seed=task.mount_seed, mounts=mounts, seed=task.seed, posture=task.posture
         )
-        self.link = DirectLink(self.robot, config)
+        self.link = InProcessRobot(self.robot, config)
         self.skills = Skills(self.link, config)
         self.session = GraspSession(GraspContext.of(config, task.scene.table, self.robot.description))
         self.steps: list[Step] = []
         self._keep = record.Keeper(self.robot, folder) if folder is not None else None
         self._faulty = False
-        self._stands: tuple[float, ...] = ()
+        self._placed_at: tuple[float, ...] = ()
 
     def run(self) -> dict[str, Any]:
         """Carry out the task and return its row."""
@@ -90,7 +94,7 @@ class Trials:
         row["again"] = self._again
         if clearance is not None:
             add_clearance(row, clearance.least, (self.robot.t_ns - began_ns) * 1e-9)
-        row["planning_ms_median"] = round(1e3 * float(np.median(self.link.planning_s or [math.nan])), 1)
+        row["planning_ms_median"] = round(1e3 * float(np.median(self.robot.planning_s or [math.nan])), 1)
         if self._keep is not None and not row["as_expected"]:
             self._keep.write(row, [step.__dict__ for step in self.steps])
         return row
@@ -103,7 +107,7 @@ class Trials:
         order, placed, open_ = Order(labels, each=Counter(labels)), list[Trial](), dict[str, Trial]()
         while ask := order.next():
             trial = self._grasp(ask)
-            order.done(ask, Code(trial.answer.code), trial.answer.message, self._stands)
+            order.done(ask, Code(trial.answer.code), trial.answer.message, self._placed_at)
             if trial.answer.success:
                 placed.append(trial)
                 continue
@@ -127,7 +131,7 @@ class Trials:
             result = error
         wall_s = time.monotonic() - began
         outcome = result if isinstance(result, GraspOutcome) else GraspOutcome(result.code, result.message, ask.label)
-        self._stands = outcome.place_position
+        self._placed_at = outcome.place_position
         return self._trial(outcome, self.steps[first:], wall_s)
 
     def _both(self) -> list[Trial]:
@@ -140,7 +144,7 @@ class Trials:
             self._report(status)
             steps[status.request].append(self.steps[-1])
 
-        robots: dict[Side, RobotInterface] = {arm: self.link.beside(self._config.limits.beside_wait) for arm in ARMS}
+        robots: dict[Side, RobotInterface] = {arm: self.link.next_to_other() for arm in ARMS}
         requests = (GraspRequest(task.labels[0]), GraspRequest(task.labels[1]))
         pair = Pair(self.session, self.skills, robots, requests, report, carry_out)
         robot.pass_time(0.1)
@@ -158,15 +162,8 @@ class Trials:
 
     # --- while it runs
     def _report(self, status: Status) -> None:
-        step = Step(
-            self.robot.t_ns,
-            status.state.value,
-            status.previous.value,
-            status.reason,
-            status.attempt,
-            status.label,
-            status.arm,
-        )
+        entered = (status.state.value, status.previous.value, status.reason, status.attempt)
+        step = Step(self.robot.t_ns, *entered, status.label, status.arm)
         self.steps.append(step)
         if self._keep is not None:
             self._keep.step(step.state, failed=status.failed)
@@ -198,7 +195,7 @@ class Trials:
             except OpenArmError as error:
                 if error.code is not Code.SCENE_INVALID:
                     raise
-        # Something stands on every side: it is not pushed, and the task is a nominal one.
+        # Blocked on every side: it is not pushed, and the task is a nominal one.
 
     # --- after it
     def _trial(self, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
@@ -222,6 +219,26 @@ class Trials:
             ends = [end_of(self.robot.tracks[name]) for name in names]
             if self.robot.t_ns > least_ns and all(at_rest(sample) for end in ends for sample in end):
                 return
+
+
+def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
+    """Run one task in this process and return its row, whatever happens."""
+    task = make_task(options.set_name, seed)
+    mounts: Mapping[str, Array] = {}
+    try:
+        if options.mount_seeds:
+            task, mounts = with_mounts(task, options.mount_seeds, folder / "mounts")
+        trials = Trials(
+            task,
+            SimulatedSenses(depth_noise=options.noise, detector=options.detector, sets=options.graph_parameters()),
+            suite_config(options.graph_parameters()).grasp,
+            mounts=mounts,
+            folder=folder / "failures" / str(seed),
+            again=options.command(seed),
+        )
+        return trials.run()
+    except Exception as error:  # one task must not end a campaign of a thousand; its row says what happened
+        return {**crashed_row(task, error), "again": options.command(seed)}
 
 
 def row_of(task: Task, trials: list[Trial], wall_s: float) -> dict[str, Any]:

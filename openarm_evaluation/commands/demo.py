@@ -79,7 +79,8 @@ def _outcome(result: DemoResult, seeds: tuple[int, ...], accept: float) -> Outco
 
     rows: list[dict[str, Any]] = [trial.as_row() for trial in result.trials]
     summary = summarise(rows)
-    where = _short(result.run_dir)
+    here, folder = Path.cwd(), result.run_dir
+    where = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
     data: dict[str, Any] = {
         "run_dir": str(result.run_dir),
         "summary": summary,
@@ -131,10 +132,3 @@ def _campaign_outcome(
     )
     success = summary["n"] > 0 and summary["success"] >= accept * summary["n"] and summary["false_success"] == 0
     return Outcome(success, message, Code.OK if success else Code.PLACE_FAILED, data, "\n".join(lines))
-
-
-def _short(path: Path) -> str:
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import cast
@@ -22,6 +21,7 @@ from pydantic import Field
 from openarm_bringup.view.wire import jpeg
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import write_whole
 from openarm_common.scene.scene import SHAPES
 from openarm_evaluation.detector.scene import RandomViews
 from openarm_evaluation.detector.yolo_text import read_labels, write_classes, write_labels
@@ -64,17 +64,16 @@ def make_data(folder: Path, config: DataConfig, progress: Callable[[str, int], N
     try:
         for index, (name, count) in enumerate(config.counts().items()):
             images, labels = folder / "images" / name, folder / "labels" / name
-            images.mkdir(parents=True, exist_ok=True)
-            labels.mkdir(parents=True, exist_ok=True)
             for number in range(count):
                 image, label = images / f"{number:06}.jpg", labels / f"{number:06}.txt"
                 if not (image.is_file() and label.is_file()):
+                    # a picture of a run that was stopped must not count as done: files are written whole
                     views = views or RandomViews()
                     # the set is part of the seed: no picture of one set can be one of another
                     picture = views.draw(np.random.default_rng([config.seed, index, number]))
-                    _write(image, jpeg(picture.rgb, _QUALITY))
+                    write_whole(image, jpeg(picture.rgb, _QUALITY))
                     height, width = picture.rgb.shape[:2]
-                    _write(label, write_labels(picture.classes, picture.boxes, width, height).encode())
+                    write_whole(label, write_labels(picture.classes, picture.boxes, width, height).encode())
                     made[name] += 1
                 if progress is not None:
                     progress(name, number)
@@ -113,7 +112,6 @@ def digest(folder: Path, name: str) -> str:
 
 
 def _claim(folder: Path, seed: int) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "seed.json"
     mine = {"seed": seed, "version": _VERSION}
     if path.is_file():
@@ -125,7 +123,7 @@ def _claim(folder: Path, seed: int) -> None:
                 f" seed {seed} (format {_VERSION}); take another folder, or remove that one",
             )
     else:
-        _write(path, json.dumps(mine).encode())
+        write_whole(path, json.dumps(mine).encode())
 
 
 def _summarise(folder: Path, config: DataConfig) -> None:
@@ -139,11 +137,4 @@ def _summarise(folder: Path, config: DataConfig) -> None:
             "objects": {SHAPES[k]: kinds.count(k) for k in range(len(SHAPES))},
             "labels_sha256": digest(folder, name),
         }
-    _write(folder / "summary.json", json.dumps({"seed": config.seed, "sets": sets}, indent=1).encode())
-
-
-def _write(path: Path, data: bytes) -> None:
-    """Whole or not at all: a picture of a run that was stopped must not count as done."""
-    part = path.with_name(f".{path.name}.{os.getpid()}")
-    part.write_bytes(data)
-    part.replace(path)
+    write_whole(folder / "summary.json", json.dumps({"seed": config.seed, "sets": sets}, indent=1).encode())

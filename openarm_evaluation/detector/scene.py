@@ -24,6 +24,7 @@ from openarm_common.types import Array
 from openarm_evaluation.detector.appearance import colour, draw_shape, pattern, sensor, surface
 from openarm_sim_bridge.cameras.renderer import create_gl_context
 from openarm_sim_bridge.world.model import build_spec
+from openarm_sim_bridge.world.world import start_qpos
 
 Rng = np.random.Generator
 
@@ -36,7 +37,6 @@ _SHEETS, _BARS, _TEXTURES = 3, 3, 9
 #: An object is labelled when this share of its silhouette and this many pixels are visible.
 _SEEN, _PIXELS = 0.35, 150
 _AWAY = (0.0, 0.0, -8.0)
-_NAMES = {"box": "box_{}", "cylinder": "cylinder_{}", "sphere": "sphere_{}"}
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class RandomViews:
     def _compile(self) -> mujoco.MjModel:
         objects = [
             SceneObject(
-                name=_NAMES[kind].format(i),
+                name=f"{kind}_{i}",
                 label=f"{kind}{i}",
                 shape=kind,
                 size=(0.05, 0.05, 0.05),
@@ -172,20 +172,12 @@ class RandomViews:
         description = self._description
         joints: dict[str, float] = {}
         for side in SIDES:
-            names = description.arm_joints(side)
             observes = camera == "wrist" and side == "right"
             state = description.group_state(f"{side}_arm", "wrist_look" if observes else "home")
-            if observes:
-                joints |= {name: state[name] + float(rng.normal(0.0, 0.10)) for name in names}
-            elif rng.random() < 0.55:
-                joints |= {name: state[name] + float(rng.normal(0.0, 0.05)) for name in names}
-            else:
-                joints |= {name: state[name] + float(rng.normal(0.0, 0.5)) for name in names}
+            spread = 0.10 if observes else 0.05 if rng.random() < 0.55 else 0.5
+            joints |= {name: state[name] + float(rng.normal(0.0, spread)) for name in description.arm_joints(side)}
             joints[description.finger_joint(side)] = float(rng.uniform(0.0, 0.044))
-        for name, joint in description.joints.items():
-            leader = joint.mimic or name
-            if leader in joints:
-                self._data.qpos[self._model.joint(name).qposadr[0]] = joints[leader]
+        self._data.qpos[:] = start_qpos(self._model, joints)
 
     def _mount(self, rng: Rng, camera: CameraConfig) -> None:
         """The nominal mount, off by up to a few centimetres and degrees."""
@@ -233,7 +225,7 @@ class RandomViews:
         model, data = self._model, self._data
         for kind, count in _SLOTS.items():
             for i in range(count):
-                start = model.joint(_NAMES[kind].format(i)).qposadr[0]
+                start = model.joint(f"{kind}_{i}").qposadr[0]
                 data.qpos[start : start + 7] = (*_AWAY, 1.0, 0.0, 0.0, 0.0)
         wanted = 0 if rng.random() < EMPTY else int(rng.integers(1, 7))
         used = dict.fromkeys(_SLOTS, 0)
@@ -247,7 +239,7 @@ class RandomViews:
             if spot is None or used[kind] == _SLOTS[kind]:
                 continue
             taken.append((*spot, reach))
-            name = _NAMES[kind].format(used[kind])
+            name = f"{kind}_{used[kind]}"
             used[kind] += 1
             low = surface(kind, half) @ R.T
             position = np.array([*spot, self._table.top_z - low[:, 2].min()])

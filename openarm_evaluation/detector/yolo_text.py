@@ -21,16 +21,10 @@ from openarm_common.types import Array
 
 def write_labels(classes: NDArray[np.int64], boxes: Array, width: int, height: int) -> str:
     """The text of a picture: classes (n,), boxes (n, 4) in pixels; empty for a picture without objects."""
-    lines: list[str] = []
-    for kind, (left, top, right, bottom) in zip(classes, boxes, strict=True):
-        shares = (
-            (left + right) / 2 / width,
-            (top + bottom) / 2 / height,
-            (right - left) / width,
-            (bottom - top) / height,
-        )
-        lines.append(f"{int(kind)} " + " ".join(f"{share:.6f}" for share in shares))
-    return "".join(f"{line}\n" for line in lines)
+    low, high = boxes[:, :2], boxes[:, 2:]
+    shares = np.hstack([(low + high) / 2, high - low]) / (width, height, width, height)
+    rows = zip(classes, shares, strict=True)
+    return "".join(f"{kind} {cx:.6f} {cy:.6f} {w:.6f} {h:.6f}\n" for kind, (cx, cy, w, h) in rows)
 
 
 def read_labels(text: str, width: int, height: int, classes: int, where: str) -> tuple[NDArray[np.int64], Array]:

@@ -15,7 +15,7 @@ from openarm_common.octree.codec import read_file
 from openarm_evaluation.campaign import campaign, link, report, trial
 from openarm_evaluation.campaign.campaign import run_campaign
 from openarm_evaluation.campaign.options import CampaignOptions
-from openarm_evaluation.campaign.progress import Pace
+from openarm_evaluation.campaign.progress import pace
 from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.faults import KINDS
 from openarm_evaluation.campaign.tasks.suites import SUITES, make_task
@@ -98,11 +98,8 @@ def test_resume_runs_only_what_is_missing_and_drops_a_torn_line(tmp_path, monkey
 
 
 def test_the_pace_counts_new_rows_alone() -> None:
-    pace = Pace(100)
-    pace.begin(50.0, 40)
-    assert pace.text(60.0) == ""
-    pace.done = 50
-    assert pace.text(86.0) == "1000 scenes an hour, 0:03:00 left"
+    assert pace(0, 60, 10.0) == ""
+    assert pace(10, 50, 36.0) == "1000 scenes an hour, 0:03:00 left"
 
 
 def test_clutter_is_five_to_eight_objects_each_asked_for() -> None:

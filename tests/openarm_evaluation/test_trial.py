@@ -12,7 +12,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, load_scene
 from openarm_evaluation.judging.judge import Sample, judge
 from openarm_evaluation.judging.provenance import machine, scene_hash, versions
-from openarm_evaluation.judging.statistics import summarise, wilson_low
+from openarm_evaluation.judging.statistics import interval, summarise
 from openarm_evaluation.judging.trial import Step, Trial, choose_target, shows
 from openarm_grasp.ros.client import GraspResult
 
@@ -87,7 +87,7 @@ def test_outcomes_and_their_sum() -> None:
 
 @pytest.mark.parametrize(("k", "n", "low"), [(20, 20, 0.839), (18, 20, 0.699), (0, 20, 0.0), (99, 100, 0.946)])
 def test_wilson_bound_equals_published_values(k: int, n: int, low: float) -> None:
-    assert wilson_low(k, n) == pytest.approx(low, abs=1e-3)
+    assert interval(k, n)["low"] == pytest.approx(low, abs=1e-3)
 
 
 def test_report_says_with_what_and_on_what_it_ran() -> None:
