@@ -97,6 +97,9 @@ class BaseNode(Node, Generic[ConfigT]):
         OpenArmError: CONFIG_INVALID, naming each wrong parameter.
     """
 
+    #: Between two messages on /diagnostics, s of wall clock.
+    REPORT_PERIOD_S = 1.0
+
     def __init__(self, name: str, model: type[ConfigT], **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -108,7 +111,7 @@ class BaseNode(Node, Generic[ConfigT]):
             level=DiagnosticStatus.STALE, name=f"{self.get_name()}: status", hardware_id="openarm"
         )
         self.__diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
-        self.create_timer(1.0, self.__publish_diagnostics, clock=self.steady_clock)
+        self.create_timer(self.REPORT_PERIOD_S, self.__publish_diagnostics, clock=self.steady_clock)
 
     @property
     def default_callback_group(self) -> CallbackGroup:

@@ -64,7 +64,7 @@ class MotionNode(BaseNode[MotionConfig]):
         self.create_service(ComputeIK, "/motion/compute_ik", self._on_ik)
         self.create_service(ApplyScene, "/motion/apply_scene", self._on_apply)
         self.create_service(GetScene, "/motion/get_scene", self._on_get)
-        self.create_timer(1.0, self._report, clock=self.steady_clock)
+        self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
         for arm in arms.values():
             self.get_logger().info(f"{arm.name} arm: {', '.join(arm.names)}; inverse kinematics: {arm.inverse.method}")
 

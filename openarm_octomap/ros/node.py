@@ -59,7 +59,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         MapServices(self, self._mapper, config.coarse_depths, lambda: self._t_ns, self._show)
         self._timer = self.create_timer(config.period, self._on_timer, clock=self.steady_clock)
         self._timer.cancel()
-        self.create_timer(1.0, self._report, clock=self.steady_clock)
+        self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
         if config.map_file:
             self._show()
         if config.autostart:

@@ -13,6 +13,14 @@ import pytest
 SIDE = "right"
 
 
+@pytest.fixture(autouse=True)
+def frequent_reports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes report on /diagnostics ten times a second, so that no test waits for the next report."""
+    from openarm_common.ros.node import BaseNode
+
+    monkeypatch.setattr(BaseNode, "REPORT_PERIOD_S", 0.1)
+
+
 class Bench:
     """A bridge, and what has been heard from it. Joint values of the right arm, rad."""
 

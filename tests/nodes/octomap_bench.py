@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bench for the node `octomap`: a camera that sees flat sheets, and somebody who looks at the map."""
+"""Bench for the node `octomap`: a camera that sees flat sheets, and a subscriber to the map."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def sheet(z: float, hole: tuple[float, float, float] | None = None) -> np.ndarra
 
 
 class Bench:
-    """A camera, joint states, and somebody who looks at the map."""
+    """A camera, joint states, and a subscriber to the map."""
 
     def __init__(self, ros, tmp_path: Path, **params) -> None:
         self.ros = ros

@@ -20,7 +20,7 @@ if __name__ == "__main__":
     last = node.create_publisher(String, "/stream_last", QOS_COMMAND)  # met last, and that is acknowledged
     deadline = time.monotonic() + 30.0
     while not all(stream.get_subscription_count() for stream in (*streams, last)):
-        assert time.monotonic() < deadline, "nobody subscribes"
+        assert time.monotonic() < deadline, "no subscriber"
         rclpy.spin_once(node, timeout_sec=0.05)
     last.publish(String())
     print("met" if last.wait_for_all_acked(Duration(seconds=10)) else "not met", flush=True)  # noqa: T201

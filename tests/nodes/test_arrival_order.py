@@ -37,7 +37,7 @@ class Arm(Bench):
         self.image = sheet(tool[2, 3])
 
     def state_at(self, offset_ms: int, q: float) -> None:
-        """A joint state beside the stamp of the image."""
+        """A joint state next to the stamp of the image."""
         position = [q if name == "openarm_left_joint1" else 0.0 for name in JOINTS]
         state = JointState(name=list(JOINTS), position=position)
         state.header.stamp = ns_to_stamp(self.t_ns + offset_ms * MS)

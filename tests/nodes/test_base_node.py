@@ -152,7 +152,7 @@ def test_a_signal_lets_the_node_bring_to_rest_what_it_moves_while_the_graph_is_t
         assert (process.returncode, out) == (0, "held True\nclosed\n")
 
 
-def test_an_end_that_takes_too_long_is_told_where_it_stands_by_a_second_signal() -> None:
+def test_an_end_that_takes_too_long_is_located_by_a_second_signal() -> None:
     hangs = "print('closing', flush=True); import threading; threading.Event().wait()"
     script = _SCRIPT.replace("super().close()", hangs)
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": os.environ}
@@ -164,8 +164,8 @@ def test_an_end_that_takes_too_long_is_told_where_it_stands_by_a_second_signal()
             process.send_signal(signal.SIGINT)
             assert process.stdout.readline() == "closing\n"
             process.send_signal(signal.SIGTERM)
-            told = iter(process.stderr.readline, "")
-            assert any("in close" in line for line in told)
+            lines = iter(process.stderr.readline, "")
+            assert any("in close" in line for line in lines)
         finally:
             process.kill()
 

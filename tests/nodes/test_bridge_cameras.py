@@ -59,7 +59,7 @@ def test_images_info_and_joint_states_belong_together(seeing) -> None:
     assert (info.k[2], info.k[5]) == (319.5, 239.5)
     assert list(info.k) == list(depth_infos[-1].k)
     # Best effort: a starved probe may miss the info of one image or another, but stamps that are near are equal.
-    images, told, ticks = (
+    images, announced, ticks = (
         np.array([stamp_to_ns(m.header.stamp) for m in got]) for got in (colour + depth, infos, seeing.joints)
     )
     assert np.isin(images, ticks).sum() > 10
@@ -69,7 +69,7 @@ def test_images_info_and_joint_states_belong_together(seeing) -> None:
         20.0,
         "infos with the stamps of images",
     )
-    distance = np.abs(images[:, None] - told).min(axis=1)
+    distance = np.abs(images[:, None] - announced).min(axis=1)
     assert np.all((distance == 0) | (distance >= 30_000_000))
     pixels, z = image_to_array(image), depth_to_metres(depth[-1])
     assert pixels.std() > 10.0
@@ -159,7 +159,7 @@ def test_images_come_again_after_their_process_was_killed(seeing) -> None:
     seeing.ros.spin_until(lambda: states, 20.0, "joint states")
     feed, before = seeing.node._images, seeing.t_ns
     os.kill(feed._process.pid, signal.SIGKILL)
-    seeing.ros.spin_until(lambda: "code -9" in feed.fault, 20.0, "its death to be told")
+    seeing.ros.spin_until(lambda: "code -9" in feed.fault, 20.0, "its death to be reported")
     n = len(images)
     seeing.ros.spin_until(lambda: len(images) > n + 3, 20.0, "images again")
     seeing.ros.spin_until(lambda: feed.fault == "", 20.0, "the fault to be over")

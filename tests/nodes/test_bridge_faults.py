@@ -234,17 +234,17 @@ def test_a_wrong_fault_is_answered_with_what_there_is(bench, fields: dict, parts
     assert not bench.call(ClearFaults, "/sim/clear_faults", name="gremlin").success
 
 
-def test_active_faults_are_told_on_diagnostics(bench) -> None:
+def test_active_faults_are_reported_on_diagnostics(bench) -> None:
     got = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
     bench.inject("gripper_weak")
 
-    def told() -> str:
+    def reported() -> str:
         values = [v for m in got[-1:] for s in m.status for v in s.values if v.key == "faults_active"]
         return values[0].value if values else ""
 
-    bench.ros.spin_until(lambda: told() == "gripper_weak", 20.0, "the fault on /diagnostics")
+    bench.ros.spin_until(lambda: reported() == "gripper_weak", 20.0, "the fault on /diagnostics")
     bench.clear()
-    bench.ros.spin_until(lambda: told() == "", 20.0)
+    bench.ros.spin_until(lambda: reported() == "", 20.0)
 
 
 # --- objects

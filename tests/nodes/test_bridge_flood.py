@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The process of the bridge while somebody floods it: it keeps its rate, or says that it does not."""
+"""The process of the bridge while a client floods it: it keeps its rate, or says that it does not."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ while True:
 
 @pytest.mark.alone
 @pytest.mark.requirement("N-23")
-def test_four_thousand_commands_a_second_leave_the_rate_or_are_told(ros, tmp_path) -> None:
+def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp_path) -> None:
     published: list[int] = []
-    told: list[DiagnosticArray] = []
+    diagnostics: list[DiagnosticArray] = []
     ros.node.create_subscription(
         JointState,
         "/joint_states",
@@ -63,17 +63,17 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_told(ros, tmp_pat
         QOS_COMMAND,
         raw=True,
     )
-    ros.node.create_subscription(DiagnosticArray, "/diagnostics", told.append, QOS_COMMAND)
+    ros.node.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, QOS_COMMAND)
 
     def status() -> dict:
-        if not told:
+        if not diagnostics:
             return {}
-        (last,) = told[-1].status
+        (last,) = diagnostics[-1].status
         return {"message": last.message, "ok": last.level == DiagnosticStatus.OK} | {
             v.key: v.value for v in last.values
         }
 
-    log = (tmp_path / "log").open("w")  # a pipe that nobody empties would hold the bridge up
+    log = (tmp_path / "log").open("w")  # a pipe that is not read would hold the bridge up
 
     def run(*command: str) -> subprocess.Popen:
         return subprocess.Popen([sys.executable, *command], stderr=log, env=os.environ)
@@ -81,14 +81,14 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_told(ros, tmp_pat
     bridge = run("-m", "openarm_sim_bridge.ros.node", "--ros-args", "-p", "scene:=empty", "-p", "images:=false")
     flood: subprocess.Popen | None = None
     try:
-        ros.spin_until(lambda: published and told, 30.0, "the bridge")
+        ros.spin_until(lambda: published and diagnostics, 30.0, "the bridge")
         flood = run("-c", FLOOD, "4000")
         ros.spin_until(lambda: int(status().get("commands_per_s", 0)) > 1000, 20.0, "the flood to be counted")
         published.clear()
         ros.spin_until(lambda: len(published) > 400, 20.0, "four seconds of joint states")
         periods = np.diff(published) * 1e-6
-        reports = len(told)
-        ros.spin_until(lambda: len(told) >= reports + 2, 20.0, "/diagnostics")
+        reports = len(diagnostics)
+        ros.spin_until(lambda: len(diagnostics) >= reports + 2, 20.0, "/diagnostics")
         kept = abs(periods.mean() - 10.0) < 0.2 and np.percentile(periods, 99) <= 15.0
         assert kept or (not status()["ok"] and status()["message"].startswith(("late", "slower"))), status()
         # It still listens to others.

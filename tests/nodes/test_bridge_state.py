@@ -109,7 +109,7 @@ def test_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
 
 
 @pytest.mark.requirement("A-04")
-def test_a_subscriber_that_asks_for_a_deadline_is_told_of_a_gap(bench) -> None:
+def test_a_subscriber_that_asks_for_a_deadline_is_notified_of_a_gap(bench) -> None:
     """Lateness is noticed by the middleware; who asks for no deadline, or for best effort, hears all the same."""
     got: list[JointState] = []
     missed: list[int] = []
@@ -128,7 +128,7 @@ def test_a_subscriber_that_asks_for_a_deadline_is_told_of_a_gap(bench) -> None:
 
 
 @pytest.mark.requirement("A-04")
-def test_a_sensor_can_not_be_had_reliably_and_that_is_told(seeing) -> None:
+def test_a_sensor_can_not_be_had_reliably_and_that_is_reported(seeing) -> None:
     refused: list[QoSPolicyKind] = []
     events = SubscriptionEventCallbacks(incompatible_qos=lambda event: refused.append(event.last_policy_kind))
     seeing.ros.node.create_subscription(
@@ -188,7 +188,7 @@ def test_ground_truth_is_the_only_outlet_of_object_poses(bench) -> None:
     ]
 
 
-def test_diagnostics_tell_how_well_it_keeps_up(seeing) -> None:
+def test_diagnostics_report_how_well_it_keeps_up(seeing) -> None:
     got = seeing.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
 
     def values() -> dict[str, str]:
@@ -207,7 +207,7 @@ def test_diagnostics_tell_how_well_it_keeps_up(seeing) -> None:
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.requirement("P-34")
 def test_a_signal_ends_the_process_in_order(ros, stop: signal.Signals) -> None:
-    """With cameras on and a trajectory under way: no error is told, and the exit code is 0."""
+    """With cameras on and a trajectory under way: no error is logged, and the exit code is 0."""
     joints: list[JointState] = []
     images: list[Image] = []
     ros.node.create_subscription(JointState, "/joint_states", joints.append, QOS_COMMAND)

@@ -56,7 +56,7 @@ def test_probe_sees_topics_services_and_first_messages(ros, probe: ReadinessClie
     until(heard)
 
 
-def test_probe_tells_a_new_server_from_the_one_before(ros, probe: ReadinessClient) -> None:
+def test_probe_distinguishes_a_new_server_from_the_one_before(ros, probe: ReadinessClient) -> None:
     conditions = (Ready(service="/do"),)
     first = ros.add(Node("first"))
     first.create_service(Trigger, "/do", lambda request, response: response)

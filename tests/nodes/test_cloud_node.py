@@ -129,7 +129,7 @@ def test_what_takes_points_away_is_not_organised(ros, params) -> None:
 
 
 @pytest.mark.requirement("A-58")
-def test_images_are_listened_to_only_while_somebody_wants_points(ros) -> None:
+def test_images_are_subscribed_to_only_while_points_have_a_subscriber(ros) -> None:
     """Of that camera alone."""
     bench = Bench(ros)
     wrist = ros.node.create_publisher(Image, "/wrist/depth/image_raw", QOS_SENSOR)

@@ -140,7 +140,7 @@ def test_a_network_that_cannot_be_used_leaves_the_work_to_the_colours(ros, camer
 
 
 @pytest.mark.requirement("N-16")
-def test_what_only_colour_sees_is_told_but_not_given_to_be_grasped(ros, camera, tmp_path) -> None:
+def test_what_only_colour_sees_is_reported_but_not_given_to_be_grasped(ros, camera, tmp_path) -> None:
     """Published as detected but not measured: an obstacle."""
     blind = write_network(tmp_path / "blind.onnx", boxes(), (1, 3, 480, 640))
     bench = Bench(ros, camera=camera, detector="both", **{"network.model": str(blind)})

@@ -66,7 +66,7 @@ def test_without_a_depth_topic_an_object_of_known_height_is_found_by_its_silhoue
 
 @pytest.mark.requirement("B-63")
 def test_the_height_of_the_table_is_measured_from_its_surface_or_a_block_and_applied(ros, bench) -> None:
-    """The detector was told 0.41 m; the camera sees 0.40 m."""
+    """The detector is configured with 0.41 m; the camera sees 0.40 m."""
     camera = FakeCamera(ros)
     camera.publish_mount()
     node = ros.add(DetectNode(parameter_overrides=[Parameter("table_height", value=0.41)], namespace="other"))
@@ -90,7 +90,7 @@ def test_the_height_of_the_table_is_measured_from_its_surface_or_a_block_and_app
     assert surface.tilt < 0.002
     assert surface.std < 0.001
     assert surface.points > 10_000
-    block = ask(block_height=0.048, label="red", apply=True)  # the block is told 2 mm too low
+    block = ask(block_height=0.048, label="red", apply=True)  # the block is given 2 mm too low
     assert block.success, block.message
     assert block.height == pytest.approx(TOP - 0.048, abs=0.0005)
     assert "takes what was measured now" in block.message
@@ -134,7 +134,7 @@ def test_pictures_and_markers_for_people(ros, bench) -> None:
 
 
 @pytest.mark.requirement("B-69")
-def test_images_are_listened_to_only_while_somebody_listens(ros) -> None:
+def test_images_are_subscribed_to_only_while_detections_have_a_subscriber(ros) -> None:
     """No subscription without demand; demand by any output starts it, its end ends it."""
     camera = FakeCamera(ros)
     ros.add(DetectNode())

@@ -108,7 +108,7 @@ def test_a_topic_is_advertised_with_its_definition_and_its_messages_come_byte_fo
         for socket in sockets:
             await socket.close()
 
-    assert publisher.get_subscription_count() == 0  # lazily: nobody has asked yet
+    assert publisher.get_subscription_count() == 0  # lazily: no client has asked yet
     foxglove.run(look)
     ros.spin_until(lambda: publisher.get_subscription_count() == 0, 10.0, "the subscription ends with the clients")
 

@@ -231,7 +231,7 @@ def test_clouds_are_a_second_input(ros, tmp_path) -> None:
     assert bench.state(ABOVE) in ("free", "unknown")
 
 
-def test_pictures_of_the_map_while_somebody_looks(bench) -> None:
+def test_pictures_of_the_map_while_it_has_a_subscriber(bench) -> None:
     """Centres, coloured cubes, the projection, and what changed."""
     got: dict[str, list] = {"c": [], "m": [], "p": [], "d": []}
     node = bench.ros.node

@@ -78,7 +78,7 @@ def test_what_was_recorded_can_be_read(
 
 @pytest.fixture
 def fresh_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A domain in which nobody was killed: Fast DDS would go on with the port that it left, whatever its size."""
+    """A domain in which no process was killed: Fast DDS would go on with the port that it left, whatever its size."""
     domain = reserve_domain()
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
     yield
@@ -112,6 +112,6 @@ def test_what_comes_while_the_recorder_is_held_up_is_not_lost(tmp_path: Path) ->
         finally:
             recorder.kill()
             sender.kill()
-    told = json.loads(out)
+    report = json.loads(out)
     sent = streams.STREAMS * streams.ROUNDS + 2
-    assert (told["messages"], told["lost"]) == (sent, 0), told["message"]
+    assert (report["messages"], report["lost"]) == (sent, 0), report["message"]

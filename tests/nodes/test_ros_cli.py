@@ -29,7 +29,7 @@ from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF
 
 @pytest.fixture
 def heard(ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """A node with one of each kind, spinning beside the test; what is published to it."""
+    """A node with one of each kind, spinning next to the test; what is published to it."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # graphs that run on this machine are not met
     heard: list[str] = []
     node = ros.node
@@ -96,7 +96,7 @@ def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsy
     while len(heard) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)  # the node takes them in a thread of its own
     assert heard == ["hello", "hello"]
-    alone = ros2.pub("/nobody", "std_msgs/msg/String")
+    alone = ros2.pub("/unheard", "std_msgs/msg/String")
     assert (alone.success, alone.code) == (False, Code.NOT_READY)
 
 
@@ -116,7 +116,7 @@ def test_services_and_actions_are_called_and_the_exit_code_follows_the_answer(he
         ros2.call("/pause", "{paused:", "true}")
 
 
-def test_mistakes_are_met_with_what_was_perhaps_meant(heard: list[str]) -> None:
+def test_mistakes_are_met_with_a_suggestion(heard: list[str]) -> None:
     for command, said in (
         (lambda: ros2.echo("/statsu"), "did you mean /status"),
         (lambda: ros2.call("/paus"), "did you mean /pause"),
@@ -133,7 +133,7 @@ def test_mistakes_are_met_with_what_was_perhaps_meant(heard: list[str]) -> None:
         assert said in refused.value.message
 
 
-def test_where_nobody_runs_every_command_says_so(
+def test_without_nodes_every_command_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
@@ -177,7 +177,7 @@ def test_the_tree_of_frames_is_shown_and_drawn(heard: list[str], tmp_path: Path)
         tf.tree(out=tmp_path / "tree.jpg")
 
 
-def test_a_frame_that_two_tell_of_is_named(ros, heard: list[str]) -> None:
+def test_a_frame_with_two_publishers_is_named(ros, heard: list[str]) -> None:
     second = ros.node.create_publisher(TFMessage, "/tf_static", QOS_STATIC_TF)
     edge = TransformStamped(child_frame_id="camera")
     edge.header.frame_id = "world"

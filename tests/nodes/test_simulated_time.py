@@ -31,10 +31,10 @@ def test_a_node_takes_simulated_time(ros, tmp_path, monkeypatch, module: str) ->
     monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path))
     kind = getattr(import_module(module), NODES[module])
     node = ros.add(kind(parameter_overrides=[Parameter("use_sim_time", value=True)]))
-    told: list[int] = []
+    stamps: list[int] = []
     publisher = ros.node.create_publisher(Clock, "/clock", QOS_CLOCK)
     ros.node.create_subscription(
-        DiagnosticArray, "/diagnostics", lambda m: told.append(stamp_to_ns(m.header.stamp)), QOS_COMMAND
+        DiagnosticArray, "/diagnostics", lambda m: stamps.append(stamp_to_ns(m.header.stamp)), QOS_COMMAND
     )
 
     def at_now() -> bool:
@@ -43,13 +43,13 @@ def test_a_node_takes_simulated_time(ros, tmp_path, monkeypatch, module: str) ->
 
     ros.spin_until(at_now, 20.0, "the clock of the node to be /clock")
     # Once a second of the wall clock, though simulated time stands still.
-    ros.spin_until(lambda: told.count(NOW) >= 2, 10.0, "diagnostics with simulated stamps")
+    ros.spin_until(lambda: stamps.count(NOW) >= 2, 10.0, "diagnostics with simulated stamps")
 
 
 @pytest.mark.requirement("P-30")
 def test_the_bridge_stamps_with_the_time_it_makes(bridge) -> None:
     bench = bridge(images=False, use_sim_time=True)
-    told = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
-    bench.ros.spin_until(lambda: len(told) > 1, 10.0, "diagnostics")
-    assert 0 < stamp_to_ns(told[-1].header.stamp) < 60_000_000_000  # seconds since the world began, not since 1970
-    assert abs(stamp_to_ns(told[-1].header.stamp) - bench.t_ns) < 2_000_000_000
+    reports = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    bench.ros.spin_until(lambda: len(reports) > 1, 10.0, "diagnostics")
+    assert 0 < stamp_to_ns(reports[-1].header.stamp) < 60_000_000_000  # seconds since the world began, not since 1970
+    assert abs(stamp_to_ns(reports[-1].header.stamp) - bench.t_ns) < 2_000_000_000

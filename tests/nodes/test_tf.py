@@ -29,7 +29,7 @@ def test_what_comes_while_a_node_is_busy_waits(ros, depth: int, kept: int) -> No
 
     publish(0)
     ros.spin_until(lambda: listener.age_s() < 60.0, what="the first")
-    for number in range(1, 61):  # nobody spins meanwhile
+    for number in range(1, 61):  # without spinning
         publish(number)
     joints.wait_for_all_acked()
     ros.spin_until(lambda: listener.buffer.latest()[0] == 600_000_000, what="the last")

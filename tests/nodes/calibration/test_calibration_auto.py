@@ -69,7 +69,7 @@ class Planner:
 class Bench:
     """Node, robot and planner."""
 
-    def __init__(self, ros, posed_robot, folder: Path, setup: str, *, told: bool, **more) -> None:
+    def __init__(self, ros, posed_robot, folder: Path, setup: str, *, given_pose: bool, **more) -> None:
         self.ros, self.store = ros, CalibrationStore(folder / "store")
         self.camera = "wrist" if setup == "in_hand" else "overhead"
         self.known: Known = make_session(setup, 3, px=1e-9)
@@ -79,7 +79,7 @@ class Bench:
         self.robot.pose(0)
         self.planner = Planner(ros, self.robot)
         given = {"camera": "wrist", "store": str(self.store.folder), "mount_seed": 1, **QUICK, **more}
-        if told:
+        if given_pose:
             Z = self.robot.Z
             key = "auto.on_table." if setup == "in_hand" else "auto.on_hand."
             given |= {
@@ -102,11 +102,11 @@ class Bench:
         return mount_error(pose_to_matrix(result.mount), self.known.X @ se3.inverse(T_LINK_OPTICAL))
 
 
-@pytest.mark.parametrize(("setup", "told"), [("in_hand", True), ("to_hand", False)])
+@pytest.mark.parametrize(("setup", "given_pose"), [("in_hand", True), ("to_hand", False)])
 @pytest.mark.requirement("A-33", "A-34", "A-40", "A-45")
-def test_calibrates_by_itself_and_stores(ros, posed_robot, tmp_path: Path, setup: str, told: bool) -> None:
+def test_calibrates_by_itself_and_stores(ros, posed_robot, tmp_path: Path, setup: str, given_pose: bool) -> None:
     """From a board in view, or from where a ruler says it is; refused poses are passed over; the board is announced."""
-    bench = Bench(ros, posed_robot, tmp_path, setup, told=told)
+    bench = Bench(ros, posed_robot, tmp_path, setup, given_pose=given_pose)
     bench.planner.refuse = lambda k: "IN_COLLISION" if k == 1 else ""
     result = bench.run(poses=7, sigma_translation=1e-9, save=True, session=str(tmp_path / "session.npz"))
     assert result.success, result.message
@@ -118,7 +118,7 @@ def test_calibrates_by_itself_and_stores(ros, posed_robot, tmp_path: Path, setup
     assert len(load_session(tmp_path / "session.npz", bench.known.description)[0]) == 7
     assert json.loads(result.report)["figures"]["samples"] == 7
     # as many motions as poses that were not had where the arm stood, and the one that was refused
-    assert len(bench.planner.goals) == (8 if told else 7)
+    assert len(bench.planner.goals) == (8 if given_pose else 7)
     goal = bench.planner.goals[-1]
     boxes = goal.obstacles if setup == "in_hand" else goal.attached
     assert [box.id for box in boxes] == ["calibration board"]
@@ -137,7 +137,7 @@ def rotations(bench: Bench) -> list[np.ndarray]:
 
 
 def test_ends_when_the_predicted_error_is_small_enough(ros, posed_robot, tmp_path: Path) -> None:
-    bench = Bench(ros, posed_robot, tmp_path, "to_hand", told=False, **{"auto.fewest": 4})
+    bench = Bench(ros, posed_robot, tmp_path, "to_hand", given_pose=False, **{"auto.fewest": 4})
     result = bench.run(poses=12, sigma_translation=0.02, sigma_rotation=0.2)
     assert result.success, result.message
     assert result.samples == 4
@@ -145,7 +145,7 @@ def test_ends_when_the_predicted_error_is_small_enough(ros, posed_robot, tmp_pat
 
 
 def test_cancel_stops_the_motion_and_the_node_is_free_again(ros, posed_robot, tmp_path: Path) -> None:
-    bench = Bench(ros, posed_robot, tmp_path, "to_hand", told=False)
+    bench = Bench(ros, posed_robot, tmp_path, "to_hand", given_pose=False)
     bench.planner.hang = True
     handle, ended = bench.start(poses=6)
     ros.spin_until(lambda: bench.planner.waiting is not None, 20.0, "a motion")
@@ -161,8 +161,8 @@ def test_cancel_stops_the_motion_and_the_node_is_free_again(ros, posed_robot, tm
 
 
 def test_says_why_it_can_not(ros, posed_robot, tmp_path: Path) -> None:
-    """No board in view and nobody told; a camera that there is not; an arm that is lost; nothing but collisions."""
-    bench = Bench(ros, posed_robot, tmp_path, "to_hand", told=False)
+    """No board in view and no pose given; a camera that there is not; an arm that is lost; nothing but collisions."""
+    bench = Bench(ros, posed_robot, tmp_path, "to_hand", given_pose=False)
     bench.robot.blank = True
     result = bench.run(poses=5)
     assert result.code == "NOTHING_DETECTED"

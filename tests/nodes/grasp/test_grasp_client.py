@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The client of the grasp node, in a thread of its own beside the node."""
+"""The client of the grasp node, in a thread of its own next to the node."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def test_the_client_means_an_object_by_its_position_and_leaves_others(bench):
     thread.start()
     bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
     thread.join()
-    meant, left = results
-    assert (meant.success, meant.label) == (True, "blue"), meant.message
+    intended, left = results
+    assert (intended.success, intended.label) == (True, "blue"), intended.message
     assert left.code is Code.UNKNOWN_OBJECT
     assert "shall stay where they are" in left.message
 
@@ -133,7 +133,7 @@ def test_the_client_notices_that_the_node_is_gone(bench):
     assert errors[0].code is Code.NOT_READY
 
 
-def test_the_client_says_when_nobody_answers(ros):
+def test_the_client_says_when_no_server_answers(ros):
     with GraspClient(timeout=0.2) as grasp, pytest.raises(OpenArmError, match="is the graph up") as error:
         grasp.pick("red")
     assert error.value.code is Code.NOT_READY

@@ -42,7 +42,7 @@ def simultaneous(bench) -> tuple[object, Future]:
 
 
 @pytest.mark.requirement("A-65")
-def test_two_objects_are_picked_at_once_each_by_its_arm_and_each_tells_its_states(bench) -> None:
+def test_two_objects_are_picked_at_once_each_by_its_arm_and_each_publishes_its_states(bench) -> None:
     heard: list[PickTwo.Feedback] = []
     wish = goal("red", "blue")
     wish.requests[1].has_place_position = True
@@ -59,8 +59,8 @@ def test_two_objects_are_picked_at_once_each_by_its_arm_and_each_tells_its_state
         assert bench.world.objects[answer.label][:2] == pytest.approx(target, abs=0.005)
     assert (result.results[1].place_position.x, result.results[1].place_position.y) == (0.3, 0.3)
     # both are under way before either has ended, and each motion may rest for the other arm
-    told = [(f.request, f.status.state) for f in heard]
-    assert max(told.index((k, "MOVE_TO_PREGRASP")) for k in (0, 1)) < min(told.index((k, "LIFT")) for k in (0, 1))
+    states = [(f.request, f.status.state) for f in heard]
+    assert max(states.index((k, "MOVE_TO_PREGRASP")) for k in (0, 1)) < min(states.index((k, "LIFT")) for k in (0, 1))
     assert {arm for arm, _, _ in bench.world.asked} == {"left", "right"}
     assert all(wait > 0.0 for _, _, wait in bench.world.asked)
     for k, label in enumerate(("red", "blue")):
@@ -74,7 +74,7 @@ def test_the_newest_status_is_of_the_one_that_is_at_work(bench) -> None:
     bench.world.during = lambda what: held_up if bench.world.asked[-1][0] == "left" else None
     _, result = bench.ros.send_goal(bench.two, goal("red", "blue"))
     bench.until(lambda: any(s.state == "IDLE" and s.label == "red" for s in bench.status), what="red is done")
-    bench.until(lambda: bench.status[-1].label == "blue", what="blue is told again")
+    bench.until(lambda: bench.status[-1].label == "blue", what="blue is published again")
     ended = next(i for i, s in enumerate(bench.status) if (s.state, s.label) == ("IDLE", "red"))
     again = bench.status[ended + 1]
     assert (again.label, again.arm, again.state) == ("blue", "left", "MOVE_TO_PREGRASP")
@@ -220,9 +220,9 @@ def test_openarm_pick_red_blue_picks_both_and_says_so_as_json(bench, tmp_path, c
     thread.start()
     bench.until(lambda: not thread.is_alive(), 60.0, "the command ends")
     thread.join()
-    told = json.loads(report.read_text(encoding="utf-8"))
-    assert (codes, told["success"], told["code"], told["simultaneous"]) == ([0], True, "OK", True), told
-    assert [(a["label"], a["arm"], a["outcome"]) for a in told["answers"]] == [
+    written = json.loads(report.read_text(encoding="utf-8"))
+    assert (codes, written["success"], written["code"], written["simultaneous"]) == ([0], True, "OK", True), written
+    assert [(a["label"], a["arm"], a["outcome"]) for a in written["answers"]] == [
         ("red", "right", "SUCCESS"),
         ("blue", "left", "SUCCESS"),
     ]

@@ -24,7 +24,7 @@ def test_a_plan_of_what_comes_later_names_where_the_object_will_not_stand_any_mo
         PlanPlace("right", (), (), held_box(target, ways[0], config), ignore_regions=(gone,)), 0.0
     )
     for goal in (grasp, place):
-        (told,) = goal.ignore_regions
-        np.testing.assert_allclose(pose_to_matrix(told.pose), gone.T_frame_box)
-        assert (told.size.x, told.size.y, told.size.z) == gone.size
+        (region,) = goal.ignore_regions
+        np.testing.assert_allclose(pose_to_matrix(region.pose), gone.T_frame_box)
+        assert (region.size.x, region.size.y, region.size.z) == gone.size
     assert list(messages.plan_goal(PlanGrasp("right", ways, (), box), 0.0).ignore_regions) == []

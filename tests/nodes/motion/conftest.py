@@ -48,7 +48,7 @@ class FakeRobot:
         self.silent = False
         self.answer: Callable[[FollowJointTrajectory.Result], None] = lambda result: None
         self.stuck: set[str] = set()
-        #: Joints that stay so far beside where they should be, rad.
+        #: Joints that stay this far from where they should be, rad.
         self.sag: dict[str, float] = {}
         self.accept = True
         self.cancelled: list[str] = []

@@ -38,7 +38,7 @@ def asked(bench, work: Callable[[MotionClient], Any]) -> Any:
 
 
 def test_a_program_plans_agrees_and_moves(bench) -> None:
-    told: list[tuple[str, float]] = []
+    stages: list[tuple[str, float]] = []
 
     def work(motion: MotionClient) -> None:
         plan = motion.move_to_named("right", "official_home", scale=1.0, plan_only=True).raise_for_code()
@@ -46,15 +46,15 @@ def test_a_program_plans_agrees_and_moves(bench) -> None:
         assert plan.trajectories[0].q.shape[1] == 7
         assert motion.execute("right", plan).raise_for_code().message == "arrived"
         q = motion.compute_ik("right", se3.make(bench.DOWN, (0.26, -0.24, 0.55)))
-        motion.move_to_joints("right", q, scale=1.0, on_feedback=lambda *stage: told.append(stage)).raise_for_code()
+        motion.move_to_joints("right", q, scale=1.0, on_feedback=lambda *stage: stages.append(stage)).raise_for_code()
         T = se3.make(bench.DOWN, (0.26, -0.24, 0.50))
         motion.move_on_line("right", T, scale=1.0).raise_for_code()
 
     asked(bench, work)
     tip = bench.node.service.arms["right"].kinematics.fk(bench.q("right"))
     np.testing.assert_allclose(tip[:3, 3], (0.26, -0.24, 0.50), atol=2e-3)
-    assert told[0][0] == "planning"
-    assert told[-1][0] == "executing"
+    assert stages[0][0] == "planning"
+    assert stages[-1][0] == "executing"
 
 
 def test_a_program_changes_the_scene_and_reads_why_there_is_no_plan(bench) -> None:

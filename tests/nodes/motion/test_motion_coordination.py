@@ -97,7 +97,7 @@ def test_an_arm_holds_when_the_other_stops_in_its_way(bench) -> None:
     slow, quick = leaving(bench)
     handle, left = bench.start(bench.execute_client, execute("left", slow))
     _, right = bench.start(bench.execute_client, execute("right", quick))
-    bench.ros.spin_until(lambda: "right" in bench.robot.active, 10.0, "the right arm to be told")
+    bench.ros.spin_until(lambda: "right" in bench.robot.active, 10.0, "the right arm to be commanded")
     handle.cancel_goal_async()
     gap = nearest(bench, [left, right])
     assert left.result().result.code == "CANCELLED"
@@ -127,7 +127,7 @@ def approach(arm: str, y: float) -> PlanApproach.Goal:
 
 
 @pytest.mark.requirement("A-68")
-def test_an_approach_is_planned_beside_where_the_other_arm_will_end(bench) -> None:
+def test_an_approach_is_planned_around_where_the_other_arm_will_end(bench) -> None:
     slow, _ = leaving(bench)
     blocked = bench.run(bench.plan_client, approach("right", -0.02))
     assert (blocked.success, blocked.failure.stage) == (False, "goal"), blocked.message

@@ -49,7 +49,7 @@ def test_arms_take_each_others_place_at_once(bench, strategy: int) -> None:
     assert result.clearance >= 0.024
     assert [t.joint_names[0] for t in result.trajectories] == ["openarm_right_joint1", "openarm_left_joint1"]
     assert len(result.start_delays) == 2
-    # both controllers are told the same moment
+    # both controllers are given the same start time
     assert len({stamp_to_ns(t.header.stamp) for t in result.trajectories}) == 1
     tip = bench.node.service.arms["right"].kinematics.fk(bench.q("right"))[:3, 3]
     np.testing.assert_allclose(tip, [0.30, 0.0, 0.62], atol=2e-3)

@@ -161,6 +161,7 @@ def test_the_executor_answers_while_a_plan_is_searched(bench) -> None:
     for name in bench.description.arm_joints("right"):
         bench.robot.state[name] = 0.0
     bench.ros.spin_until(lambda: abs(bench.node.robot.states.latest()[1]["openarm_right_joint2"]) < 1e-9)
+    bench.ros.spin_until(bench.ik_client.service_is_ready, 20.0, "the service")
     future = bench.start(bench.move_client, bench.named("right", "home", plan_only=True))[1]
     begin = time.monotonic()
     answer = bench.ros.call(bench.ik_client, ComputeIK.Request(arm="left", pose=bench.stamped(np.eye(4))))
@@ -243,7 +244,7 @@ class WaitingPlanner:
         self.searching.set()
         deadline = time.monotonic() + 20.0
         while not query.stopped():
-            assert time.monotonic() < deadline, "nobody stopped the search"
+            assert time.monotonic() < deadline, "the search was not stopped"
             threading.Event().wait(0.01)
         raise OpenArmError(Code.CANCELLED, "planning was stopped")
 

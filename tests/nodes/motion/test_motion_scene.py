@@ -58,7 +58,7 @@ def test_bodies_are_in_force_when_the_answer_comes(bench) -> None:
     assert bench.run(bench.move_client, bench.named(plan_only=True)).success
 
 
-def test_every_shape_is_taken_told_again_and_kept_clear_of(bench) -> None:
+def test_every_shape_is_stored_returned_and_kept_clear_of(bench) -> None:
     tip = goal_tip(bench)
     at_table = tip - [0.0, 0.0, 0.40]
     rock = body(bench, "rock", tip, shape="mesh")
@@ -70,10 +70,10 @@ def test_every_shape_is_taken_told_again_and_kept_clear_of(bench) -> None:
     ):
         answer = bench.ros.call(bench.apply_client, ApplyScene.Request(clear=True, add=[message]))
         assert answer.success, answer.message
-        told = bench.ros.call(bench.get_client, GetScene.Request()).objects[-1]
-        assert (told.id, told.shape, told.pose.header.frame_id) == (message.id, message.shape, BASE_FRAME)
-        np.testing.assert_allclose([told.pose.pose.position.z], [tip[2]], atol=1e-9)
-        assert len(told.vertices) == len(message.vertices)
+        stored = bench.ros.call(bench.get_client, GetScene.Request()).objects[-1]
+        assert (stored.id, stored.shape, stored.pose.header.frame_id) == (message.id, message.shape, BASE_FRAME)
+        np.testing.assert_allclose([stored.pose.pose.position.z], [tip[2]], atol=1e-9)
+        assert len(stored.vertices) == len(message.vertices)
         result = bench.run(bench.move_client, bench.named(plan_only=True))
         assert (result.code, result.failure.second) == ("IN_COLLISION", message.id), result.message
 
@@ -181,9 +181,9 @@ def test_the_map_is_in_the_way_unless_something_known_explains_it(make_bench, wr
     # the table's own cells, up to the first above it, are no obstacle of their own
     top = [(x, y, 0.405) for x in np.arange(0.15, 0.8, 0.02) for y in np.arange(-0.5, 0.5, 0.02)]
     write(writer, top)
-    told = bench.ros.call(bench.get_client, GetScene.Request())
-    assert (told.map, told.map_used, told.map_version, told.map_message) == ("optional", True, 2, "")
-    assert 0.0 <= told.map_age < 3.0
+    scene = bench.ros.call(bench.get_client, GetScene.Request())
+    assert (scene.map, scene.map_used, scene.map_version, scene.map_message) == ("optional", True, 2, "")
+    assert 0.0 <= scene.map_age < 3.0
     pose = bench.stamped(se3.make(bench.DOWN, (0.26, -0.24, 0.44)))
     goal = MoveArm.Goal(arm="right", kind=MoveArm.Goal.POSE, pose=pose, velocity_scale=1.0, plan_only=True)
     assert bench.run(bench.move_client, goal).success
@@ -196,7 +196,7 @@ def test_the_map_is_in_the_way_unless_something_known_explains_it(make_bench, wr
     assert (result.code, result.failure.second) == ("IN_COLLISION", "ball"), result.message
 
 
-def test_what_will_be_gone_by_then_is_in_nobodys_way(make_bench, writer) -> None:
+def test_what_will_be_gone_by_then_is_no_obstacle(make_bench, writer) -> None:
     """A place planned ahead of the pick: the map still shows the object where it stands."""
     bench = make_bench()
     stands = se3.make(None, (0.26, -0.24, 0.43))
@@ -226,20 +226,20 @@ def test_a_stale_map_is_refused_where_it_is_required_and_said_where_not(make_ben
     result = bench.run(bench.move_client, bench.named(plan_only=True))
     assert result.code == "STALE_DATA"
     assert "camera 'wrist' last contributed to the map 5.0 s ago, expected at most 2 s" in result.message
-    told = bench.ros.call(bench.get_client, GetScene.Request())
-    assert (told.map, told.map_used) == ("required", False)
-    assert "wrist" in told.map_message
+    scene = bench.ros.call(bench.get_client, GetScene.Request())
+    assert (scene.map, scene.map_used) == ("required", False)
+    assert "wrist" in scene.map_message
     write(writer, [])
     assert bench.run(bench.move_client, bench.named(plan_only=True)).success
 
 
-def test_one_camera_may_be_told_to_matter(make_bench, writer) -> None:
+def test_one_camera_may_be_required(make_bench, writer) -> None:
     bench = make_bench(**parameters(use="required", cameras=["overhead"]))
     write(writer, [], {"wrist": 100.0})
     assert bench.run(bench.move_client, bench.named(plan_only=True)).success
 
 
-def test_an_optional_map_that_is_old_is_left_out_and_told(make_bench, writer) -> None:
+def test_an_optional_map_that_is_old_is_left_out_and_reported(make_bench, writer) -> None:
     bench = make_bench()
     write(writer, [goal_tip(bench)], {"overhead": 60.0})
     result = bench.run(bench.move_client, bench.named(plan_only=True))
