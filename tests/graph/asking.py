@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 class Asked(Generic[T]):
-    """A request in a thread of its own that nobody has to wait for.
+    """A request in a thread of its own that does not block the test.
 
     Args:
         observer: Of the graph; it has heard ground truth.

@@ -33,7 +33,7 @@ class Up:
     output: Path
 
     def openarm(self, *args: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
-        """Run another command of the command line beside it."""
+        """Run another command of the command line next to it."""
         command = [sys.executable, "-m", "openarm_bringup.cli", *args]
         return subprocess.run(
             command, env=self.env, cwd=ROOT, capture_output=True, text=True, timeout=timeout, check=False
@@ -79,14 +79,14 @@ def start_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Starter]:
     """A function that starts a graph, in the domain of another when asked; all are stopped at the end of the module."""
     started: list[Up] = []
 
-    def start(*args: str, beside: Up | None = None) -> Up:
+    def start(*args: str, joining: Up | None = None) -> Up:
         folder = tmp_path_factory.mktemp("graph")
-        domain = beside.domain if beside else reserve_domain()
+        domain = joining.domain if joining else reserve_domain()
         # A-10: without a display, also where the machine has one.
         env = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
         env |= {
             "OPENARM_RUNS": str(folder / "runs"),
-            "XDG_RUNTIME_DIR": beside.env["XDG_RUNTIME_DIR"] if beside else str(folder),
+            "XDG_RUNTIME_DIR": joining.env["XDG_RUNTIME_DIR"] if joining else str(folder),
             "ROS_DOMAIN_ID": str(domain),
             "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH", "")))),
         }

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""B-66: the bring-up in four steps, each a graph of its own; the fourth is test_graph.py."""
+"""B-66: the bring-up in steps, each a graph of its own; the map is test_bringup_map.py, the last is test_graph.py."""
 
 from __future__ import annotations
 
-import json
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import rclpy
 from control_msgs.action import ParallelGripperCommand
@@ -18,17 +16,13 @@ from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import JointState, PointCloud2
+from sensor_msgs.msg import JointState
 from vision_msgs.msg import Detection3DArray
 from visualization_msgs.msg import Marker, MarkerArray
 
-from openarm_bringup.bags.bag import open_bag
-from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.convert import points_from_cloud
 from openarm_common.scene.scene import load_scene
 
-pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.graph, pytest.mark.slow]
 
 
 @contextmanager
@@ -76,11 +70,17 @@ def act(node: Node, executor: SingleThreadedExecutor, kind: Any, name: str, goal
     return result.result().result
 
 
-@pytest.mark.requirement("B-66")
-def test_step_1_robot_alone_tells_its_joints_and_moves_a_gripper(start_graph: Any) -> None:
+@pytest.fixture(scope="module")
+def robot(start_graph: Any) -> Any:
+    """The graph of the robot without anything else, ready."""
     up = start_graph("sim_only")
     up.wait_ready()
-    with user(up.domain) as (node, executor):
+    return up
+
+
+@pytest.mark.requirement("B-66")
+def test_step_1_robot_alone_publishes_its_joints_and_moves_a_gripper(robot: Any) -> None:
+    with user(robot.domain) as (node, executor):
         state = newest(node, executor, JointState, "/joint_states", lambda m: len(m.name) == 16)
         assert "openarm_left_joint1" in state.name
         goal = ParallelGripperCommand.Goal()
@@ -89,7 +89,15 @@ def test_step_1_robot_alone_tells_its_joints_and_moves_a_gripper(start_graph: An
         result = act(node, executor, ParallelGripperCommand, "/left_gripper_controller/gripper_cmd", goal)
         assert result.reached_goal
         assert result.state.position[0] == pytest.approx(0.04, abs=0.002)
-    assert up.stop() == 0
+
+
+@pytest.mark.requirement("P-34")
+def test_a_second_start_in_the_same_domain_works(start_graph: Any, robot: Any) -> None:
+    assert robot.stop(signal.SIGTERM) == 0
+    second = start_graph("sim_only", joining=robot)
+    assert second.domain == robot.domain
+    second.wait_ready()
+    assert second.stop() == 0
 
 
 @pytest.mark.requirement("B-66")
@@ -134,37 +142,3 @@ def test_step_3_an_arm_moves_to_a_posture_without_eyes(start_graph: Any) -> None
         )
         assert home.success, f"{home.code}: {home.message}"
     assert up.stop() == 0
-
-
-@pytest.mark.requirement("A-77", "B-66")
-def test_the_map_shows_the_objects_and_not_the_arms_and_the_step_is_recorded(start_graph: Any, tmp_path: Path) -> None:
-    """The step between eyes and hands, and what a recording of it holds."""
-    up = start_graph("map")
-    up.wait_ready()
-    bag = tmp_path / "step"
-    topics = "/joint_states|/robot_description|/tf_static|/octomap_point_cloud_centers"
-    done = up.openarm("record", str(bag), "--topics", topics, "--duration", "6", "--json")
-    assert done.returncode == 0, done.stdout + done.stderr
-    # P-31: at rest the map lets the cameras rest too
-    topics_of_octomap = json.loads(up.openarm("node", "info", "octomap", "--json").stdout)["subscribes to"]
-    assert "/overhead/depth/image_raw" in topics_of_octomap
-    rests = up.openarm("service", "call", "/octomap/change_state", "{transition: {label: deactivate}}")
-    assert rests.returncode == 0, rests.stdout + rests.stderr
-    topics_of_octomap = json.loads(up.openarm("node", "info", "octomap", "--json").stdout)["subscribes to"]
-    assert not {"/overhead/depth/image_raw", "/wrist/depth/image_raw", "/joint_states"} & set(topics_of_octomap)
-    assert up.stop() == 0
-    told = json.loads(done.stdout)
-    assert told["lost"] == 0
-    assert set(told["topics"]) == set(topics.split("|"))
-    with open_bag(bag) as recorded:
-        newest = {record.topic: record.data for record in recorded.records()}
-    cells = points_from_cloud(deserialize_message(newest["/octomap_point_cloud_centers"], PointCloud2))
-    for item in load_scene("demo").objects:
-        x, y = item.position[:2]
-        beside = np.hypot(cells[:, 0] - x, cells[:, 1] - y) < 0.04
-        assert cells[beside, 2].max() > load_scene("demo").table.top_z + 0.03, item.name
-    state = deserialize_message(newest["/joint_states"], JointState)
-    joints = dict(zip(state.name, state.position, strict=True))
-    for side in ("left", "right"):
-        hand = RobotDescription.load().link_pose(f"openarm_{side}_hand", joints)[:3, 3]
-        assert np.linalg.norm(cells - hand, axis=1).min() > 0.05

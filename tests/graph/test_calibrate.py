@@ -25,8 +25,8 @@ LATE_MS = 20.0
 
 @pytest.mark.requirement("A-33", "A-40", "N-09")
 def test_the_wrist_camera_is_calibrated_and_its_delay_measured(tmp_path: Path, monkeypatch) -> None:
-    """Six poses: 0.3 mm and 0.03° from the true mount; images whose stamps are 20 ms late are told to 1 ms."""
-    for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):  # set anew for the graph, put back afterwards
+    """Six poses: 0.3 mm and 0.03° from the true mount; images whose stamps are 20 ms late are measured to 1 ms."""
+    for name in ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"):  # set again for the graph, restored afterwards
         monkeypatch.setenv(name, os.environ.get(name, ""))
     monkeypatch.setenv("OPENARM_RUNS", str(tmp_path / "runs"))
 

@@ -51,8 +51,8 @@ def test_a_replayed_bag_is_detected_as_the_robot_was(start_graph: Any) -> None:
         assert len(found) >= 5
         expected = golden.read(BAG / "golden.json")
         for axis, values in zip("xy", zip(*found, strict=True), strict=True):
-            told = expected[f"detection/overhead/blue/{axis}_mm"]["value"] * 1e-3
-            assert all(value == pytest.approx(told, abs=0.003) for value in values)
+            recorded = expected[f"detection/overhead/blue/{axis}_mm"]["value"] * 1e-3
+            assert all(value == pytest.approx(recorded, abs=0.003) for value in values)
     finally:
         executor.shutdown()
         node.destroy_node()

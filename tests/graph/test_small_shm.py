@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A container has 64 MB of /dev/shm unless told otherwise: no image may be lost there."""
+"""A container has 64 MB of /dev/shm unless configured otherwise: no image may be lost there."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def can_mount() -> bool:
         return False
 
 
-@pytest.mark.skipif(not can_mount(), reason="this machine lets nobody make a mount namespace")
+@pytest.mark.skipif(not can_mount(), reason="this machine does not permit mount namespaces")
 def test_no_image_is_lost_on_64_mb_of_shared_memory() -> None:
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = in_small_shm(sys.executable, str(Path(__file__).parent / "small_shm.py"), "6")

@@ -27,7 +27,7 @@ def test_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_hold
     eyes = tmp_path / "eyes.yaml"
     eyes.write_text("extends: vision\nname: eyes\nnodes: {detector: {restart: {policy: never}}}\n")
     control = start_graph("control")
-    vision = start_graph(str(eyes), beside=control)
+    vision = start_graph(str(eyes), joining=control)
     control.wait_ready()
     detector = vision.wait_ready()["nodes"]["detector"]["pid"]
     done = control.openarm("pick", "red", "--json", timeout=200.0)

@@ -34,7 +34,7 @@ def test_all_tests_are_shared_out_a_file_each_and_what_is_said_last_holds(
     assert command[command.index("-n") + 1] == "2"
     assert command[command.index("--dist") + 1] == "loadfile"
     assert command[len(command) - len(args) :] == list(args)
-    assert command.index("tests/openarm_common") < command.index("tests/nodes") < command.index("tests/graph")
+    assert command.index("tests/openarm_common") < command.index("tests/graph") < command.index("tests/nodes")
 
 
 @pytest.mark.parametrize(
