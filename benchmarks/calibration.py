@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hand-eye calibration against its Cramér-Rao bound, beside every closed form of OpenCV in the same run.
+"""Hand-eye calibration against its Cramér-Rao bound and every closed form of OpenCV in the same run.
 
     python benchmarks/calibration.py [--quick] [--trials N] [--json PATH]
 

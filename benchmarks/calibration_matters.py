@@ -81,14 +81,14 @@ def compare(scene: str, label: str, seed: int, mounts: Mounts) -> tuple[dict[str
     true = true_mount(camera, seed)
     away = [mount_error(T, true)[0] * 1e3 for T in (camera.T_parent_link, mounts[CAMERAS[0]])]
     print(
-        f"mount seed {seed:2d} {scene:7s}{label:7s} without ({away[0]:5.2f} mm off): {told(nominal):58s}"
-        f" with ({away[1]:.3f} mm off): {told(calibrated)}",
+        f"mount seed {seed:2d} {scene:7s}{label:7s} without ({away[0]:5.2f} mm off): {outcome(nominal):58s}"
+        f" with ({away[1]:.3f} mm off): {outcome(calibrated)}",
         flush=True,
     )
     return nominal, calibrated
 
 
-def told(row: Mapping[str, Any]) -> str:
+def outcome(row: Mapping[str, Any]) -> str:
     """How a grasp went."""
     if row["place_error_mm"] is not None and row["code"] == "OK":
         return f"placed {row['place_error_mm']:.1f} mm off at attempt {row['attempts']}"
@@ -97,7 +97,7 @@ def told(row: Mapping[str, Any]) -> str:
 
 
 def summary(scene: str, pairs: list[tuple[dict[str, Any], dict[str, Any]]]) -> list[Row]:
-    """Shares and errors with calibration, beside those without."""
+    """Shares and errors with calibration and without."""
     n = len(pairs)
 
     def share(side: int, first: bool) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network detector beside OpenCV's network module: how good, how fast.
+"""The network detector compared with OpenCV's network module: how good, how fast.
 
     python benchmarks/detector.py [--quick] [--data FOLDER] [--json PATH]
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the same seed gives the same run, bit by bit, on an idle machine and beside busy processes.
+"""Whether the same seed gives the same run, bit by bit, on an idle machine and next to busy processes.
 
     python -m benchmarks.determinism [--quick] [--runs N] [--set NAME] [--seed S] [--tasks N] [--noise] [--json PATH]
 
-Runs the tasks of a campaign N times in process, each time in a new process, the last time beside one busy process for
+Runs the tasks of a campaign N times in process, each time in a new process, the last time next to one busy process for
 each core. Prints for each run the SHA-256 of all joint positions and efforts at every control tick (exact, not rounded)
 and of the rows of the report (without wall times), and exits with 1 when they differ. It holds for one machine and one
 set of versions. Nodes that meet over DDS never repeat to the last bit, because messages arrive when they arrive.
@@ -123,7 +123,7 @@ def main() -> int:
         with busy((os.cpu_count() or 1) if disturbed else 0):
             run = run_in_new_process(args.suite, seeds, args.noise)
         runs.append(run)
-        print(f"run {k + 1}{' beside busy processes' if disturbed else ''}: {', '.join(run.codes)}")
+        print(f"run {k + 1}{' next to busy processes' if disturbed else ''}: {', '.join(run.codes)}")
         print(f"  joints  {run.motion}")
         print(f"  rows    {run.rows}")
         print(f"  {run.sim_s:.2f} s simulated in {run.wall_s:.1f} s", flush=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the graph keeps real time on two cores, beside a naive single-timer bridge in the same run.
+"""Whether the graph keeps real time on two cores, compared with a naive single-timer bridge in the same run.
 
     python benchmarks/graph_realtime.py [--quick] [--seconds S] [--runs N] [--json PATH]
 
@@ -23,7 +23,7 @@ Budget, in cores, for these rates (a 100 Hz subscription costs an rclpy process 
     cloud                   60 clouds a second of 307,200 points                              0.25
     octomap                 both depth cameras at 2 Hz, self-filter, /joint_states 100 Hz     0.25
     motion                  /joint_states 100 Hz, map                                         0.15
-    detector                idle unless somebody listens to detections                        0.02
+    detector                idle without a subscriber to detections                           0.02
     grasp                   idle unless a grasp runs                                          0.02
     calibration_publisher   latched                                                           0.01
     sum                                                                                       1.40

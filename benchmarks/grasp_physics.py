@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the physics holds what the hand grasps, beside MuJoCo's own settings in the same run.
+"""Whether the physics holds what the hand grasps, compared with MuJoCo's own settings in the same run.
 
     python -m benchmarks.grasp_physics [--quick] [--json PATH]
 
@@ -56,7 +56,7 @@ class Figures:
 
 
 def start(kind: str, seed: int, physics: PhysicsConfig | None) -> Trial:
-    """Set up a trial; a pose that the simple search finds no grasp for is drawn anew."""
+    """Set up a trial; a pose that the simple search finds no grasp for is drawn again."""
     for redraw in range(50):
         item, error = make(kind, seed + 1000 * redraw)
         try:
@@ -121,7 +121,7 @@ def hold(kind: str, seed: int, physics: PhysicsConfig | None, seconds: float) ->
 
 
 def again_and_again(kind: str, seed: int, physics: PhysicsConfig | None, times: int) -> tuple[int, float]:
-    """Pick an object up and put it down, aiming anew each time; how often that went wrong, and its top speed, m/s."""
+    """Pick an object up and put it down, aiming again each time; how often that went wrong, and its top speed, m/s."""
     run = start(kind, seed, physics)
     rng, height, flown, fastest = np.random.default_rng(seed), run.position[2], 0, 0.0
     for _ in range(times):

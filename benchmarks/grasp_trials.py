@@ -2,7 +2,7 @@
 """Physical grasps of one object with the suite's model, in short: what `benchmarks.grasp_physics` and tests run.
 
 Pre-grasp, straight approach, close, lift 12 cm, hold, shake, put back, open, retreat; position targets at 100 Hz. Each
-grasp aims beside the object by an error of pose as a localisation has it. Nothing is welded, and nothing is written to
+grasp aims off the object by an error of pose as a localisation has it. Nothing is welded, and nothing is written to
 `qpos` once a trial runs. World frame (x forward, y left, z up); m, rad, s.
 """
 
@@ -91,7 +91,7 @@ class Grasp:
     width: float
 
     def q(self, back: float = 0.0, up: float = 0.0, sideways: float = 0.0) -> Array:
-        """Joint positions (7,) that far behind, above or beside the grasp, m.
+        """Joint positions (7,) that far behind, above or to the side of the grasp, m.
 
         Raises:
             NoGraspError: Out of reach.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the detector says that objects stand, beside where they stand: both cameras, clean and noisy depth.
+"""Where the detector says that objects are, compared with where they are: both cameras, clean and noisy depth.
 
     python benchmarks/localization.py [--quick] [--poses N] [--first-seed S] [--json PATH]
 

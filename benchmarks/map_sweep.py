@@ -153,7 +153,7 @@ def sweep(seconds: float, seed: int) -> dict[str, float]:
 
 
 async def run(seconds: float, seed: int, *, noise: bool) -> dict[str, float]:
-    """The graph, and the sweep beside it."""
+    """The graph, and the sweep next to it."""
     sets = (f"mujoco_bridge.depth_noise.enabled={str(noise).lower()}",)
     graph = load_graph("sim", overrides={"domain": reserve_domain()}, sets=sets)
     os.environ |= {"ROS_DOMAIN_ID": str(graph.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inverse kinematics beside peers: pinocchio's kinematics with the loop in Python, ikpy and mink. rad, m."""
+"""Inverse kinematics compared with peers: pinocchio's kinematics with the loop in Python, ikpy and mink. rad, m."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def in_cell(arm: Arm, cell: Array, rng: np.random.Generator, collides: Collides,
 
 
 def table_problems(arms: Sequence[Arm], home: Mapping[str, float], count: int, seed: int) -> list[Problem]:
-    """From a random free configuration to one of several beside a box that only the map knows; the arms take turns."""
+    """From a random free configuration to one of several next to a box that only the map knows; the arms take turns."""
     rng = np.random.default_rng(seed)
     out: list[Problem] = []
     while len(out) < count:

@@ -73,7 +73,7 @@ def scene_boxes(arms: Mapping[str, Arm], home: Mapping[str, float], rng: np.rand
 def single(
     arm: Arm, state: dict[str, float], boxes: tuple[Box, ...], rng: np.random.Generator
 ) -> tuple[str, Trajectory]:
-    """One random plan: to joints, to a pose beside a box, or along a line."""
+    """One random plan: to joints, to a pose next to a box, or along a line."""
     now = arm.start_state(state, scale=float(rng.choice([0.3, 0.5, 1.0])))
     around, kind = moves.RequestBoxes(boxes), str(rng.choice(["joints", "joints", "pose", "pose", "line"]))
     if kind == "joints":
@@ -83,7 +83,7 @@ def single(
         collides = arm.scene(state, boxes).collides
         found = around_box(arm, boxes[int(rng.integers(len(boxes)))], rng, collides, 1)
         if not found:
-            raise OpenArmError(Code.UNREACHABLE, "no free pose beside that box")
+            raise OpenArmError(Code.UNREACHABLE, "no free pose next to that box")
         return kind, moves.to_pose(arm, now, arm.kinematics.fk(found[0]), around)
     pose = arm.kinematics.fk(now.start)
     pose[:3, 3] += rng.uniform(-0.15, 0.15, 3)

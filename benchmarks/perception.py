@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth to cloud and to octree, beside the usual ways of doing it on the same images in the same run.
+"""Depth to cloud and to octree, compared with the usual ways of doing it on the same images in the same run.
 
     python benchmarks/perception.py [--quick] [--bindings PYTHON] [--json PATH]
 
@@ -114,7 +114,7 @@ def cloud_rows(frames: Sequence[Frame], repeats: int) -> list[Row]:
 
 
 def octree_rows(pairs: Sequence[Sequence[Frame]], repeats: int, python: str) -> list[Row]:
-    """The octree, exact, beside liboctomap and its bindings on the same points."""
+    """The octree, exact, compared with liboctomap and its bindings on the same points."""
     grid = OccupancyGrid(GridConfig(**THEIRS))
     times: list[float] = []
     for turn in range(max(1, repeats // len(pairs)) + 1):
