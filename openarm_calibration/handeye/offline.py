@@ -24,7 +24,7 @@ from openarm_calibration.handeye.verdict import Limits, Verdict, assess, side_by
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_calibration.store.store import StoredCalibration
 from openarm_common import se3
-from openarm_common.camera.cameras import T_LINK_OPTICAL
+from openarm_common.camera.cameras import T_LINK_OPTICAL, Intrinsics
 from openarm_common.errors import Code, OpenArmError
 
 #: Postures within this of each other have the same error of the robot, rad or m.
@@ -110,12 +110,11 @@ def _with_found_intrinsics(solution: Solution) -> Solution:
     """Return the same answer with the intrinsics that were found in place of those that were stated."""
     estimate, problem = solution.estimate, solution.problem
     found = [
-        replace(stated, fx=stated.fx + float(d[0]), fy=stated.fy + float(d[1]), cx=stated.cx + float(d[2]),
-                cy=stated.cy + float(d[3]))
-        for stated, d in zip(problem.intrinsics, estimate.intrinsics, strict=True)
-    ]  # fmt: skip
+        Intrinsics(k.width, k.height, *row)
+        for k, row in zip(problem.intrinsics, (problem.intrinsics_rows + estimate.intrinsics).tolist(), strict=True)
+    ]
     settled = replace(estimate, intrinsics=np.zeros_like(estimate.intrinsics))
-    return replace(solution, problem=problem.with_intrinsics(found), estimate=settled)
+    return replace(solution, problem=assemble(problem.views, found, list(problem.free)), estimate=settled)
 
 
 def judged(

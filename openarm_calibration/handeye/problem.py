@@ -305,20 +305,20 @@ class Problem:
         """(n,) marks of each view."""
         return np.diff(self.offsets)
 
+    @property
+    def intrinsics_rows(self) -> Array:
+        """(cameras, 4) fx, fy, cx, cy."""
+        return np.array([[k.fx, k.fy, k.cx, k.cy] for k in self.intrinsics])
+
     def camera_rows(self) -> Array:
         """Return (n, 4) fx, fy, cx, cy of each view's camera."""
-        rows = np.array([[k.fx, k.fy, k.cx, k.cy] for k in self.intrinsics])
-        return rows[self.camera]
+        return self.intrinsics_rows[self.camera]
 
     def subset(self, keep: Sequence[int] | Indices | NDArray[np.bool_]) -> Problem:
         """Return the problem with some of its views (indices or a mask); the per-view fits are kept."""
         chosen = np.arange(len(self))[np.asarray(keep)]
         views = tuple(self.views[i] for i in chosen)
         return _pack(views, self.intrinsics, self.free[chosen], self.free_cost[chosen])
-
-    def with_intrinsics(self, intrinsics: Sequence[Intrinsics]) -> Problem:
-        """Return the same views by cameras of other intrinsics."""
-        return assemble(self.views, intrinsics, list(self.free))
 
 
 def assemble(views: Sequence[View], intrinsics: Sequence[Intrinsics], guesses: Sequence[Array]) -> Problem:
@@ -387,22 +387,37 @@ def difference(T_from: Array, T_to: Array) -> Array:
     return np.concatenate([T_to[:3, 3] - T_from[:3, 3], w])
 
 
-def chain(problem: Problem, X: Array, Z: Array, correction: Array) -> tuple[Array, Array]:
+def chain(problem: Problem, X: Array, Z: Array, correction: Array | None = None) -> tuple[Array, Array]:
     """Predict `T_camera_board` and B of each view.
 
     Args:
         problem: The views.
         X: (cameras, 4, 4).
         Z: (boards, 4, 4).
-        correction: (n, 6) of A.
+        correction: (n, 6) of A; None corrects nothing.
 
     Returns:
         (n, 4, 4) T_camera_board and (n, 4, 4) B.
     """
-    A = moved(problem.A, correction)
+    A = problem.A if correction is None else moved(problem.A, correction)
     kind = problem.kind[:, None, None]
     B = np.where(kind == 0, inverses(A), np.where(kind == 1, A, np.eye(4)))
     return inverses(X)[problem.camera] @ B @ Z[problem.board], B
+
+
+def residuals(problem: Problem, X: Array, Z: Array) -> list[Array]:
+    """Return measured minus predicted pixels (marks, 2) of each view; NaN behind the camera.
+
+    Args:
+        problem: The views.
+        X: (cameras, 4, 4).
+        Z: (boards, 4, 4).
+    """
+    T, _ = chain(problem, X, Z)
+    return [
+        view.pixels - project(view.points, view.radius, pose, row)
+        for view, pose, row in zip(problem.views, T, problem.camera_rows(), strict=True)
+    ]
 
 
 def sensitivity(problem: Problem, X: Array, Z: Array, T: Array, B: Array) -> tuple[Array, Array, Array]:
@@ -437,10 +452,26 @@ def sensitivity(problem: Problem, X: Array, Z: Array, T: Array, B: Array) -> tup
     return by_X, by_Z, by_A
 
 
+def layout(problem: Problem, extras: Sequence[Extra]) -> dict[str, slice]:
+    """Return the columns of the unknowns: six for each camera's X, six for each board's Z, the extras in their order.
+
+    Args:
+        problem: The views.
+        extras: More unknowns.
+    """
+    widths = {
+        "X": 6 * problem.cameras, "Z": 6 * problem.boards, "scale": 1, "delay": 1, "intrinsics": 4 * problem.cameras,
+    }  # fmt: skip
+    out: dict[str, slice] = {}
+    end = 0
+    for name in ("X", "Z", *extras):
+        out[name] = slice(end, end + widths[name])
+        end += widths[name]
+    return out
+
+
 def design(problem: Problem, X: Array, Z: Array, T: Array, B: Array, extras: Sequence[Extra]) -> tuple[Array, Array]:
     """Return how the unknowns move each view.
-
-    Columns: six for each camera's X, six for each board's Z, then the extras in their order.
 
     Args:
         problem: The views.
@@ -451,25 +482,21 @@ def design(problem: Problem, X: Array, Z: Array, T: Array, B: Array, extras: Seq
         extras: More unknowns.
 
     Returns:
-        (n, COLUMNS, parameters) and, for the corrections of A, (n, 6, 6).
+        (n, COLUMNS, parameters), with columns as `layout`, and, for the corrections of A, (n, 6, 6).
     """
     by_X, by_Z, by_A = sensitivity(problem, X, Z, T, B)
-    n = len(problem)
-    widths = {"scale": 1, "delay": 1, "intrinsics": 4 * problem.cameras}
-    column = 6 * (problem.cameras + problem.boards)
-    G = np.zeros((n, COLUMNS, column + sum(widths[extra] for extra in extras)))
-    index = np.arange(n)
+    columns = layout(problem, extras)
+    G = np.zeros((len(problem), COLUMNS, max(part.stop for part in columns.values())))
+    index = np.arange(len(problem))
     for k in range(6):
         G[index, :6, 6 * problem.camera + k] = by_X[:, :, k]
         G[index, :6, 6 * (problem.cameras + problem.board) + k] = by_Z[:, :, k]
-    for extra in extras:
-        if extra == "scale":
-            G[:, 6, column] = 1.0
-        elif extra == "delay":
-            # an image that is `delay` old shows A as it was: A(t - delay)
-            G[:, :6, column] = -(by_A @ problem.rate[:, :, None])[:, :, 0]
-        else:
-            for k in range(4):
-                G[index, 7 + k, column + 4 * problem.camera + k] = 1.0
-        column += widths[extra]
+    if "scale" in columns:
+        G[:, 6, columns["scale"]] = 1.0
+    if "delay" in columns:
+        # an image that is `delay` old shows A as it was: A(t - delay)
+        G[:, :6, columns["delay"]] = -(by_A @ problem.rate[:, :, None])
+    if "intrinsics" in columns:
+        for k in range(4):
+            G[index, 7 + k, columns["intrinsics"].start + 4 * problem.camera + k] = 1.0
     return G, by_A

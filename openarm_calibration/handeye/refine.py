@@ -17,14 +17,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from openarm_calibration.handeye.problem import Extra, Problem, chain, design, moved, normal_equations
+from openarm_calibration.handeye.problem import Extra, Problem, chain, design, layout, moved, normal_equations
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 
 #: Below these a robot counts as exact: far less than a mark moves by, and the arithmetic stays well conditioned.
-FLOOR_TRANSLATION = 1e-7  # m
-FLOOR_ROTATION = 1e-7  # rad
+FLOOR = 1e-7  # m, rad
 #: Chance, before anything is seen, that the robot is exact; the factor within which others are like a typical one.
 _EXACT = 0.4
 _FACTOR = 3.0
@@ -171,33 +170,6 @@ def _answers(
         answers[k] = covariances[k] @ np.ascontiguousarray(left[:size, size])
 
 
-def averaged(full: Array, KMK: Array, both: Array, typical: tuple[float, float]) -> Array:
-    """Return the covariance (p, p) about the present answer, averaged over the spreads that the data allow.
-
-    With few poses the spread itself is uncertain, and an answer that takes its best value for true is too sure of
-    itself. The weight is the restricted likelihood times a prior: either the robot is exact, as in a simulation, or
-    its spread is near that of a typical one, with translation and rotation more or less in proportion.
-
-    Args:
-        full: See `criterion`.
-        KMK: See `criterion`.
-        both: See `criterion`.
-        typical: Spread of a typical robot, m and rad.
-    """
-    level, balance = (grid.ravel() for grid in np.meshgrid(_LEVELS, _BALANCES, indexing="ij"))
-    spreads = np.stack([level * np.sqrt(balance) * typical[0], level / np.sqrt(balance) * typical[1]], axis=1)
-    spreads = np.concatenate([[[FLOOR_TRANSLATION, FLOOR_ROTATION]], spreads])
-    near = np.exp(-0.5 * (np.log(level) ** 2 + np.log(balance) ** 2) / math.log(_FACTOR) ** 2)
-    prior = np.concatenate([[_EXACT], (1.0 - _EXACT) * near / near.sum()])
-    size, count = len(full) - 1, len(spreads)
-    values, answers, covariances = np.full(count, np.inf), np.zeros((count, size)), np.zeros((count, size, size))
-    _answers(full, np.ascontiguousarray(KMK), np.ascontiguousarray(both), spreads, values, answers, covariances)
-    weight = prior * np.exp(-0.5 * _TRUST * (values - np.min(values)))
-    weight[~np.isfinite(values)] = 0.0
-    weight /= weight.sum()
-    return np.einsum("k,kpq->pq", weight, covariances) + np.einsum("k,kp,kq->pq", weight, answers, answers)
-
-
 _LOWEST_PX = 1e-3
 #: Errors of a small arm, m and rad: only the centre of a wide prior.
 TYPICAL_ROBOT = (4e-4, 8e-4)
@@ -221,9 +193,7 @@ class Noise:
     @property
     def prior(self) -> Array:
         """(6, 6) inverse covariance of a correction of A."""
-        t = max(self.translation, FLOOR_TRANSLATION)
-        r = max(self.rotation, FLOOR_ROTATION)
-        return np.diag([t**-2.0] * 3 + [r**-2.0] * 3)
+        return np.diag(np.repeat(np.maximum((self.translation, self.rotation), FLOOR), 3) ** -2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,17 +254,14 @@ class Linear:
     `y` is the residual of the views with all corrections taken out, seen as a twist; `M` weighs it.
     """
 
-    GMG: Array  # (p, p)
-    GMy: Array  # (p,)
-    yMy: float
+    full: Array  # (p + 1, p + 1) [[GMG, GMy], [GMyᵀ, yMy]]
     KMK: Array  # (poses, 6, 6)
-    KMG: Array  # (poses, 6, p)
-    KMy: Array  # (poses, 6)
+    both: Array  # (poses, 6, p + 1) [KMG, KMy]
     cost: float  # of the views alone, in units of the pixel noise
 
 
-def linearise(problem: Problem, state: State, px: float, extras: Sequence[Extra]) -> tuple[Linear, Array]:
-    """Return the normal equations at a state; also the (n, 6, 6) effect of corrections on each view.
+def linearise(problem: Problem, state: State, px: float, extras: Sequence[Extra]) -> Linear:
+    """Return the normal equations at a state.
 
     Args:
         problem: The views.
@@ -317,26 +284,48 @@ def linearise(problem: Problem, state: State, px: float, extras: Sequence[Extra]
     My = b + (Mk @ correction[:, :, None])[:, :, 0]
     poses = int(problem.pose.max()) + 1
     Kt = K.swapaxes(1, 2)
-    KMK, KMG, KMy = np.zeros((poses, 6, 6)), np.zeros((poses, 6, G.shape[2])), np.zeros((poses, 6))
+    KMK, both = np.zeros((poses, 6, 6)), np.zeros((poses, 6, G.shape[2] + 1))
     np.add.at(KMK, problem.pose, Kt @ Mk[:, :6])
-    np.add.at(KMG, problem.pose, Mk.swapaxes(1, 2) @ G)
-    np.add.at(KMy, problem.pose, (Kt @ My[:, :6, None])[:, :, 0])
+    np.add.at(both, problem.pose, np.concatenate([Mk.swapaxes(1, 2) @ G, Kt @ My[:, :6, None]], axis=2))
     GMG = np.einsum("nip,niq->pq", G, M @ G, optimize=False)
     GMy = np.einsum("nip,ni->p", G, My)
     Kd = (K @ correction[:, :, None])[:, :, 0]
     # b = M y - M K d, and |r|² changes by the same quadratic, so yMy follows from the residual at d
     cost = float(costs.sum() * weight)
     yMy = cost + float(np.sum(Kd * (2.0 * b[:, :6] + (M[:, :6, :6] @ Kd[:, :, None])[:, :, 0])))
-    return Linear(GMG, GMy, yMy, KMK, KMG, KMy, cost), K
+    full = np.block([[GMG, GMy[:, None]], [GMy[None, :], np.array([[yMy]])]])
+    return Linear(full, KMK, both, cost)
 
 
 def eliminate(linear: Linear, prior: Array) -> tuple[Array, Array, Array]:
     """Return the information (p, p), right-hand side (p,), and (poses, 6, 6) inverse of the corrections' block."""
     V: Array = np.linalg.inv(linear.KMK + prior).astype(np.float64)
-    VG = V @ linear.KMG
-    information = linear.GMG - np.einsum("gip,giq->pq", linear.KMG, VG)
-    right = linear.GMy - np.einsum("gip,gi->p", VG, linear.KMy)
-    return (information + information.T) / 2.0, right, V
+    reduced = linear.full - np.einsum("gip,giq->pq", linear.both, V @ linear.both)
+    information = reduced[:-1, :-1]
+    return (information + information.T) / 2.0, reduced[:-1, -1], V
+
+
+def averaged(linear: Linear) -> Array:
+    """Return the covariance (p, p) about the present answer, averaged over the spreads that the data allow.
+
+    With few poses the spread itself is uncertain, and an answer that takes its best value for true is too sure of
+    itself. The weight is the restricted likelihood times a prior: either the robot is exact, as in a simulation, or
+    its spread is near that of a typical one, with translation and rotation more or less in proportion.
+    """
+    level, balance = (grid.ravel() for grid in np.meshgrid(_LEVELS, _BALANCES, indexing="ij"))
+    spreads = np.stack(
+        [level * np.sqrt(balance) * TYPICAL_ROBOT[0], level / np.sqrt(balance) * TYPICAL_ROBOT[1]], axis=1
+    )
+    spreads = np.concatenate([[[FLOOR, FLOOR]], spreads])
+    near = np.exp(-0.5 * (np.log(level) ** 2 + np.log(balance) ** 2) / math.log(_FACTOR) ** 2)
+    prior = np.concatenate([[_EXACT], (1.0 - _EXACT) * near / near.sum()])
+    size, count = len(linear.full) - 1, len(spreads)
+    values, answers, covariances = np.full(count, np.inf), np.zeros((count, size)), np.zeros((count, size, size))
+    _answers(linear.full, linear.KMK, linear.both, spreads, values, answers, covariances)
+    weight = prior * np.exp(-0.5 * _TRUST * (values - np.min(values)))
+    weight[~np.isfinite(values)] = 0.0
+    weight /= weight.sum()
+    return np.einsum("k,kpq->pq", weight, covariances) + np.einsum("k,kp,kq->pq", weight, answers, answers)
 
 
 def refine(
@@ -364,7 +353,7 @@ def refine(
         OpenArmError: INTERNAL, when the start is no description of the views (a mark behind the camera).
     """
     state = State.start(problem, X, Z)
-    linear, _ = linearise(problem, state, noise.px, extras)
+    linear = linearise(problem, state, noise.px, extras)
     if not np.isfinite(linear.cost):
         raise OpenArmError(
             Code.INTERNAL, "the refinement starts with a mark behind the camera; the closed form it came from is wrong"
@@ -372,7 +361,8 @@ def refine(
     damping, settled = 0.0, 0
     for count in range(iterations):
         if estimate_robot and count >= 2 and settled < 4:
-            found = restricted_likelihood(linear, noise, whole=count == 2)
+            spreads = _search(linear.full, linear.KMK, linear.both, noise.translation, noise.rotation, count == 2)
+            found = Noise(noise.px, *spreads)
             settled = settled + 1 if _near(found, noise) else 0
             noise = found
         prior = noise.prior
@@ -382,9 +372,9 @@ def refine(
             scale = np.sqrt(np.maximum(np.diag(information), 1e-30))
             normed = information / np.outer(scale, scale) + damping * np.eye(len(scale))
             step = np.linalg.lstsq(normed, right / scale, rcond=1e-14)[0] / scale
-            correction = (V @ (linear.KMy - (linear.KMG @ step))[:, :, None])[:, :, 0]
+            correction = (V @ (linear.both @ np.append(-step, 1.0))[:, :, None])[:, :, 0]
             trial = _stepped(problem, state, step, correction, extras)
-            ahead, _ = linearise(problem, trial, noise.px, extras)
+            ahead = linearise(problem, trial, noise.px, extras)
             reached = ahead.cost + _prior_cost(correction, prior)
             if reached <= cost * (1.0 + 1e-9) + 1e-9 or damping > 1e3:
                 break
@@ -396,10 +386,7 @@ def refine(
         small = float(np.abs(step[: 6 * (problem.cameras + problem.boards)]).max()) < 1e-9
         if (small or cost - reached < 1e-9 * max(reached, 1.0)) and (not estimate_robot or settled >= 1):
             break
-    spread: Array | None = None
-    if estimate_robot:
-        full, both = _joined(linear)
-        spread = averaged(full, linear.KMK, both, TYPICAL_ROBOT)
+    spread = averaged(linear) if estimate_robot else None
     information, _, _ = eliminate(linear, noise.prior)
     return Estimate(**vars(state), noise=noise, information=information, extras=tuple(extras), spread=spread)
 
@@ -413,26 +400,18 @@ def information_at(problem: Problem, X: Array, Z: Array, noise: Noise) -> Array:
         Z: (boards, 4, 4).
         noise: Standard deviations.
     """
-    return eliminate(linearise(problem, State.start(problem, X, Z), noise.px, ())[0], noise.prior)[0]
+    return eliminate(linearise(problem, State.start(problem, X, Z), noise.px, ()), noise.prior)[0]
 
 
 def _stepped(problem: Problem, state: State, step: Array, correction: Array, extras: Sequence[Extra]) -> State:
-    cameras, boards = problem.cameras, problem.boards
-    X = moved(state.X, step[: 6 * cameras].reshape(cameras, 6))
-    Z = moved(state.Z, step[6 * cameras : 6 * (cameras + boards)].reshape(boards, 6))
-    out = replace(state, X=X, Z=Z, correction=correction)
-    column = 6 * (cameras + boards)
-    for extra in extras:
-        if extra == "scale":
-            out = replace(out, scale=state.scale + float(step[column]))
-            column += 1
-        elif extra == "delay":
-            out = replace(out, delay=state.delay + float(step[column]))
-            column += 1
-        else:
-            out = replace(out, intrinsics=state.intrinsics + step[column : column + 4 * cameras].reshape(cameras, 4))
-            column += 4 * cameras
-    return out
+    part = {name: step[columns] for name, columns in layout(problem, extras).items()}
+    return replace(
+        state,
+        X=moved(state.X, part["X"].reshape(-1, 6)),
+        Z=moved(state.Z, part["Z"].reshape(-1, 6)),
+        correction=correction,
+        **{extra: getattr(state, extra) + part[extra].reshape(np.shape(getattr(state, extra))) for extra in extras},
+    )
 
 
 def _prior_cost(correction: Array, prior: Array) -> float:
@@ -440,29 +419,7 @@ def _prior_cost(correction: Array, prior: Array) -> float:
 
 
 def _near(a: Noise, b: Noise) -> bool:
-    small_t, small_r = 10 * FLOOR_TRANSLATION, 10 * FLOOR_ROTATION
-    return (
-        abs(a.translation - b.translation) < 0.02 * b.translation + small_t
-        and abs(a.rotation - b.rotation) < 0.02 * b.rotation + small_r
-    )
-
-
-def restricted_likelihood(linear: Linear, noise: Noise, *, whole: bool) -> Noise:
-    """Return the robot's spread of the largest restricted likelihood; near `noise`, or in the whole range.
-
-    Args:
-        linear: The linearised problem.
-        noise: Where to begin.
-        whole: Whether the whole range is searched first.
-    """
-    full, both = _joined(linear)
-    start = noise.translation, noise.rotation
-    return Noise(noise.px, *_search(full, linear.KMK, both, *start, whole))
-
-
-def _joined(linear: Linear) -> tuple[Array, Array]:
-    full = np.block([[linear.GMG, linear.GMy[:, None]], [linear.GMy[None, :], np.array([[linear.yMy]])]])
-    return full, np.concatenate([linear.KMG, linear.KMy[:, :, None]], axis=2)
+    return np.allclose((a.translation, a.rotation), (b.translation, b.rotation), rtol=0.02, atol=10 * FLOOR)
 
 
 def pixel_noise(problem: Problem) -> float:

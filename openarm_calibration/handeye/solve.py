@@ -16,7 +16,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy import stats
 
@@ -52,9 +51,7 @@ class PoseTest:
     rotation: float
 
 
-def pose_tests(
-    problem: Problem, used: NDArray[np.bool_], estimate: Estimate, limit: float, usable: NDArray[np.bool_] | None = None
-) -> tuple[PoseTest, ...]:
+def pose_tests(problem: Problem, used: Mask, estimate: Estimate, limit: float, usable: Mask) -> tuple[PoseTest, ...]:
     """Test every robot pose of a problem; views that are not used are tested against all that are.
 
     Args:
@@ -67,7 +64,7 @@ def pose_tests(
     Returns:
         By number of the pose, as `problem.pose` counts.
     """
-    T, B = chain(problem, estimate.X, estimate.Z, np.zeros((len(problem), 6)))
+    T, B = chain(problem, estimate.X, estimate.Z)
     squares, _, _ = normal_equations(
         problem.points, problem.pixels, problem.offsets, problem.radii, problem.free,
         problem.camera_rows() + estimate.intrinsics[problem.camera], estimate.scale,
@@ -77,8 +74,7 @@ def pose_tests(
     extra = 6 * (problem.cameras + problem.boards)
     # extras act in addition to the twist; their effect on it is what a view's own fit would make of them
     G6 = G[:, :6].copy()
-    fit = np.ones(len(problem), dtype=bool) if usable is None else usable
-    M[~fit] = np.eye(6)
+    M[~usable] = np.eye(6)
     if estimate.extras:
         through = np.linalg.solve(M, squares[:, :6, 6:] * estimate.noise.px**-2.0)
         G6[:, :, extra:] += through @ G[:, 6:, extra:]
@@ -90,7 +86,7 @@ def pose_tests(
     for pose in range(int(problem.pose.max()) + 1):
         rows = np.flatnonzero(problem.pose == pose)
         k = len(rows)
-        if not fit[rows].all():
+        if not usable[rows].all():
             out.append(PoseTest(np.inf, limit, 0.0, np.inf, np.inf))
             continue
         S = np.zeros((6 * k, 6 * k))
@@ -292,7 +288,7 @@ def _spoiled(problem: Problem, used: Mask, estimate: Estimate) -> bool:
 
 def _reprojection(problem: Problem, X: Array, Z: Array) -> Array:
     """Return (n,) rms of each view without corrections, px."""
-    T, _ = chain(problem, X, Z, np.zeros((len(problem), 6)))
+    T, _ = chain(problem, X, Z)
     _, _, cost = normal_equations(
         problem.points, problem.pixels, problem.offsets, problem.radii, T, problem.camera_rows(), 1.0
     )

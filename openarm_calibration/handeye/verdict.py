@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import Field
 
 from openarm_calibration.handeye.closed_form import METHODS, closed_form
-from openarm_calibration.handeye.problem import Problem, Setup, chain, project
-from openarm_calibration.handeye.refine import mount_error, refine
+from openarm_calibration.handeye.problem import Extra, Problem, chain, project, residuals
+from openarm_calibration.handeye.refine import Estimate, mount_error, refine
 from openarm_calibration.handeye.solve import Solution, SolveConfig, solve
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common.config import Config
@@ -94,7 +94,7 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
             extras=solution.estimate.extras,
         )  # fmt: skip
         left = problem.subset(used[out])
-        T, _ = chain(left, estimate.X, estimate.Z, np.zeros((len(left), 6)))
+        T, _ = chain(left, estimate.X, estimate.Z)
         rows = left.camera_rows() + estimate.intrinsics[left.camera]
         for k, view in enumerate(left.views):
             away = project(view.points, view.radius, T[k], rows[k]) - view.pixels
@@ -110,11 +110,10 @@ def held_out(problem: Problem, solution: Solution, folds: int) -> Held:
 def side_by_side(problem: Problem, solution: Solution) -> dict[str, dict[str, float] | str]:
     """Compare every closed form with the refinement: distance from it (m, rad) and rms reprojection (px)."""
     part = problem.subset(solution.used)
-    setup: Setup = part.views[0].setup
     out: dict[str, dict[str, float] | str] = {}
     for method in METHODS:
         try:
-            mounts = closed_form(method, setup, part.A, part.free)
+            mounts = closed_form(method, part.views[0].setup, part.A, part.free)
         except OpenArmError as error:
             out[method] = error.message
             continue
@@ -126,10 +125,7 @@ def side_by_side(problem: Problem, solution: Solution) -> dict[str, dict[str, fl
 
 
 def _rms(problem: Problem, X: Array, Z: Array) -> float:
-    T, _ = chain(problem, X, Z, np.zeros((len(problem), 6)))
-    rows = problem.camera_rows()
-    away = [project(view.points, view.radius, T[k], rows[k]) - view.pixels for k, view in enumerate(problem.views)]
-    return float(np.sqrt(np.mean(np.concatenate(away) ** 2)))
+    return float(np.sqrt(np.mean(np.concatenate(residuals(problem, X, Z)) ** 2)))
 
 
 def estimate_delay(samples: SampleSet, config: SolveConfig | None = None, rounds: int = 4) -> tuple[float, float]:
@@ -222,19 +218,23 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
     return Verdict(grade, reasons, figures, tuple(checks))
 
 
+def _freed(solution: Solution, extra: Extra) -> Estimate:
+    """Return the refinement of the same views with one more unknown."""
+    now = solution.estimate
+    return refine(solution.problem.subset(solution.used), now.X, now.Z, now.noise, extras=(extra,))
+
+
 def _focal(solution: Solution) -> tuple[float, float]:
     """Return the focal length over the one that the camera states, when the intrinsics are free, and its deviation.
 
     The larger distance of fx and fy; of several cameras the first.
     """
-    part = solution.problem.subset(solution.used)
-    now, stated = solution.estimate, part.intrinsics[0]
-    estimate = refine(part, now.X, now.Z, now.noise, extras=("intrinsics",))
+    estimate, stated = _freed(solution, "intrinsics"), solution.problem.intrinsics[0]
     try:
         covariance = estimate.covariance()
     except OpenArmError:
         return 1.0, math.inf  # views that do not determine it
-    first = 6 * (part.cameras + part.boards)
+    first = 6 * (solution.problem.cameras + solution.problem.boards)
     both = [
         (float(estimate.intrinsics[0, k]) / f, math.sqrt(float(covariance[first + k, first + k])) / f)
         for k, f in enumerate((stated.fx, stated.fy))
@@ -245,7 +245,5 @@ def _focal(solution: Solution) -> tuple[float, float]:
 
 def _scale(solution: Solution) -> tuple[float, float]:
     """Return the scale of the board when it is free, and its deviation."""
-    part = solution.problem.subset(solution.used)
-    now = solution.estimate
-    estimate = refine(part, now.X, now.Z, now.noise, extras=("scale",))
-    return estimate.scale, math.sqrt(float(estimate.covariance()[-1, -1]))
+    estimate = _freed(solution, "scale")
+    return float(estimate.scale), math.sqrt(float(estimate.covariance()[-1, -1]))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from openarm_calibration.handeye.offline import Result
-from openarm_calibration.handeye.problem import chain, project
+from openarm_calibration.handeye.problem import residuals as problem_residuals
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common import se3
 from openarm_common.figures import data_uri, render_figure, sheet
@@ -61,11 +61,9 @@ def residuals(result: Result) -> Drawing:
     from matplotlib.collections import LineCollection
 
     problem, estimate = result.solution.problem, result.solution.estimate
-    T, _ = chain(problem, estimate.X, estimate.Z, np.zeros((len(problem), 6)))
-    rows = problem.camera_rows()
     away = {
-        k: view.pixels - project(view.points, view.radius, T[k], rows[k])
-        for k, view in enumerate(problem.views)
+        k: residual
+        for k, residual in enumerate(problem_residuals(problem, estimate.X, estimate.Z))
         if result.solution.used[k]
     }
     rms = float(np.sqrt(np.mean(np.concatenate(list(away.values())) ** 2)))
