@@ -80,10 +80,10 @@ def measure(seed: int, cameras: tuple[str, ...], poses: int) -> list[dict[str, A
         camera = load_cameras()[name]
         true = true_mount(camera, seed)
         row: dict[str, Any] = {"seed": seed, "camera": name, **as_row(result)}
-        if result.T_parent_link is None:
+        if row["T_parent_link"] is None:
             row["error"] = f"{result.code}: {result.message}"
         else:
-            offset, angle = mount_error(result.T_parent_link, true)
+            offset, angle = mount_error(np.array(row["T_parent_link"]), true)
             row |= {"mm": offset * 1e3, "deg": math.degrees(angle)}
             row["nominal_mm"] = mount_error(camera.T_parent_link, true)[0] * 1e3
             row |= with_few(run.run_dir / f"{name}.npz", true)

@@ -18,8 +18,10 @@ from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
+    from openarm_interfaces.action import AutoCalibrate
+
     from openarm_bringup.supervision.supervisor import Event
-    from openarm_calibration.ros.client import AutoResult, OnFeedback
+    from openarm_calibration.ros.client import OnFeedback
 
 GRAPH = "calibrate"
 
@@ -66,7 +68,7 @@ class CalibrationRun:
     """Results by camera, in the order of the work; session files are in the run folder."""
 
     run_dir: Path
-    results: dict[str, AutoResult] = field(default_factory=dict[str, "AutoResult"])
+    results: dict[str, AutoCalibrate.Result] = field(default_factory=dict[str, "AutoCalibrate.Result"])
     ready_s: float = 0.0
     error: OpenArmError | None = None
 
@@ -142,13 +144,13 @@ def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners
     return run
 
 
-def as_row(result: AutoResult) -> dict[str, Any]:
+def as_row(result: AutoCalibrate.Result) -> dict[str, Any]:
     """Return what `--json` and reports write of one camera."""
-    names = ("success", "message", "grade", "sigma_translation", "sigma_rotation", "samples", "path", "duration")
-    T = result.T_parent_link
-    return {name: getattr(result, name) for name in names} | {
-        "code": str(result.code),
-        "T_parent_link": None if T is None else T.tolist(),
+    from openarm_common.ros.convert import pose_to_matrix
+
+    same = ("success", "code", "message", "grade", "sigma_translation", "sigma_rotation", "samples", "path", "duration")
+    return {name: getattr(result, name) for name in same} | {
+        "T_parent_link": pose_to_matrix(result.mount).tolist() if result.grade else None,
         "missed": list(result.missed),
-        "delay": None if result.delay is None else {"seconds": result.delay[0], "sigma": result.delay[1]},
+        "delay": {"seconds": result.delay, "sigma": result.delay_sigma} if result.delay_sigma > 0.0 else None,
     }

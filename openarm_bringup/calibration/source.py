@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from openarm_calibration.board.board import Board
     from openarm_calibration.handeye.offline import Result
     from openarm_calibration.sampling.samples import SampleSet
-    from openarm_calibration.store.store import CalibrationStore, StoredCalibration
+    from openarm_calibration.store.store import CalibrationStore
 
 
 @Parameter(name="*")
@@ -82,6 +81,7 @@ def with_solved(
     """
     from openarm_calibration.handeye.offline import REFINED, calibrate, checked_algorithm, without_named
     from openarm_calibration.handeye.solve import SolveConfig
+    from openarm_calibration.store.store import now
 
     name = checked_algorithm(algorithm)
     if free_intrinsics and name != REFINED:
@@ -94,7 +94,7 @@ def with_solved(
     else:
         samples, digest = _from_session(path, source)
     without_named(samples, source.exclude)
-    stored = stored_of(samples, source.store)
+    stored = store_in(source.store).in_use(samples.head.camera, samples.head.mount_seed)
     try:
         result = calibrate(samples, algorithm=name, config=config, session=digest, created=now(), stored=stored)
     except OpenArmError as error:
@@ -155,16 +155,3 @@ def store_in(folder: Path | None) -> CalibrationStore:
     if folder is not None and folder.exists() and not folder.is_dir():
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--store {folder} is a file, expected a folder")
     return CalibrationStore(folder if folder is not None else default_folder())
-
-
-def stored_of(samples: SampleSet, store: Path | None) -> StoredCalibration | None:
-    """Return what is stored of the camera; None also for other mounts, whose distance says nothing."""
-    found = store_in(store).find(samples.head.camera)
-    if found is None or found.calibration.mount_seed != samples.head.mount_seed:
-        return None
-    return found.calibration
-
-
-def now() -> str:
-    """Return date and time for the record."""
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

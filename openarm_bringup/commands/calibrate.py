@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from cyclopts import App
 
-from openarm_bringup.calibration.source import ALL_SAMPLES, Solved, Source, now, store_in, stored_of, with_solved
+from openarm_bringup.calibration.source import ALL_SAMPLES, Solved, Source, store_in, with_solved
 from openarm_bringup.commands import calibrate_live
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
@@ -117,16 +117,18 @@ def together(*sessions: Path, save: bool = False, store: Path | None = None) -> 
     from openarm_calibration.handeye.offline import calibrate_together
     from openarm_calibration.report.report import summary
     from openarm_calibration.sampling.samples import load_session
+    from openarm_calibration.store.store import now
     from openarm_common.robot.description import RobotDescription
 
     if len(sessions) < 2:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{len(sessions)} sessions given, expected two or more; one: `solve`")
+    place = store_in(store)
     opened = [load_session(session, RobotDescription.load()) for session in sessions]
     results = calibrate_together(
         [samples for samples, _ in opened],
         hashes=[digest for _, digest in opened],
         created=now(),
-        stored=[stored_of(samples, store) for samples, _ in opened],
+        stored=[place.in_use(samples.head.camera, samples.head.mount_seed) for samples, _ in opened],
     )
     names = [samples.head.camera for samples, _ in opened]
     data: dict[str, Any] = {"cameras": {n: result.as_json() for n, result in zip(names, results, strict=True)}}
@@ -135,7 +137,7 @@ def together(*sessions: Path, save: bool = False, store: Path | None = None) -> 
     if any(result.verdict.grade == "fail" for result in results):
         return Outcome(False, f"{grades}; nothing was stored", Code.DEGENERATE, data, text)
     if save:
-        paths = [str(store_in(store).save(result.calibration)) for result in results]
+        paths = [str(place.save(result.calibration)) for result in results]
         return Outcome(True, f"{grades}. Stored in {', '.join(paths)}", data=data, text=text)
     return Outcome(True, grades, data=data, text=text)
 

@@ -16,8 +16,6 @@ from openarm_common.errors import Code, OpenArmError
 if TYPE_CHECKING:
     from openarm_interfaces.action import AutoCalibrate
 
-    from openarm_calibration.ros.client import AutoResult
-
 #: Of the node's parameter auto.poses.
 MOST_POSES = 100
 
@@ -56,9 +54,7 @@ def auto(
         run_calibration,
     )
 
-    if poses < 0 or 0 < poses < 4:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"--poses {poses}: at least 4 are needed, 10 to 15 are usual")
-    if poses > MOST_POSES:
+    if poses and not 4 <= poses <= MOST_POSES:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--poses {poses}: expected 4 to {MOST_POSES}; 10 to 15 are usual")
     seed: int | Literal["none"] | None = "none" if mount_seed == "none" else None
     if mount_seed is not None and seed is None:
@@ -150,22 +146,23 @@ class _Show(GraphReport):
             self._console.print(line, markup=False, soft_wrap=True)
 
 
-def _outcome(results: dict[str, AutoResult], error: OpenArmError | None, run_dir: Path | None) -> Outcome:
+def _outcome(results: dict[str, AutoCalibrate.Result], error: OpenArmError | None, run_dir: Path | None) -> Outcome:
     from openarm_bringup.calibration.run import as_row
+    from openarm_common.ros.convert import xyz
 
     lines: list[str] = []
     for name, result in results.items():
-        if result.T_parent_link is None:
+        if not result.grade:
             lines.append(f"{name}: {result.code}: {result.message}")
             continue
-        x, y, z = result.T_parent_link[:3, 3] * 1e3
+        x, y, z = xyz(result.mount.position) * 1e3
         lines.append(
             f"{name}: {x:.2f}, {y:.2f}, {z:.2f} mm, predicted error {result.sigma_translation * 1e3:.3f} mm"
             f" {math.degrees(result.sigma_rotation):.4f}°, {result.samples} samples in {result.duration:.0f} s;"
             f" {result.message}"
         )
-        if result.delay is not None:
-            delay, sigma = (value * 1e3 for value in result.delay)
+        if result.delay_sigma > 0.0:
+            delay, sigma = result.delay * 1e3, result.delay_sigma * 1e3
             lines.append(f"{name}: images are {delay:.2f} ± {sigma:.2f} ms old at their stamps")
     data: dict[str, Any] = {"cameras": {name: as_row(result) for name, result in results.items()}}
     if run_dir is not None:
@@ -177,7 +174,7 @@ def _outcome(results: dict[str, AutoResult], error: OpenArmError | None, run_dir
     failed = [name for name, result in results.items() if not result.success or result.grade == "fail"]
     if failed:
         first = results[failed[0]]
-        code = first.code if first.code != Code.OK else Code.DEGENERATE
+        code = Code(first.code) if first.code != Code.OK else Code.DEGENERATE
         return Outcome(False, f"{failed[0]}: {first.message}{where}", code, data, text)
     return Outcome(True, f"calibrated {', '.join(results)}{where}", data=data, text=text)
 

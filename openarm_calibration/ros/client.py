@@ -7,57 +7,16 @@ Example:
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from openarm_interfaces.action import AutoCalibrate
 from openarm_interfaces.srv import GetSampleList, RemoveSample, SampleFile, TakeSample
 
 from openarm_common.errors import Code
 from openarm_common.ros.client import BackgroundNode
-from openarm_common.ros.convert import pose_to_matrix
 
 OnFeedback = Callable[[AutoCalibrate.Feedback], None]
-
-
-@dataclass(frozen=True, eq=False)
-class AutoResult:
-    """How a calibration went.
-
-    Args:
-        success: Whether it was solved, and stored if that was asked for.
-        code: OK, or why not.
-        message: One sentence.
-        grade: pass, warn, fail; empty when it was not solved.
-        T_parent_link: (4, 4) mount of the camera; None when it was not solved.
-        sigma_translation: Predicted error, m.
-        sigma_rotation: Predicted error, rad.
-        samples: That were taken.
-        missed: Poses without a sample, and why.
-        delay: Age of the images at their stamps and its predicted error, s; None when it was not measured.
-        path: Of the stored calibration; empty when it was not stored.
-        duration: s of wall clock.
-        report: All figures.
-    """
-
-    success: bool
-    code: Code
-    message: str
-    grade: str
-    T_parent_link: NDArray[np.float64] | None
-    sigma_translation: float
-    sigma_rotation: float
-    samples: int
-    missed: tuple[str, ...]
-    delay: tuple[float, float] | None
-    path: str
-    duration: float
-    report: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
 class CalibrationClient(BackgroundNode):
@@ -82,7 +41,7 @@ class CalibrationClient(BackgroundNode):
         timeout: float = 1200.0,
         on_feedback: OnFeedback | None = None,
         stop: threading.Event | None = None,
-    ) -> AutoResult:
+    ) -> AutoCalibrate.Result:
         """Calibrate a camera; returns when that has ended, well or not.
 
         Args:
@@ -104,21 +63,10 @@ class CalibrationClient(BackgroundNode):
         answer: AutoCalibrate.Result = self.do(
             AutoCalibrate, "/calibration/auto", goal, timeout=timeout, on_feedback=on_feedback, stop=stop
         )
-        return AutoResult(
-            success=answer.success,
-            code=Code(answer.code) if answer.code in Code.__members__ else Code.INTERNAL,
-            message=answer.message or "the node ended the action without an answer; its log says why",
-            grade=answer.grade,
-            T_parent_link=pose_to_matrix(answer.mount) if answer.grade else None,
-            sigma_translation=answer.sigma_translation,
-            sigma_rotation=answer.sigma_rotation,
-            samples=answer.samples,
-            missed=tuple(answer.missed),
-            delay=(answer.delay, answer.delay_sigma) if answer.delay_sigma > 0.0 else None,
-            path=answer.path,
-            duration=answer.duration,
-            report=json.loads(answer.report) if answer.report else {},
-        )
+        if answer.code not in Code.__members__:
+            answer.code = Code.INTERNAL.value
+        answer.message = answer.message or "the node ended the action without an answer; its log says why"
+        return answer
 
     def take(self) -> TakeSample.Response:
         """Take a sample at the present posture of the arm."""

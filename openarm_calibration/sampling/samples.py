@@ -15,7 +15,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from openarm_calibration.board.board import parse_board
+from openarm_calibration.board.board import Board, parse_board
 from openarm_calibration.board.detect import BoardDetection, guess_pose
 from openarm_calibration.handeye.problem import Problem, View, assemble, difference
 from openarm_common import se3
@@ -252,6 +252,27 @@ def setup_of(description: RobotDescription, parent: str) -> Literal["in_hand", "
     """Return whether a camera on a link moves with the arm, or is fixed and observes a board that the arm carries."""
     moves = any(joint.type != "fixed" for joint in description.chain(parent))
     return "in_hand" if moves else "to_hand"
+
+
+def head_of(
+    camera: str, parent: str, description: RobotDescription, optics: Intrinsics, board: Board, carrier: str, **more: Any
+) -> SessionHead:
+    """Describe a session: a camera on a link that moves is in the hand; for another one the arm carries the board.
+
+    Args:
+        camera: Name of the camera.
+        parent: Link that carries it.
+        description: The robot.
+        optics: Intrinsics.
+        board: To detect.
+        carrier: Link that holds the board of a camera that does not move.
+        more: Other fields.
+    """
+    setup = setup_of(description, parent)
+    return SessionHead(
+        camera=camera, setup=setup, parent=parent, carrier=parent if setup == "in_hand" else carrier,
+        intrinsics=astuple(optics), board=board.model_dump(), **more,
+    )  # fmt: skip
 
 
 # --- reading a session file

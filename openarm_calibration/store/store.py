@@ -9,6 +9,7 @@ refused, and the newest good one of the history takes its place.
 from __future__ import annotations
 
 import contextlib
+import datetime
 import hashlib
 import json
 import os
@@ -148,8 +149,6 @@ class CalibrationStore:
 
     def cameras(self) -> tuple[str, ...]:
         """Return the names of the cameras that have a file, damaged or not."""
-        if not self.folder.is_dir():
-            return ()
         return tuple(sorted(p.stem for p in self.folder.glob("*.yaml") if _NAME.fullmatch(p.stem)))
 
     def save(self, calibration: StoredCalibration) -> Path:
@@ -161,8 +160,7 @@ class CalibrationStore:
         path = self.path(calibration.camera)
         digest = calibration.digest()
         text = yaml.safe_dump({**calibration.model_dump(mode="json"), "sha256": digest}, sort_keys=False)
-        past = self._past(calibration.camera)
-        number = 1 + max((_number(p) for p in past), default=0)
+        number = 1 + max(map(_number, self._past(calibration.camera)), default=0)
         write_whole(self._history(calibration.camera) / f"{number:06d}-{digest[:12]}.yaml", text.encode())
         write_whole(path, text.encode())
         return path
@@ -187,9 +185,7 @@ class CalibrationStore:
         Raises:
             OpenArmError: CONFIG_INVALID, when the file is damaged and the history has no good one.
         """
-        path = self.path(camera)
-        past = self._past(camera)
-        if not path.is_file() and not past:
+        if not self.path(camera).is_file() and not self._past(camera):
             return None
         try:
             return Found(self.load(camera))
@@ -199,6 +195,11 @@ class CalibrationStore:
                 raise
             older, calibration = good[-1]
             return Found(calibration, f"{error.message}; the last good one, {older.name}, is used")
+
+    def in_use(self, camera: str, mount_seed: int | None) -> StoredCalibration | None:
+        """Return what is stored of a camera; None also for other mounts, whose distance says nothing."""
+        found = self.find(camera)
+        return found.calibration if found is not None and found.calibration.mount_seed == mount_seed else None
 
     def history(self, camera: str) -> tuple[StoredCalibration, ...]:
         """Return all good calibrations of a camera, oldest first."""
@@ -245,8 +246,7 @@ class CalibrationStore:
         return out
 
     def _past(self, camera: str) -> list[Path]:
-        folder = self._history(camera)
-        return sorted(folder.glob("*.yaml"), key=_number) if folder.is_dir() else []
+        return sorted(self._history(camera).glob("*.yaml"), key=_number)
 
 
 def checked_name(camera: str) -> str:
@@ -281,21 +281,6 @@ def read(path: Path) -> StoredCalibration:
     return calibration
 
 
-def check_mount_seed(calibration: StoredCalibration, mount_seed: int | None) -> None:
-    """Refuse a calibration of other mounts than those in use.
-
-    Raises:
-        OpenArmError: CONFIG_INVALID, naming both seeds.
-    """
-    if calibration.mount_seed != mount_seed:
-        names = ["none" if seed is None else str(seed) for seed in (calibration.mount_seed, mount_seed)]
-        raise OpenArmError(
-            Code.CONFIG_INVALID,
-            f"the calibration of {calibration.camera!r} is of mount seed {names[0]}, the mounts in use are of mount"
-            f" seed {names[1]}; calibrate again",
-        )
-
-
 def places(folder: Path, mount_seed: int | None) -> tuple[CalibrationStore, ...]:
     """List where calibrations of the mounts in use are searched; the first that has one wins.
 
@@ -325,18 +310,29 @@ def of_these_mounts(
             found = store.find(camera)
             if found is None:
                 continue
-            check_mount_seed(found.calibration, mount_seed)
-            if found.calibration.parent != parent:
-                raise OpenArmError(
-                    Code.CONFIG_INVALID,
-                    f"the calibration of {camera!r} is for parent {found.calibration.parent!r}, the camera is on"
-                    f" {parent!r}; calibrate again",
-                )
         except OpenArmError as error:
             faults.append(error.message)
             continue
-        return found, (*faults, *([found.warning] if found.warning else []))
+        calibration = found.calibration
+        if calibration.mount_seed != mount_seed:
+            stated, used = ("none" if seed is None else seed for seed in (calibration.mount_seed, mount_seed))
+            faults.append(
+                f"the calibration of {camera!r} is of mount seed {stated}, the mounts in use are of mount seed {used};"
+                " calibrate again"
+            )
+        elif calibration.parent != parent:
+            faults.append(
+                f"the calibration of {camera!r} is for parent {calibration.parent!r}, the camera is on {parent!r};"
+                " calibrate again"
+            )
+        else:
+            return found, (*faults, *([found.warning] if found.warning else []))
     return None, tuple(faults)
+
+
+def now() -> str:
+    """Return date and time for the record."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
 
 
 def default_folder() -> Path:

@@ -43,7 +43,7 @@ def calibrate_once(mount_seed: int, on_note: Callable[[str], None]) -> None:
         raise run.error
     for camera, result in run.results.items():
         if not result.success:
-            raise OpenArmError(result.code, f"calibration of {camera}: {result.message}")
+            raise OpenArmError(Code(result.code), f"calibration of {camera}: {result.message}")
     left = uncalibrated(mount_seed)
     if left:
         raise OpenArmError(Code.INTERNAL, f"{', '.join(left)} are stored in {store}, but not found there")

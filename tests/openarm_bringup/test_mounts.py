@@ -6,9 +6,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from openarm_interfaces.action import AutoCalibrate
 
 from openarm_bringup.calibration.run import CalibrationOptions, CalibrationRun
-from openarm_calibration.ros.client import AutoResult
 from openarm_calibration.store.store import CalibrationStore, StoredCalibration
 from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
@@ -20,9 +20,9 @@ def _own_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
 
 
-def answer(*, success: bool = True) -> AutoResult:
+def answer(*, success: bool = True) -> AutoCalibrate.Result:
     code, message = (Code.OK, "pass") if success else (Code.NO_PLAN, "no way")
-    return AutoResult(success, code, message, "pass", None, 0.0, 0.0, 10, (), None, "", 1.0)
+    return AutoCalibrate.Result(success=success, code=code.value, message=message, grade="pass", samples=10)
 
 
 def test_mount_seed_1_needs_no_calibration_and_others_are_calibrated_once(tmp_path: Path, monkeypatch) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from openarm_calibration.store.store import CalibrationStore, StoredCalibration, check_mount_seed
+from openarm_calibration.store.store import CalibrationStore, StoredCalibration, of_these_mounts
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 
@@ -81,10 +81,15 @@ def test_rollback_goes_back_one_and_says_when_there_is_none(tmp_path: Path) -> N
         store.rollback("wrist")
 
 
-def test_a_calibration_of_another_mount_seed_is_refused() -> None:
-    check_mount_seed(calibration(mount_seed=1), 1)
-    with pytest.raises(OpenArmError, match="is of mount seed 1, the mounts in use are of mount seed none"):
-        check_mount_seed(calibration(mount_seed=1), None)
+def test_a_calibration_of_another_mount_seed_is_refused(tmp_path: Path) -> None:
+    store = CalibrationStore(tmp_path)
+    store.save(calibration(mount_seed=1))
+    parent = store.load("wrist").parent
+    found, reasons = of_these_mounts([store], "wrist", parent, 1)
+    assert (found is not None, reasons) == (True, ())
+    found, reasons = of_these_mounts([store], "wrist", parent, None)
+    assert found is None
+    assert "is of mount seed 1, the mounts in use are of mount seed none" in reasons[0]
 
 
 def test_a_missing_camera_lists_those_there_are(tmp_path: Path) -> None:

@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo, Image, JointState
-from tf2_msgs.msg import TFMessage
+from sensor_msgs.msg import CameraInfo, Image
 
 from openarm_bringup.bags.bag import Bag
+from openarm_bringup.bags.ros.messages import messages_of
 from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.board.detect import detect
 from openarm_calibration.ros.image_capture import grey
@@ -39,7 +39,8 @@ from openarm_perception.geometry.depth import DepthLimits
 
 #: Boards are searched for twice a second in each camera: it is held still for as long, and the search is slow.
 _BOARD_PERIOD_NS = 500_000_000
-_STREAMS = ("color/image_raw", "depth/image_raw", "depth/camera_info")
+#: Streams of a camera, and where a shot has them.
+_STREAMS = {"color/image_raw": "color", "depth/image_raw": "depth", "depth/camera_info": "info"}
 
 
 @dataclass
@@ -113,27 +114,24 @@ def numbers_of(
 
 def _read(bag: Bag, description: RobotDescription) -> tuple[list[_Shot], RobotStateBuffer]:
     cameras = {name: camera for name, camera in load_cameras().items() if camera.depth}
-    topics = {f"/{name}/{stream}": (name, stream) for name in cameras for stream in _STREAMS}
-    joints: list[JointState] = []
+    topics = {f"/{name}/{stream}": (name, part) for name in cameras for stream, part in _STREAMS.items()}
+    found = messages_of(bag, [*topics, "/joint_states", "/tf_static"])
+    states = RobotStateBuffer(description, capacity=max(len(found["/joint_states"]), 1))
+    for message in found["/tf_static"]:
+        for edge in message.transforms:
+            states.set_static(edge.header.frame_id, edge.child_frame_id, transform_to_matrix(edge.transform))
+    for message in sorted(found["/joint_states"], key=_stamp):
+        states.add_joint_state(_stamp(message), message.name, message.position)
     shots: dict[tuple[int, str], _Shot] = {}
-    count = bag.counts.get("/joint_states", 0)
-    states = RobotStateBuffer(description, capacity=max(count, 1))
-    for record in bag.records([*topics, "/joint_states", "/tf_static"]):
-        if record.topic == "/joint_states":
-            joints.append(deserialize_message(record.data, JointState))
-        elif record.topic == "/tf_static":
-            message = deserialize_message(record.data, TFMessage)
-            for edge in message.transforms:
-                states.set_static(edge.header.frame_id, edge.child_frame_id, transform_to_matrix(edge.transform))
-        else:
-            name, stream = topics[record.topic]
-            message = deserialize_message(record.data, CameraInfo if stream.endswith("camera_info") else Image)
-            t_ns = stamp_to_ns(message.header.stamp)
-            shot = shots.setdefault((t_ns, name), _Shot(cameras[name], t_ns))
-            setattr(shot, "info" if isinstance(message, CameraInfo) else stream.partition("/")[0], message)
-    for message in sorted(joints, key=lambda joint: stamp_to_ns(joint.header.stamp)):
-        states.add_joint_state(stamp_to_ns(message.header.stamp), message.name, message.position)
+    for topic, (name, part) in topics.items():
+        for message in found[topic]:
+            t_ns = _stamp(message)
+            setattr(shots.setdefault((t_ns, name), _Shot(cameras[name], t_ns)), part, message)
     return [shots[key] for key in sorted(shots)], states
+
+
+def _stamp(message: Any) -> int:
+    return stamp_to_ns(message.header.stamp)
 
 
 def _work(shot: _Shot, states: RobotStateBuffer, pipeline: Pipeline, mapper: Mapper, found: _Found) -> None:

@@ -9,16 +9,15 @@ from typing import Any
 
 import yaml
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo, Image, JointState
-from std_msgs.msg import String
-from tf2_msgs.msg import TFMessage
+from sensor_msgs.msg import Image
 
 from openarm_bringup.bags.bag import Bag
+from openarm_bringup.bags.ros.messages import messages_of
 from openarm_calibration.board.board import Board
 from openarm_calibration.config import CalibrationConfig
 from openarm_calibration.ros.image_capture import grey
 from openarm_calibration.sampling.gate import GateConfig
-from openarm_calibration.sampling.samples import SampleSet, SessionHead, setup_of
+from openarm_calibration.sampling.samples import SampleSet, head_of
 from openarm_calibration.sampling.stills import Picker, Stretch, stretches
 from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
@@ -65,14 +64,11 @@ def samples_of(
     configured = load_cameras()
     base = BASE_FRAME if BASE_FRAME in small.robot.links else small.robot.root
     parent = _parent(small, camera, base, configured)
-    setup = setup_of(small.robot, parent)
     simulated = camera not in configured or configured[camera].mount_error
     seed = mount_seed if mount_seed is not None else _seed(bag)
-    head = SessionHead(
-        camera=camera, setup=setup, parent=parent, base=base,
-        carrier=(carrier or CalibrationConfig().carrier) if setup == "to_hand" else parent,
-        intrinsics=(optics.width, optics.height, optics.fx, optics.fy, optics.cx, optics.cy),
-        board=board.model_dump(), mount_seed=seed if simulated else None,
+    head = head_of(
+        camera, parent, small.robot, optics, board, carrier or CalibrationConfig().carrier,
+        base=base, mount_seed=seed if simulated else None,
     )  # fmt: skip
     samples = SampleSet(head, small.robot)
     images = f"/{camera}{_IMAGES}"
@@ -113,26 +109,19 @@ def _camera(bag: Bag, name: str) -> str:
 
 def _small(bag: Bag, camera: str) -> _Small:
     info = f"/{camera}{_INFOS}"
-    urdf = ""
-    parents: dict[str, str] = {}
-    states: list[tuple[int, Mapping[str, float]]] = []
-    optics: dict[int, Intrinsics] = {}
-    for record in bag.records([info, "/joint_states", "/tf_static", "/robot_description"]):
-        if record.topic == "/joint_states":
-            message = deserialize_message(record.data, JointState)
-            states.append((stamp_to_ns(message.header.stamp), dict(zip(message.name, message.position, strict=False))))
-        elif record.topic == "/tf_static":
-            for edge in deserialize_message(record.data, TFMessage).transforms:
-                parents[edge.child_frame_id] = edge.header.frame_id
-        elif record.topic == "/robot_description":
-            urdf = deserialize_message(record.data, String).data
-        else:
-            message = deserialize_message(record.data, CameraInfo)
-            optics[stamp_to_ns(message.header.stamp)] = intrinsics_from_info(message)
-    states.sort(key=lambda state: state[0])
-    # what the bag says of the robot holds, also where this suite knows the robot otherwise
-    robot = RobotDescription.from_urdf(urdf) if urdf else RobotDescription.load()
-    return _Small(robot, parents, states, optics)
+    found = messages_of(bag, (info, "/joint_states", "/tf_static", "/robot_description"))
+    states = [
+        (stamp_to_ns(message.header.stamp), dict(zip(message.name, message.position, strict=False)))
+        for message in found["/joint_states"]
+    ]
+    urdf = found["/robot_description"][-1].data if found["/robot_description"] else ""
+    return _Small(
+        # what the bag says of the robot holds, also where this suite knows the robot otherwise
+        robot=RobotDescription.from_urdf(urdf) if urdf else RobotDescription.load(),
+        parents={e.child_frame_id: e.header.frame_id for message in found["/tf_static"] for e in message.transforms},
+        states=sorted(states, key=lambda state: state[0]),
+        optics={stamp_to_ns(message.header.stamp): intrinsics_from_info(message) for message in found[info]},
+    )
 
 
 def _parent(small: _Small, camera: str, base: str, configured: Mapping[str, CameraConfig]) -> str:
