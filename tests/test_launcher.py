@@ -170,7 +170,7 @@ def test_kernels_that_a_pull_has_changed_are_compiled_before_anything_runs(machi
     assert machine.run("x").stderr == ""
 
 
-def test_an_interrupted_set_up_leaves_no_stamp_and_the_next_starts_the_environment_anew(machine: Machine) -> None:
+def test_an_interrupted_set_up_leaves_no_stamp_and_the_next_recreates_the_environment(machine: Machine) -> None:
     reached = machine.root.parent / "reached"
     command = [machine.root / "openarm", "x"]
     with subprocess.Popen(command, env=machine.env | {"SLOW": str(reached)}, start_new_session=True) as process:
@@ -224,12 +224,12 @@ def test_the_probe_accepts_this_python_and_refuses_another() -> None:
     assert (refusal.returncode, refusal.stdout.startswith("it is ")) == (1, True), refusal
 
 
-def test_too_little_disk_is_told_with_the_numbers(machine: Machine) -> None:
+def test_too_little_disk_is_reported_with_the_numbers(machine: Machine) -> None:
     machine.stub("df", "echo head; echo /dev/x 0 0 1048576 0% /")
     assert f"no disk space: {machine.root} has 1024 MB free, set-up needs 4000 MB" in machine.refused()
 
 
-def test_a_full_disk_on_the_way_is_told_as_such(machine: Machine) -> None:
+def test_a_full_disk_on_the_way_is_reported_as_such(machine: Machine) -> None:
     machine.stub("uv", _UV.replace('"pip sync")', '"pip sync") echo "error: No space left on device"; exit 2;;\n"x")'))
     assert "no disk space left while fetching the packages of requirements.lock" in machine.refused()
 
@@ -237,7 +237,7 @@ def test_a_full_disk_on_the_way_is_told_as_such(machine: Machine) -> None:
 @pytest.mark.skipif(
     shutil.which("uv", path=str(Path(sys.executable).parent)) is None, reason="uv is not in this environment"
 )
-def test_no_network_is_told_as_such_by_the_real_uv(machine: Machine) -> None:
+def test_no_network_is_reported_as_such_by_the_real_uv(machine: Machine) -> None:
     (machine.bin / "uv").unlink()
     (machine.bin / "uv").symlink_to(Path(sys.executable).parent / "uv")
     closed = "http://127.0.0.1:9/simple"
@@ -247,7 +247,7 @@ def test_no_network_is_told_as_such_by_the_real_uv(machine: Machine) -> None:
     assert "run ./openarm again" in words
 
 
-def test_no_network_for_pip_where_uv_is_missing_is_told_as_such(machine: Machine) -> None:
+def test_no_network_for_pip_where_uv_is_missing_is_reported_as_such(machine: Machine) -> None:
     (machine.bin / "uv").unlink()
     words = machine.refused(PIP_INDEX_URL="http://127.0.0.1:9/simple", PIP_RETRIES="1", PIP_CONFIG_FILE=os.devnull)
     assert "no network while fetching uv" in words
@@ -292,7 +292,7 @@ def test_missing_libraries_are_named_where_there_is_no_apt(machine: Machine) -> 
     assert "missing on this system (Debian's package names): libegl1." in machine.refused()
 
 
-def test_a_sourced_native_ros_is_left_out_and_told(machine: Machine) -> None:
+def test_a_sourced_native_ros_is_left_out_and_reported(machine: Machine) -> None:
     machine.run()
     answer = machine.run(
         "x", PYTHONPATH="/opt/ros/jazzy/lib/python3.12/site-packages", AMENT_PREFIX_PATH="/opt/ros/jazzy"

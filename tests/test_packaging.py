@@ -49,17 +49,17 @@ def test_a_package_is_complete_for_colcon_too(package: str, monkeypatch: pytest.
     assert (folder / "resource" / package).is_file()
     assert f"install_scripts=$base/lib/{package}" in (folder / "setup.cfg").read_text()
 
-    told: dict[str, object] = {}
-    monkeypatch.setattr(setuptools, "setup", lambda **arguments: told.update(arguments))
+    given: dict[str, object] = {}
+    monkeypatch.setattr(setuptools, "setup", lambda **arguments: given.update(arguments))
     monkeypatch.chdir(folder)
     runpy.run_path("setup.py", run_name="__main__")
     inside = [".".join([package, *path.parent.relative_to(folder).parts]) for path in folder.rglob("__init__.py")]
-    assert sorted(told["packages"]) == sorted(inside)  # setup.py lists sub-packages by hand
-    patterns = told["package_data"][package]
+    assert sorted(given["packages"]) == sorted(inside)  # setup.py lists sub-packages by hand
+    patterns = given["package_data"][package]
     brought = {path for pattern in patterns for path in folder.glob(pattern) if path.is_file()}
     assert {path for path in folder.rglob("*") if path.suffix in (".html", ".js", ".css", ".svg", ".typed")} <= brought
-    assert told["version"] == manifest.findtext("version") == _project()["version"]
-    for script in told.get("entry_points", {"console_scripts": []})["console_scripts"]:
+    assert given["version"] == manifest.findtext("version") == _project()["version"]
+    for script in given.get("entry_points", {"console_scripts": []})["console_scripts"]:
         module = script.split(" = ")[1].removesuffix(":main").split(".")
         assert Path(_ROOT, *module).with_suffix(".py").is_file(), script
 

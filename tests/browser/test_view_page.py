@@ -198,7 +198,7 @@ async def seen(tab: Any, count: Callable[[Any], int], least: int) -> None:
 
 
 async def shoot(tab: Any, name: str) -> None:
-    """Keep a picture where somebody asked for them; a page that is as it was pleases the eye of a person alone."""
+    """Keep a picture where one was asked for: for review by eye."""
     folder = os.environ.get("OPENARM_SHOTS")
     if folder:
         await tab.picture(Path(folder) / f"{name}.png")

@@ -113,7 +113,7 @@ def test_a_last_chunk_whose_content_never_reached_the_disk_is_given_up(tmp_path:
         assert len(list(bag.records())) > 200
 
 
-def test_a_bag_that_was_cut_short_later_is_told_from_an_unfinished_recording(tmp_path: Path) -> None:
+def test_a_bag_that_was_cut_short_later_is_distinguished_from_an_unfinished_recording(tmp_path: Path) -> None:
     file = write(tmp_path / "bag", 400, size=10_000) / "bag.mcap"
     with file.open("r+b") as data:
         data.truncate(file.stat().st_size // 2)

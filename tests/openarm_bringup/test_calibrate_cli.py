@@ -108,7 +108,7 @@ def test_wrong_intrinsics_are_found_with_the_mount(capsys, tmp_path: Path) -> No
 
 
 @pytest.mark.requirement("A-45")
-def test_a_stored_file_that_would_run_something_is_told_and_not_run(capsys, tmp_path: Path) -> None:
+def test_a_stored_file_that_would_run_something_is_reported_and_not_run(capsys, tmp_path: Path) -> None:
     """Also one that is cut short, and one whose name is a trick."""
     store = tmp_path / "store"
     store.mkdir(exist_ok=True)
@@ -214,7 +214,7 @@ def result(camera: str, **more) -> AutoCalibrate.Result:
     ],
 )  # fmt: skip
 @pytest.mark.requirement("B-15")
-def test_auto_takes_the_fixed_camera_first_and_tells_what_came_out(
+def test_auto_takes_the_fixed_camera_first_and_reports_the_results(
     capsys, tmp_path: Path, monkeypatch, results, error, code: int, words: str
 ) -> None:
     """Exit code and sentence follow the worst camera; pages are written of the sessions that there are."""

@@ -147,7 +147,7 @@ def test_ps_and_logs_find_a_running_graph(capsys: pytest.CaptureFixture[str]) ->
         runs.the_running(6)
 
 
-def test_several_graphs_are_told_apart_by_domain_and_one_that_lost_a_node_is_degraded(
+def test_several_graphs_are_distinguished_by_domain_and_one_that_lost_a_node_is_degraded(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """Two supervisors in one domain make one graph; ones in different domains have to be chosen from."""
@@ -188,7 +188,7 @@ def test_several_graphs_are_told_apart_by_domain_and_one_that_lost_a_node_is_deg
         runs.remove_record(os.getpid())
 
 
-def test_a_graph_is_not_started_beside_another_that_has_its_nodes(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_graph_is_not_started_next_to_another_that_has_its_nodes(capsys: pytest.CaptureFixture[str]) -> None:
     other = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(60)"])
     ready = runs.NodeRecord(state="ready")
     record = runs.RunRecord(
@@ -272,7 +272,7 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert done.stdout.rstrip().endswith("[]")
-    # CPU time, not the clock: tests run beside other work. It takes 0.4 s.
+    # CPU time, not the clock: tests run next to other work. It takes 0.4 s.
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.0
 
 

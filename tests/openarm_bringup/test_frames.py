@@ -21,7 +21,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 ROWS = (Row(0, "world", True), Row(1, "base", True), Row(2, "arm", False), Row(1, "table <1>", True))
 
 
-def told(parent: str, child: str, x: float = 0.0) -> TFMessage:
+def published(parent: str, child: str, x: float = 0.0) -> TFMessage:
     edge = TransformStamped(child_frame_id=child)
     edge.header.frame_id = parent
     edge.transform.translation.x = x
@@ -29,12 +29,12 @@ def told(parent: str, child: str, x: float = 0.0) -> TFMessage:
     return TFMessage(transforms=[edge])
 
 
-def test_one_publisher_may_tell_again_and_again() -> None:
+def test_one_publisher_may_publish_repeatedly() -> None:
     frames = Frames()
     for number in range(5):
-        frames.add(told("base", "arm", 0.1 * number), number, False)
-    frames.add(told("world", "base"), 1, True)
-    frames.add(told("world", "base", 1.0), 2, True)  # a calibration was stored
+        frames.add(published("base", "arm", 0.1 * number), number, False)
+    frames.add(published("world", "base"), 1, True)
+    frames.add(published("world", "base", 1.0), 2, True)  # a calibration was stored
     assert frames.clashes == {}
     assert frames.edges["arm"][1][0, 3] == pytest.approx(0.4)
 
@@ -42,15 +42,15 @@ def test_one_publisher_may_tell_again_and_again() -> None:
 @pytest.mark.parametrize(
     ("second", "number", "static", "said"),
     [
-        (told("world", "arm"), 8, False, "has the parents base and world"),
-        (told("base", "arm"), 8, True, "is published on /tf and on /tf_static"),
-        (told("base", "arm"), 7, False, "has two publishers on /tf"),
-        (told("base", "arm"), 3, False, "has two publishers on /tf"),
+        (published("world", "arm"), 8, False, "has the parents base and world"),
+        (published("base", "arm"), 8, True, "is published on /tf and on /tf_static"),
+        (published("base", "arm"), 7, False, "has two publishers on /tf"),
+        (published("base", "arm"), 3, False, "has two publishers on /tf"),
     ],
 )
 def test_a_second_publisher_of_a_frame_is_named(second: TFMessage, number: int, static: bool, said: str) -> None:
     frames = Frames()
-    frames.add(told("base", "arm"), 7, False)
+    frames.add(published("base", "arm"), 7, False)
     frames.add(second, number, static)
     assert frames.clashes == {"arm": said}
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shared memory: what nobody uses goes, what anybody uses stays."""
+"""Shared memory: unused segments are removed, used ones stay."""
 
 from __future__ import annotations
 

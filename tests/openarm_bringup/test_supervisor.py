@@ -61,7 +61,7 @@ def toy(folder: Path, name: str, body: str = "time.sleep(60)", **fields: object)
 
 
 class Running:
-    """A supervisor under test and what it has told."""
+    """A supervisor under test and what it has reported."""
 
     def __init__(self, folder: Path, nodes: dict[str, NodeSpec], ladder: Ladder | None = None) -> None:
         self.events: list[Event] = []

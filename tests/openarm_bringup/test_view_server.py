@@ -214,7 +214,7 @@ def test_labels_can_only_become_text() -> None:
 
 
 def test_vendored_files_are_those_that_are_named() -> None:
-    """What came unchanged from the package has the sum that stands beside it."""
+    """What came unchanged from the package has the checksum listed next to it."""
     said = (PAGE / "vendor" / "README.md").read_text(encoding="utf-8")
     for name in ("three.module.min.js", "three.core.min.js"):
         data = (PAGE / "vendor" / name).read_bytes()
@@ -252,7 +252,7 @@ def test_a_page_that_comes_later_gets_the_newest_of_each() -> None:
 
 
 @pytest.mark.parametrize("message", ['{"want": ["everything"]}', '{"want": 3}', "}{"])
-def test_a_page_that_wants_nonsense_is_told_and_closed(message: str) -> None:
+def test_a_page_that_sends_nonsense_is_answered_and_closed(message: str) -> None:
     async def test(bench: Bench) -> None:
         async with bench.socket() as socket:
             await socket.receive_json()

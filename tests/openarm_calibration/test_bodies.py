@@ -43,7 +43,7 @@ def test_many_postures_at_once_are_those_one_by_one(openarm: RobotDescription) -
         (0.37, 0.785, False),
     ],
 )
-def test_contact_is_told_by_separating_axes(x: float, turn: float, touches: bool) -> None:
+def test_contact_is_found_by_separating_axes(x: float, turn: float, touches: bool) -> None:
     """A cylinder of radius 50 mm comes near a cube of 100 mm, straight or turned by 45 degrees."""
     description = RobotDescription.from_urdf(POLE)
     bodies = Bodies(description)

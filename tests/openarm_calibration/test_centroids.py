@@ -69,7 +69,7 @@ def test_a_circle_at_the_edge_of_the_image_keeps_its_start() -> None:
 
 
 def test_marks_that_something_covers_or_comes_near_to_are_left_out() -> None:
-    """A sticker over half a circle and a cable beside another; what is reported is right to 0.05 px."""
+    """A sticker over half a circle and a cable next to another; what is reported is right to 0.05 px."""
     image = picture(0.5, 0.0, noise=1.0)
     u, v = np.round(TRUE[20]).astype(int)
     image[v - 4 : v + 5, u - 4 : u + 1] = 190

@@ -46,8 +46,8 @@ class Arm:
             self.state |= self.description.group_state(f"{side}_arm", "home")
 
     def search(self) -> PoseSearch:
-        told = self.Z @ se3.make(se3.rot_x(0.03), (0.008, -0.006, 0.0))
-        return PoseSearch(self.description, self.camera.T_parent_optical, told, QUICK)
+        given = self.Z @ se3.make(se3.rot_x(0.03), (0.008, -0.006, 0.0))
+        return PoseSearch(self.description, self.camera.T_parent_optical, given, QUICK)
 
     def look(self, q: np.ndarray, rng: np.random.Generator) -> bool:
         """Go there and take a sample; False when not all marks are in the image."""
@@ -130,7 +130,7 @@ def score(arm: Arm) -> float:
 
 @pytest.mark.parametrize("name", ["wrist", "overhead"])
 @pytest.mark.requirement("N-07", "A-40")
-def test_the_proposed_pose_tells_more_than_others_that_show_the_board(name: str) -> None:
+def test_the_proposed_pose_is_more_informative_than_others_that_show_the_board(name: str) -> None:
     """By the true mounts: with a sample at the first proposal the bound is below that with one at the average other."""
     arm, rng = Arm(name), np.random.default_rng(0)
     search = arm.search()

@@ -114,7 +114,7 @@ def test_a_damaged_session_is_refused(session, tmp_path: Path, damage: str, word
 
 
 def rewritten(known, path: Path, change) -> Path:
-    """A session file whose JSON and arrays somebody changed."""
+    """A session file whose JSON and arrays were modified."""
     known.samples.save(path)
     with np.load(path) as data:
         arrays = {name: data[name] for name in data.files}
@@ -165,7 +165,7 @@ def test_a_delay_of_20_ms_is_estimated_to_1_ms(session) -> None:
 
 @pytest.mark.requirement("P-28")
 def test_the_verdict_has_held_out_errors_and_reasons(session) -> None:
-    """A good set passes; few samples, a wrong board size and a drift are told."""
+    """A good set passes; few samples, a wrong board size and a drift are reported."""
     known = session(px=0.05)
     problem = known.samples.problem()
     solution = solve(problem)

@@ -49,14 +49,14 @@ def test_the_first_calibration_of_the_mounts_in_use_is_taken(tmp_path: Path) -> 
     own, of_seed = CalibrationStore(tmp_path), CalibrationStore(tmp_path / "mount_seed_7")
     of_seed.save(stored(0.2, 7))
     own.save(stored(0.1, 3))
-    found, told = of_these_mounts(places(tmp_path, 7), "wrist", "hand", 7)
+    found, warnings = of_these_mounts(places(tmp_path, 7), "wrist", "hand", 7)
     assert found is not None
     assert found.calibration.position[0] == 0.2
-    assert "of mount seed 3, the mounts in use are of mount seed 7" in told[0]
+    assert "of mount seed 3, the mounts in use are of mount seed 7" in warnings[0]
     own.save(stored(0.1, 7))
-    found, told = of_these_mounts(places(tmp_path, 7), "wrist", "hand", 7)
+    found, warnings = of_these_mounts(places(tmp_path, 7), "wrist", "hand", 7)
     assert found is not None
-    assert (found.calibration.position[0], told) == (0.1, ())
+    assert (found.calibration.position[0], warnings) == (0.1, ())
     assert of_these_mounts(places(tmp_path, 7), "wrist", "foot", 7)[0] is None
 
 

@@ -75,7 +75,7 @@ def test_noise_is_estimated_from_the_data() -> None:
 
 
 @pytest.mark.parametrize("robot", [(0.0, 0.0), ROBOT], ids=["exact", "robot"])
-def test_the_covariance_is_honest_where_few_poses_must_tell_the_noise_too(robot: tuple[float, float]) -> None:
+def test_the_covariance_is_honest_where_few_poses_must_give_the_noise_too(robot: tuple[float, float]) -> None:
     """60 trials of 6 poses, nothing known beforehand: NEES near 6, and 95 % regions that hold nearly that often."""
     rng = np.random.default_rng([12, robot[0] > 0])
     nees = []
@@ -89,7 +89,7 @@ def test_the_covariance_is_honest_where_few_poses_must_tell_the_noise_too(robot:
 
 
 def test_scale_and_intrinsics_come_out_right() -> None:
-    """A board printed 1 % small is told by its scale; a wrong focal length by freed intrinsics."""
+    """A board printed 1 % small is found by its scale; a wrong focal length by freed intrinsics."""
     truth = synthetic.trial("in_hand", 15, Noise(0.1), np.random.default_rng(5))
     small = [
         View(v.points * 0.99, v.pixels, v.A, v.setup, radius=v.radius * 0.99, pose=v.pose) for v in truth.problem.views

@@ -80,7 +80,7 @@ def test_planes_up_to_the_slant_are_left_alone(slant: float) -> None:
     inside = np.s_[1:-1, 1:-1]
     for depth in (z.astype(np.float32), np.round(z * 1e3).astype(np.uint16)):
         whole = np.ones(depth.shape, bool)
-        for dv in (-1, 0, 1):  # rows beside a row without depth have too few neighbours
+        for dv in (-1, 0, 1):  # rows next to a row without depth have too few neighbours
             whole &= np.roll(depth, dv, axis=0) > 0
         assert whole[inside].sum() > 2000
         assert not (flying(depth) & whole)[inside].any()

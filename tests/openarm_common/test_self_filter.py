@@ -49,7 +49,7 @@ def truth(kind: str, points: np.ndarray, padding: float) -> np.ndarray:
 @given(st.sampled_from(list(GEOMETRY)), st.integers(0, 2**32 - 1))
 @pytest.mark.requirement("P-05")
 def test_pixels_in_the_padded_shape_and_no_others_are_labelled(kind: str, seed: int) -> None:
-    """Any pose of the camera, also inside the shape or beside it."""
+    """Any pose of the camera, also inside the shape or next to it."""
     rng = np.random.default_rng(seed)
     description = RobotDescription.from_urdf(ONE_LINK.format(geometry=GEOMETRY[kind]))
     robot = SelfFilter(description, SelfFilterConfig(padding=0.03))

@@ -175,7 +175,7 @@ def test_a_frame_that_is_not_connected_yet_is_waited_for_and_then_named() -> Non
     assert refused.value.code is Code.NO_TRANSFORM
 
 
-def test_optional_joints_that_nobody_publishes_are_named_and_the_frame_is_used() -> None:
+def test_optional_joints_without_a_publisher_are_named_and_the_frame_is_used() -> None:
     eye = Eye(wait=0.5, frame=BASE, joints="optional")
     assert eye.image(103) is None
     eye.now = 1.1

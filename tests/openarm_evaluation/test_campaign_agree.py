@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two campaigns beside each other."""
+"""Two campaigns compared."""
 
 from __future__ import annotations
 

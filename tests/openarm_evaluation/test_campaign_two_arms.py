@@ -39,10 +39,10 @@ def test_an_object_that_no_arm_can_grasp_is_pushed_and_then_grasped() -> None:
     trials, row = run("push", 5000)
     assert row["as_expected"], row["message"]
     assert row["grasps"][0]["route"] == "push"
-    told = [step.reason for step in trials.steps if step.reason.startswith("push 1 by the")]
-    assert told
+    reasons = [step.reason for step in trials.steps if step.reason.startswith("push 1 by the")]
+    assert reasons
     # what the camera says of the push is what happened: the object was there when it was grasped
-    assert float(told[0].split(" mm from its destination")[0].split()[-1]) < 20.0
+    assert float(reasons[0].split(" mm from its destination")[0].split()[-1]) < 20.0
 
 
 @pytest.mark.requirement("A-65")

@@ -29,17 +29,17 @@ def data(tmp_path) -> Path:
 
 
 @pytest.mark.requirement("B-65")
-def test_the_report_tells_figures_and_shows_failures(data, capsys) -> None:
+def test_the_report_gives_figures_and_shows_failures(data, capsys) -> None:
     """Wrong in the first picture, right in the second: half of what is shown is right, the first picture is shown."""
     model = write_network(data / "net.onnx", boxes((100, 100, 141, 141, 0, 0.9)))
     out, figures = data / "page.html", data / "out.json"
     call = ["detector", "report", str(model), "--data", str(data), "--out", str(out), "--json", str(figures)]
     assert cli.run([*call, "--accept", "0.3"]) == 0
-    told = json.loads(figures.read_text())["models"]["net"]
-    assert told["precision"] == 0.5
-    assert told["recall"] == 1.0
-    assert told["map50"] == pytest.approx(0.5)  # balls are not there, and do not count
-    assert told["centre_median_px"] == pytest.approx(0.5 * 2**0.5, abs=1e-3)
+    figures_of_net = json.loads(figures.read_text())["models"]["net"]
+    assert figures_of_net["precision"] == 0.5
+    assert figures_of_net["recall"] == 1.0
+    assert figures_of_net["map50"] == pytest.approx(0.5)  # balls are not there, and do not count
+    assert figures_of_net["centre_median_px"] == pytest.approx(0.5 * 2**0.5, abs=1e-3)
     assert "centre 0.71 px" in capsys.readouterr().out
     page = out.read_text()
     assert page.count("<figure>") == 1

@@ -190,7 +190,7 @@ class World(Skills):
 
     def call(self, call: Call) -> None:
         if self.stopped is not None:
-            raise OpenArmError(self.stopped, "stopped on purpose")
+            raise OpenArmError(self.stopped, "stopped by injection")
         self.log.append((self.t_ns * 1e-9, call))
         for fault in self.faults:
             error = fault(call)
@@ -319,7 +319,7 @@ class World(Skills):
         def fault(call: Call) -> OpenArmError | None:
             if left[0] > 0 and chosen(call):
                 left[0] -= 1
-                return OpenArmError(code, f"{type(call).__name__} failed on purpose")
+                return OpenArmError(code, f"{type(call).__name__} failed by injection")
             return None
 
         self.faults.append(fault)

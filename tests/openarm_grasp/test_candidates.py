@@ -189,9 +189,9 @@ def test_score_is_the_sum_of_its_parts():
 def test_hands_whose_fingers_have_room_come_first():
     """A block stands close to the narrow side, across which the hand would close by itself: it turns by a quarter."""
     alone = box(yaw=0.0, size=(0.045, 0.05, 0.05))
-    beside = box(x=alone.p_base[0] + 0.075, yaw=0.0, size=(0.05, 0.05, 0.05), label="blue")
+    neighbour = box(x=alone.p_base[0] + 0.075, yaw=0.0, size=(0.05, 0.05, 0.05), label="blue")
     assert "/x" in propose(alone, CONFIG)[0].id
-    offered = propose(alone, CONFIG, others=(beside,))
+    offered = propose(alone, CONFIG, others=(neighbour,))
     assert "/y" in offered[0].id
     rooms = {c.id.split("/")[1][0]: c.parts["room"] for c in offered}
     assert rooms["y"] == 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One arm beside the other: it waits where the other stands, gives way when both wait, looks when nothing is hidden."""
+"""One arm next to the other: it waits for the other, gives way when both wait, looks when nothing is hidden."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def run(work: Coroutine[Any, Any, Any]) -> Any:
         work.send(None)
     except StopIteration as end:
         return end.value
-    raise AssertionError("it waits for something that nobody does")
+    raise AssertionError("it waits for something that never happens")
 
 
 def link(robot: Robot, arm: Any, coordination: ArmCoordination | None = None) -> CoordinatedRobot:
@@ -77,7 +77,7 @@ def test_an_arm_waits_until_the_other_has_gone_on_and_plans_again() -> None:
     assert robot.steps == 3
 
 
-def test_what_is_not_the_other_arms_doing_is_told_at_once() -> None:
+def test_what_is_not_the_other_arms_doing_is_reported_at_once() -> None:
     robot = Robot()
     robot.faults = [Code.IN_COLLISION]
     with pytest.raises(OpenArmError, match="in the way"):

@@ -145,7 +145,7 @@ def test_a_place_counts_when_the_camera_sees_it_within_2_cm(frames, code):
 
 @pytest.mark.requirement("P-08")
 def test_a_twin_elsewhere_is_not_taken_for_the_lifted_object() -> None:
-    """A taller object of the same label stands beside: it proves nothing, and the one that is gone is gone."""
+    """A taller object of the same label stands next to it: it proves nothing, and the one that is gone is gone."""
     twin = seen(x=0.40, top=0.50, height=0.10)
     assert judge_sight(seen(), [Frame(1, (twin,))], HELD, match_radius=0.03).code is Code.GRASP_MISSED
     assert judge_sight(seen(), [Frame(1, (twin,))], HELD, match_radius=0.03, others=(twin,)).ok

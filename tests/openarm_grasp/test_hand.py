@@ -96,7 +96,7 @@ def test_a_starved_process_does_not_take_its_own_pause_for_silence():
     silence.check(1.0)
 
 
-def test_robot_time_that_goes_back_is_a_robot_started_anew():
+def test_robot_time_that_goes_back_is_a_restarted_robot():
     silence = Silence(0.2)
     silence.update(0.0, 100 * MS)
     silence.update(0.1, 2 * MS)

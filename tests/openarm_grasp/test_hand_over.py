@@ -37,9 +37,9 @@ def test_an_object_goes_from_hand_to_hand_by_way_of_the_middle(robot) -> None:
     assert two.objects["red"].p_base[:2] == pytest.approx((0.25, 0.30), abs=1e-6)
     lifts = [effect.arm for effect in two.done(Follow) if effect.trajectory == "lift"]
     assert lifts == ["right", "left"]
-    told = [note for note in two.notes if "hand-over" in note]
-    assert "1 of 2: the right arm brings it to the middle" in told[0]
-    assert "2 of 2" in told[1]
+    notes = [note for note in two.notes if "hand-over" in note]
+    assert "1 of 2: the right arm brings it to the middle" in notes[0]
+    assert "2 of 2" in notes[1]
     # In between it stood where both reach, clear of the other object.
     middle = two.session.context.config.hand_over
     first = next(effect for effect in two.done(PlanPlace) if effect.arm == "right" and effect.after is None)
@@ -173,7 +173,7 @@ def test_an_arm_that_was_asked_for_is_not_replaced(robot) -> None:
 
 
 @pytest.mark.requirement("P-12")
-def test_a_dry_run_tells_the_way_and_moves_nothing(robot) -> None:
+def test_a_dry_run_reports_the_route_and_moves_nothing(robot) -> None:
     two = robot(0.25, -0.30)
     outcome = two.ask(place=(0.25, 0.30), dry_run=True)
     assert (outcome.code, outcome.route) == (Code.OK, "hand_over")

@@ -59,13 +59,13 @@ def test_the_answer_has_every_way_with_its_score_and_its_fate(asked) -> None:
     assert (found["red/y+/tilt45/lean-"].code, isnan(found["red/y+/tilt45/lean-"].limit_margin)) == ("", True)
 
 
-def test_a_refusal_tells_of_every_way(asked) -> None:
+def test_a_refusal_names_every_way(asked) -> None:
     refused = no_way(Code.UNREACHABLE, **{"red_x+_tilt0": "20 mm short"})
     found = by_id(asked(refused, refused))
     assert (found["red/x+/tilt0"].code, found["red/x+/tilt0"].message) == (Code.UNREACHABLE, "20 mm short")
 
 
-def test_an_edge_that_is_too_wide_is_told(asked) -> None:
+def test_an_edge_that_is_too_wide_is_reported(asked) -> None:
     found = by_id(asked(size=np.array([0.05, 0.09, 0.05])))
     assert len(found) == 15
     assert (found["red/y"].code, found["red/y"].message) == (
@@ -83,7 +83,7 @@ def test_what_could_be_grasped_but_not_placed_says_so_and_those_that_share_its_f
 
 
 def test_the_planner_says_what_became_of_each_and_how_near_to_a_limit() -> None:
-    """A wall beside the object: hands that lean over it are refused by its name."""
+    """A wall next to the object: hands that lean over it are refused by its name."""
     box = SceneObject(name="red_box", shape="box", size=(0.045, 0.06, 0.06), color="red", position=(0.26, -0.2))
     wall = replace_at(box, "blue_wall", "blue", (0.26, -0.29))
     scene = Scene(name="options", objects=(box, wall))

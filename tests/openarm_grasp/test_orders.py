@@ -28,7 +28,7 @@ def carry_out(
         code = (codes or {}).get(ask, Code.OK if table.get(ask.label) else Code.UNKNOWN_OBJECT)
         if code is Code.OK:
             table[ask.label] -= 1
-        order.done(ask, code, "as told")
+        order.done(ask, code, "injected")
     return asked
 
 
@@ -63,7 +63,7 @@ def test_an_order_done_in_part_says_so():
     order = Order(("red", "blue"))
     carry_out(order, {GraspRequest("red"): Code.TOO_WIDE})
     assert order.outcome == "PARTIAL"
-    assert order.faults() == {"red": "TOO_WIDE: as told"}
+    assert order.faults() == {"red": "TOO_WIDE: injected"}
     assert order.placed == ["blue"]
 
 
@@ -114,7 +114,7 @@ def test_what_others_block_is_asked_for_again_when_they_are_gone():
 def test_what_stays_blocked_failed_with_its_reason():
     order = Order(("red", "blue"))
     carry_out(order, {GraspRequest("red"): Code.NO_PLAN, GraspRequest("blue"): Code.NO_PLAN})
-    assert order.faults() == {"red": "NO_PLAN: as told", "blue": "NO_PLAN: as told"}
+    assert order.faults() == {"red": "NO_PLAN: injected", "blue": "NO_PLAN: injected"}
     assert order.outcome == "FAILED"
 
 

@@ -125,7 +125,7 @@ def test_a_cancel_in_each_state_drops_nothing_and_the_next_request_works(state: 
         if trials.steps and trials.steps[-1].state == state and not entered:
             entered.append(robot.t_ns)
         if entered and robot.t_ns - entered[0] > 400_000_000:
-            trials.link.cancelled = "cancelled on purpose"
+            trials.link.cancelled = "cancelled by injection"
         fastest.append(float(np.linalg.norm(robot.world.objects()[0].linear)))
 
     trials.link.watch = watch

@@ -176,6 +176,6 @@ def test_a_place_on_another_object_is_refused_with_its_name():
     assert error.value.code is Code.IN_COLLISION
 
 
-def test_a_place_beside_another_object_is_left_to_the_planner():
+def test_a_place_next_to_another_object_is_left_to_the_planner():
     p = check_position((0.30, -0.30, 9.9), box(), [box(x=0.36, y=-0.30, label="blue")], TABLE)
     assert p == pytest.approx((0.30, -0.30))

@@ -46,7 +46,7 @@ def test_the_grasp_after_a_push_is_planned_without_what_the_map_shows_of_the_obj
 
 
 @pytest.mark.requirement("N-13")
-def test_a_push_that_the_object_does_not_follow_is_repeated_three_times_and_told(robot) -> None:
+def test_a_push_that_the_object_does_not_follow_is_repeated_three_times_and_reported(robot) -> None:
     two = robot(0.46, 0.02)
     two.far, two.follows = 0.44, 0.1
     outcome = two.ask()
@@ -68,7 +68,7 @@ def test_the_camera_verifies_a_push(robot) -> None:
 
 
 @pytest.mark.requirement("N-13")
-def test_an_object_that_is_lost_in_a_push_is_told(robot) -> None:
+def test_an_object_that_is_lost_in_a_push_is_reported(robot) -> None:
     two = robot(0.46, 0.02)
     two.far = 0.44
     push = two.push

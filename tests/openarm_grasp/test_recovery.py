@@ -110,7 +110,7 @@ def test_an_alarm_that_the_look_from_home_does_not_confirm_is_raised_once(world,
 
 
 @pytest.mark.requirement("P-09")
-def test_an_object_that_has_fallen_over_is_told(world, box):
+def test_an_object_that_has_fallen_over_is_reported(world, box):
     """It stands at its target, lower than it was: nothing that the hand could try again would right it."""
     world.objects["red"] = box("red", 0.26, -0.2, size=0.06)
     outcome = world.grasp()  # the scripted hand puts down cubes of 50 mm
@@ -136,7 +136,7 @@ def test_lost_on_the_way_is_found_again(world, box):
             return None
         world.objects["red"] = box("red", 0.3, -0.3)
         world.held, world.gap = None, 0.0
-        return OpenArmError(Code.GRASP_LOST, "dropped on purpose")
+        return OpenArmError(Code.GRASP_LOST, "dropped by injection")
 
     world.faults.append(drop_once)
     outcome = world.grasp()
@@ -206,7 +206,7 @@ def test_no_way_home_is_tried_without_obstacles_then_named(world):
 @pytest.mark.parametrize("code", [Code.CANCELLED, Code.ROBOT_LOST, Code.INTERNAL])
 @pytest.mark.parametrize("state", list(State)[1:])
 def test_a_stop_in_any_state_ends_the_request_and_the_next_works(world, state, code):
-    world.faults.append(lambda e: OpenArmError(code, "stopped on purpose") if world.state is state else None)
+    world.faults.append(lambda e: OpenArmError(code, "stopped by injection") if world.state is state else None)
     outcome = world.grasp()
     assert outcome.code is code
     assert world.states[-2:] == [state, State.IDLE]

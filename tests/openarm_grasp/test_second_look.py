@@ -74,7 +74,7 @@ def test_a_second_look_that_does_not_help_changes_nothing(what: str, worlds, box
         if not near:
             return seen
         if what == "failed":
-            raise OpenArmError(Code.NOT_READY, "nobody publishes /wrist/detections_3d")
+            raise OpenArmError(Code.NOT_READY, "no node publishes /wrist/detections_3d")
         found = {"nothing": (), "another": (box("red", 0.34, -0.2),), "no plan": (box("red", 0.27, -0.2),)}[what]
         return Frames(tuple(replace(frame, detections=found) for frame in seen.frames), "base")
 

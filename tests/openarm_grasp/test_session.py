@@ -96,7 +96,7 @@ def test_a_place_goes_on_with_what_it_holds_after_frames_that_are_too_old(world)
     ],
 )
 @pytest.mark.requirement("P-02")
-def test_the_outcome_of_two_is_told_in_one_word(first: str, second: str, kind: str) -> None:
+def test_the_outcome_of_two_is_given_in_one_word(first: str, second: str, kind: str) -> None:
     proof = Proof(Verdict(Code.OK, "held"), Verdict(Code.OK, "at its place"))
     ends = {
         "done": GraspOutcome(Code.OK, "placed", "a", attempts=1, proof=proof),

@@ -178,10 +178,10 @@ def test_a_held_object_may_stand_on_the_table_on_straight_parts(right: Arm, home
 def test_fingers_are_where_they_are(right: Arm, home: dict[str, float]) -> None:
     q = q_of(right, home)
     tip = right.kinematics.fk(q)
-    beside = Box("post", tip @ se3.make(None, (0.0, 0.055, -0.02)), np.array([0.02, 0.02, 0.02]))
-    assert not right.scene(right.with_gripper(home, 0.0), [beside]).collides(q)
-    assert right.scene(right.with_gripper(home, 0.044), [beside]).collides(q)
-    contact = right.scene(right.with_gripper(home, 0.044), [beside]).contacts(q)[0]
+    post = Box("post", tip @ se3.make(None, (0.0, 0.055, -0.02)), np.array([0.02, 0.02, 0.02]))
+    assert not right.scene(right.with_gripper(home, 0.0), [post]).collides(q)
+    assert right.scene(right.with_gripper(home, 0.044), [post]).collides(q)
+    contact = right.scene(right.with_gripper(home, 0.044), [post]).contacts(q)[0]
     assert contact.first == "openarm_right_left_finger"  # the follower moves too, on the +y side
 
 

@@ -59,7 +59,7 @@ def test_the_scene_asks_for_its_full_clearance_again_afterwards(right: Arm, home
 
 
 class Blind:
-    """A planner that looks at nothing, and remembers how closely it was told to look."""
+    """A planner that checks nothing, and records the resolution it was asked for."""
 
     def __init__(self) -> None:
         self.resolutions: list[tuple[float, float]] = []

@@ -49,12 +49,12 @@ def states_after(target: Mapper, scene: MapScene, t_ns: int, rng=None, held=(), 
 
 
 def test_compare_counts_what_it_says() -> None:
-    """A surface seen one cell beside itself is neither a ghost nor missed."""
+    """A surface seen one cell off is neither a ghost nor missed."""
     states, surface = np.zeros((9, 9, 9), np.uint8), np.zeros((9, 9, 9), bool)
     surface[2:5, 4, 4] = True
     states[2:5, 4, 5] = OCCUPIED
-    beside = compare(states, surface, surface)
-    assert (beside.iou, beside.iou_strict, beside.ghosts, beside.missed) == (1.0, 0.0, 0, 0)
+    shifted = compare(states, surface, surface)
+    assert (shifted.iou, shifted.iou_strict, shifted.ghosts, shifted.missed) == (1.0, 0.0, 0, 0)
     states[8, 8, 8] = OCCUPIED
     surface[0, 0, 0] = True
     worse = compare(states, surface, surface)

@@ -251,7 +251,7 @@ def test_each_query_says_what_unknown_counts_as() -> None:
     assert mapper.query([free], 64 * 0.02, "free").blocked.tolist() == [True]  # the coarse cell holds the box
 
 
-def test_decay_forgets_what_nobody_looked_at() -> None:
+def test_decay_forgets_what_was_not_observed() -> None:
     grid = OccupancyGrid(GridConfig(decay_s=2.0, **SMALL))
     s = 1_000_000_000
     grid.integrate([scan(floor(box=(slice(20, 28), slice(28, 36), 890)))], 5 * s)

@@ -72,7 +72,7 @@ def test_the_best_box_of_a_thing_is_kept_and_neighbours_stay() -> None:
         output(
             (50, 50, 20, 20, 0.6, 0.1),  # weaker, same thing
             (51, 50, 20, 20, 0.9, 0.1),
-            (75, 50, 20, 20, 0.7, 0.2),  # beside
+            (75, 50, 20, 20, 0.7, 0.2),  # next to it
             (51, 51, 20, 20, 0.1, 0.8),  # same place, other class: overlaps by more than half way
             (10, 10, 5, 5, 0.3, 0.2),  # not certain enough
         ),

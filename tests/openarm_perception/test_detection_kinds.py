@@ -28,14 +28,14 @@ CLASSES = ("box", "cylinder")
 def perceive(tabletop, tmp_path):
     """What a kind of detector makes of things, of which the network tells (class, score, shift of its box, px)."""
 
-    def run(kind: DetectorKind, things, told=None, spoil=None, robot=None) -> Perceived:
+    def run(kind: DetectorKind, things, answers=None, spoil=None, robot=None) -> Perceived:
         view = tabletop.render(things)
         rows = []
         for i, thing in enumerate(things):
             alone = Pipeline(COLORS, Localizer(LocalizerConfig(), LIMITS, tabletop.table_height))
             colour = replace(thing, label="red") if thing.label == "grey" else thing
             (found,) = alone.detector.detect(tabletop.render([colour]).rgb)
-            say = (CLASSES.index(thing.kind), 0.9, 0.0) if told is None else told.get(i)
+            say = (CLASSES.index(thing.kind), 0.9, 0.0) if answers is None else answers.get(i)
             if say is not None:
                 (u, v), (w, h) = found.origin, found.size
                 grow = say[3] if len(say) > 3 else 0.0
@@ -92,7 +92,7 @@ def test_what_both_see_is_found_and_named_by_both(tabletop, perceive) -> None:
 
 @pytest.mark.requirement("N-16")
 def test_what_the_network_does_not_see_is_looked_at_again(tabletop, perceive) -> None:
-    """A network that has gone blind: nothing coloured is grasped, all of it stands in the way, and each is told of."""
+    """A network that has gone blind: nothing coloured is grasped, all of it stands in the way, and each is reported."""
     seen = perceive("both", three(tabletop), {2: (0, 0.9, 0.0)})
     assert [place.label for place in seen.located] == ["box"]
     assert sorted(place.label for place in seen.unmeasured) == ["blue", "red"]

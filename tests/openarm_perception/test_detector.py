@@ -91,7 +91,7 @@ def test_red_wraps_around_zero(detector: Detector, hue_deg: float) -> None:
 @pytest.mark.parametrize("value", [0.25, 0.5, 0.95])
 @pytest.mark.requirement("B-18")
 def test_every_palette_colour_has_one_name_at_any_brightness(detector: Detector, value: float) -> None:
-    """The colours of the objects, among them the red of the cube and of the can, are told apart."""
+    """The colours of the objects, among them the red of the cube and of the can, are distinguished."""
     hues = {"red": 0, "orange": 27, "yellow": 51, "green": 130, "blue": 225, "purple": 285}
     for label, hue in hues.items():
         colour = tuple(round(255 * c) for c in colorsys.hsv_to_rgb(hue / 360.0, 0.8, value))
@@ -164,7 +164,7 @@ def test_wrong_colours_are_refused(change: dict[str, object], fault: str) -> Non
 
 
 def test_labels_must_be_unique() -> None:
-    """Two colours of one name can't be told apart by who asks for it."""
+    """Two colours of one name can't be distinguished by who asks for it."""
     color = {"label": "red", "hue_deg": (345, 12)}
     with pytest.raises(ValueError, match="unique"):
         ColorDetectorConfig.model_validate({"classes": [color, color]})

@@ -91,7 +91,7 @@ def test_the_median_takes_noise_and_keeps_holes_and_edges() -> None:
     assert np.std(out[inner][out[inner] > 0].astype(float) - 600) < 2.5
     assert out[60, 80] == 0
     assert (out[20:24, 20:24] == 0).all()
-    assert np.abs(out[62, 81].astype(float) - 600) < 25  # beside a hole: not pulled towards zero
+    assert np.abs(out[62, 81].astype(float) - 600) < 25  # next to a hole: not pulled towards zero
     metres = (noisy * 1e-3).astype(np.float32)
     metres[metres == 0] = np.nan
     np.testing.assert_array_equal(np.isnan(median_depth(metres, 3)), np.isnan(metres))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Followers against an ideal arm (it is where it was told to be), and against arms that lag, stick or are pushed."""
+"""Followers against an ideal arm (it is always where commanded), and against arms that lag, stick or are pushed."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def test_the_newest_state_is_drawn_and_no_camera_is_forgotten(ends) -> None:
     assert receiver.take(0.0) is None
 
 
-def test_a_side_that_does_not_listen_keeps_nobody_waiting(ends) -> None:
+def test_a_side_that_does_not_listen_blocks_no_one(ends) -> None:
     sender, receiver, _ = ends
     m = model()
     taken = [sender.offer(snapshot(t, m), ["a"]) for t in range(20000)]

@@ -32,7 +32,7 @@ def test_every_thread_is_real_time_and_children_are_not_where_the_system_allows_
     assert (said == "SCHED_FIFO 7" and fifo == "True") or ("rtprio" in said and fifo == "False")
 
 
-def test_a_user_without_the_right_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_user_without_the_right_sees_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes reference.bt and the digest of reference.ot beside this file with liboctomap (through pyoctomap).
+"""Makes reference.bt and the digest of reference.ot next to this file with liboctomap (through pyoctomap).
 
     pip install pyoctomap numpy
     python tests/openarm_octomap/data/make_reference.py
