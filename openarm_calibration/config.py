@@ -52,7 +52,7 @@ class AutoConfig(Config):
     tries: int = Field(default=90, ge=1, description="poses that are tried for one sample before it is given up")
     velocity_scale: float = Field(default=0.5, gt=0.0, le=1.0, description="of the motions")
     delay_velocity_scale: float = Field(default=0.1, gt=0.0, le=1.0, description="while the delay is measured")
-    settle_timeout: float = Field(default=5.0, gt=0.0, description="longest wait until the arm stands still, s")
+    settle_timeout: float = Field(default=5.0, gt=0.0, description="longest wait until the arm is at rest, s")
     move_timeout: float = Field(default=60.0, gt=0.0, description="longest wait for a motion, s of wall clock")
     plate: float = Field(default=0.01, gt=0.0, description="thickness that plans allow for the board, m")
     on_table: PlaceConfig = Field(default_factory=PlaceConfig, description="board of a camera that moves, base frame")

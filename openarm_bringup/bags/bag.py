@@ -172,7 +172,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """Open a rosbag2 folder or an MCAP file for reading.
 
     A recording that was cut short (SIGKILL, full disk) lacks its end: everything whole in it is kept, the end is
-    written anew and the metadata made from the file.
+    written again and the metadata made from the file.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when it is missing, empty, truncated beyond use, or something else.

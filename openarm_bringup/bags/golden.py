@@ -13,7 +13,7 @@ from typing import Any
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
 
-#: How far a number may be off when it is written anew, by the unit its name ends in; others have to be equal.
+#: How far a number may be off when it is computed again, by the unit its name ends in; others have to be equal.
 TOLERANCES = {"_mm": 0.5, "_deg": 0.3, "_px": 0.05}
 #: Share of cells that may differ between machines, by rounding of the last bit.
 CELLS = 0.002

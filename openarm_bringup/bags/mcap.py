@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The end of an MCAP file that was cut short is written anew (https://mcap.dev/spec).
+"""The end of an MCAP file that was cut short is restored (https://mcap.dev/spec).
 
 A file is a magic, records (one byte of kind, eight of length, content), a summary, a footer record and the magic again.
 Without the end no reader opens it, and without the summary's index of chunks none gives the messages of several topics
@@ -65,7 +65,7 @@ def mend(path: Path) -> int | None:
         )
     with path.open("r+b") as file:
         chunks, end = whole_chunks(file, size)
-        # Whether all indexes of the last chunk were written only its content shows: they are made anew.
+        # Whether all indexes of the last chunk were written only its content shows: they are made again.
         # After a loss of power its content may be missing, whatever its length: then it is given up.
         indexes: list[bytes] | None = None
         while chunks and (indexes := _indexes(file, chunks[-1][0])) is None:

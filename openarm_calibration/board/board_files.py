@@ -128,7 +128,7 @@ def mesh(board: Board) -> tuple[list[float], list[float], list[int]]:
 
 
 def mjcf(board: Board, texture: str) -> str:
-    """MJCF with the board as a body `calibration_board` in its own frame; `texture` is the PNG beside it."""
+    """MJCF with the board as a body `calibration_board` in its own frame; `texture` is the PNG next to it."""
     vertices, uv, faces = mesh(board)
     numbers = [" ".join(f"{v:g}" for v in values) for values in (vertices, uv)]
     return f"""<mujoco model="calibration_board">

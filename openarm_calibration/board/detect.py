@@ -129,7 +129,7 @@ def detect(board: Board, image: Grey) -> BoardDetection:
 def _circles(board: CircleGrid, image: Grey) -> BoardDetection:
     seen = 0
     size = (board.columns, board.rows)
-    # A far board is looked for in an enlarged image; the contours of small blobs are too coarse otherwise.
+    # A far board is searched for in an enlarged image; the contours of small blobs are too coarse otherwise.
     for zoom in (1, 2, 3):
         large = image if zoom == 1 else cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
         blobs = _blob_detector(large.shape[0] * large.shape[1], len(board.points))
@@ -197,15 +197,12 @@ def _ordered(board: CircleGrid, pixels: Array) -> Array:
     The grid finder may start at either end. A mirrored order fits a plane as well; its chirality differs.
     """
     grid = pixels.reshape(board.rows, board.columns, 2)
-    candidates = [grid, grid[::-1, ::-1], grid[::-1], grid[:, ::-1]]
-    best, least = pixels, np.inf
-    for candidate in candidates:
-        flat = candidate.reshape(-1, 2)
-        H = homography(board.points[:, :2], flat)
-        residual = _homography_residual(H, board.points[:, :2], flat)
-        if np.linalg.det(H[:2, :2] - np.outer(H[:2, 2], H[2, :2]) / H[2, 2]) > 0.0 and residual < least:
-            best, least = flat, residual
-    return np.ascontiguousarray(best)
+    orders = [
+        np.ascontiguousarray(order.reshape(-1, 2)) for order in (grid, grid[::-1, ::-1], grid[::-1], grid[:, ::-1])
+    ]
+    fits = [_fit(board.points[:, :2], order) for order in orders]
+    fronts = [(residual, k) for k, (residual, mirrored) in enumerate(fits) if not mirrored]
+    return orders[min(fronts, default=(0.0, 0))[1]]
 
 
 def _refined(board: CircleGrid, image: Grey, rough: Array) -> tuple[NDArray[np.int64], Array, float]:
@@ -224,7 +221,7 @@ def _refined(board: CircleGrid, image: Grey, rough: Array) -> tuple[NDArray[np.i
     away = np.linalg.norm(mapped(_robust_homography(plane[sure], exact[sure]), plane) - exact, axis=1)
     ids = np.flatnonzero(sure & (away <= 6.0 * float(np.median(away[sure])) + 0.1))
     plane, exact = plane[ids], exact[ids]
-    return ids, exact, _homography_residual(homography(plane, exact), plane, exact) if len(ids) >= 4 else np.inf
+    return ids, exact, _fit(plane, exact)[0] if len(ids) >= 4 else np.inf
 
 
 def _corners(board: Charuco, image: Grey) -> BoardDetection:
@@ -243,9 +240,7 @@ def _corners(board: Charuco, image: Grey) -> BoardDetection:
     marks = board.points[index, :2]
     if np.linalg.matrix_rank(marks - marks.mean(axis=0), tol=1e-6) < 2:
         raise OpenArmError(Code.NOTHING_DETECTED, f"{count} corners of {board.label} lie on one line; show more of it")
-    H = homography(marks, pixels)
-    residual = _homography_residual(H, marks, pixels)
-    mirrored = np.linalg.det(H[:2, :2] - np.outer(H[:2, 2], H[2, :2]) / H[2, 2]) <= 0.0
+    residual, mirrored = _fit(marks, pixels)
     if residual > MOST_RESIDUAL or mirrored:
         why = "the image is mirrored" if mirrored else f"{residual:.2f} px rms, expected at most {MOST_RESIDUAL} px"
         raise OpenArmError(Code.NOTHING_DETECTED, f"{count} corners do not lie as on {board.label}: {why}")
@@ -265,8 +260,11 @@ def homography(plane: Array, pixels: Array) -> Array:
     return cv2.findHomography(plane, pixels)[0].astype(np.float64)
 
 
-def _homography_residual(H: Array, plane: Array, pixels: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum((mapped(H, plane) - pixels) ** 2, axis=1))))
+def _fit(plane: Array, pixels: Array) -> tuple[float, bool]:
+    """Return the rms distance of marks from the image of their plane, px, and whether that image is mirrored."""
+    H = homography(plane, pixels)
+    residual = float(np.sqrt(np.mean(np.sum((mapped(H, plane) - pixels) ** 2, axis=1))))
+    return residual, bool(np.linalg.det(H[:2, :2] - np.outer(H[:2, 2], H[2, :2]) / H[2, 2]) <= 0.0)
 
 
 def guess_pose(points: Array, pixels: Array, radius: float, intrinsics: Intrinsics) -> tuple[Array, float]:

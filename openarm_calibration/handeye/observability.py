@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openarm_calibration.handeye.problem import Problem
-from openarm_calibration.handeye.refine import Estimate
+from openarm_calibration.handeye.refine import Estimate, Noise
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
@@ -132,25 +132,21 @@ def require_accuracy(problem: Problem, estimate: Estimate, most_translation: flo
     """
     condition = condition_number(problem, estimate.information)
     if condition > _WORST_CONDITION:
-        seen = motion(problem.A[problem.kind < 2])
-        raise OpenArmError(
-            Code.DEGENERATE,
-            f"{_cause(seen, estimate)}: some direction of the mounts is not determined"
-            f" (condition {condition:.1e}, at most {_WORST_CONDITION:.0e} is accepted);"
-            f" {_advice(seen, estimate)}",
-        )
+        raise _degenerate(
+            motion(problem.A[problem.kind < 2]), estimate.noise,
+            f"some direction of the mounts is not determined (condition {condition:.1e}, at most"
+            f" {_WORST_CONDITION:.0e} is accepted)",
+        )  # fmt: skip
     covariance = estimate.covariance()
     for camera in range(problem.cameras):
         variance = np.maximum(np.diag(covariance)[6 * camera : 6 * camera + 6], 0.0)
         t, r = math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum())
         if t > most_translation or r > most_rotation:
-            seen = motion(problem.A[(problem.camera == camera) & (problem.kind < 2)])
-            raise OpenArmError(
-                Code.DEGENERATE,
-                f"{_cause(seen, estimate)}: the predicted error is {t * 1e3:.2g} mm and {math.degrees(r):.2g}°,"
-                f" more than {most_translation * 1e3:g} mm or {math.degrees(most_rotation):g}°;"
-                f" {_advice(seen, estimate)}",
-            )
+            raise _degenerate(
+                motion(problem.A[(problem.camera == camera) & (problem.kind < 2)]), estimate.noise,
+                f"the predicted error is {t * 1e3:.2g} mm and {math.degrees(r):.2g}°,"
+                f" more than {most_translation * 1e3:g} mm or {math.degrees(most_rotation):g}°",
+            )  # fmt: skip
 
 
 def condition_number(problem: Problem, information: Array) -> float:
@@ -164,37 +160,27 @@ def condition_number(problem: Problem, information: Array) -> float:
     return float(values[-1] / values[0]) if values[0] > 0.0 else math.inf
 
 
-def _cause(seen: Motion, estimate: Estimate) -> str:
+def _degenerate(seen: Motion, noise: Noise, what: str) -> OpenArmError:
+    """Return the refusal of an answer: its cause, what is wrong with it, and what to do."""
+    advice = "add poses, nearer to the board and with larger rotations"
     if seen.rotation < _SMALL_ROTATION:
-        return f"rotations too small (up to {math.degrees(seen.rotation):.1f}°)"
-    if seen.second < _SMALL_SECOND_AXIS:
-        return (
-            f"nearly one rotation axis (up to {math.degrees(seen.second):.1f}° across the gripper's {_name(seen.axis)})"
-        )
-    if seen.poses < 6:
-        return f"too few poses ({seen.poses})"
-    if _contradicting(estimate):
-        noise = estimate.noise
-        return (
+        cause = f"rotations too small (up to {math.degrees(seen.rotation):.1f}°)"
+        advice = "rotate the hand by 30° or more between samples, about two different axes"
+    elif seen.second < _SMALL_SECOND_AXIS:
+        across = math.degrees(seen.second)
+        cause = f"nearly one rotation axis (up to {across:.1f}° across the gripper's {_name(seen.axis)})"
+        advice = f"rotate by 15° or more about {_other(seen.axis)} too"
+    elif seen.poses < 6:
+        cause = f"too few poses ({seen.poses})"
+    elif noise.translation > _BAD_ARM[0] or noise.rotation > _BAD_ARM[1]:
+        cause = (
             f"{seen.poses} poses that contradict each other, as if the robot were off by"
             f" {noise.translation * 1e3:.1f} mm and {math.degrees(noise.rotation):.2f}°"
         )
-    return f"{seen.poses} poses that are too noisy or too far from the board"
-
-
-def _advice(seen: Motion, estimate: Estimate) -> str:
-    if seen.rotation < _SMALL_ROTATION:
-        return "rotate the hand by 30° or more between samples, about two different axes"
-    if seen.second < _SMALL_SECOND_AXIS:
-        return f"rotate by 15° or more about {_other(seen.axis)} too"
-    if seen.poses >= 6 and _contradicting(estimate):
-        return "check the intrinsics in camera_info, the size of the board, and that it did not move"
-    return "add poses, nearer to the board and with larger rotations"
-
-
-def _contradicting(estimate: Estimate) -> bool:
-    """Return whether the robot's errors, as estimated, are larger than those of any arm in order."""
-    return estimate.noise.translation > _BAD_ARM[0] or estimate.noise.rotation > _BAD_ARM[1]
+        advice = "check the intrinsics in camera_info, the size of the board, and that it did not move"
+    else:
+        cause = f"{seen.poses} poses that are too noisy or too far from the board"
+    return OpenArmError(Code.DEGENERATE, f"{cause}: {what}; {advice}")
 
 
 def _name(axis: Array) -> str:

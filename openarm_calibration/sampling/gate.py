@@ -2,7 +2,7 @@
 """Which image may be paired with which joint state.
 
 The stamp of the image is the base. A joint state counts within 5 ms of it, or between two that bracket it, and only
-while the robot stands still: 5 ms at 0.25 m/s are a millimetre and more. Nothing is ever paired with "the latest".
+while the robot is at rest: 5 ms at 0.25 m/s are a millimetre and more. Nothing is ever paired with "the latest".
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from openarm_common.robot.robot_state import RobotStateBuffer
 
 
 class GateConfig(Config):
-    """When a robot counts as standing."""
+    """When a robot counts as at rest."""
 
     max_speed: float = Field(default=0.005, gt=0.0, description="of any joint that moves camera or board, rad/s")
     window: float = Field(default=0.2, gt=0.0, le=2.0, description="before the image in which the speed is measured, s")
@@ -73,13 +73,13 @@ def match(
         raise OpenArmError(
             Code.STALE_DATA,
             f"{len(before)} joint states in the {config.window:g} s before the image, at least 2 are needed to see"
-            " whether the robot stands; wait and take the sample again",
+            " whether the robot is at rest; wait and take the sample again",
         )
     if speed > config.max_speed and not moving:
         raise OpenArmError(
             Code.MOVING,
             f"the robot moves: {fastest} at {speed:.3f} rad/s, at most {config.max_speed:g} rad/s while a sample is"
-            " taken; wait until it stands",
+            " taken; wait until it is at rest",
         )
     return Matched(joints, nearest[0], speed, tuple(around))
 

@@ -70,7 +70,7 @@ def stretches(
         states: Joint states in the order of their stamps.
         names: Joints that move camera or board.
         robot: Their robot.
-        gate: When it stands still.
+        gate: When it is at rest.
     """
     # states enter as if the images were live, so that the gate reads a few seconds and not an hour
     buffer = RobotStateBuffer(robot, capacity=2000)

@@ -187,7 +187,7 @@ class Recorder(ContextNode):
         self._await_discovery()
         self._discover()
         self._began.set()
-        # Polling sixty readers takes 0.1 ms; an executor makes a wait set of them anew for every few messages.
+        # Polling sixty readers takes 0.1 ms; an executor makes a new wait set of them for every few messages.
         found_at = time.monotonic()
         while not self._end.wait(_LOOK_S):
             if time.monotonic() - found_at > _DISCOVERY_S:
