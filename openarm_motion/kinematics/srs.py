@@ -29,13 +29,11 @@ class SrsMiss:
 
     Attributes:
         too_far: How much further than the arm reaches the wrist would be, m; negative: how much too near; else 0.
-        joint: Index of the joint that binds, when the distance is not the reason.
-        excess: How far outside its limit it would be, rad.
+        excess: How far outside its limit the joint that binds would be, when the distance is not the reason, rad.
         nearest: (7,) that configuration; empty when the distance is the reason.
     """
 
     too_far: float
-    joint: int
     excess: float
     nearest: Array
 
@@ -72,13 +70,13 @@ class SrsArm:
         rows = srs_kernels.BRANCHES * swivels.size
         found, at, branch = np.empty((rows, 7)), np.empty(rows), np.empty(rows, dtype=np.int64)
         nearest = np.empty(7)
-        count, status, joint, excess = srs_kernels.sweep(
+        count, status, excess = srs_kernels.sweep(
             _c(pose), swivels, self._geometry, self._tool, self._lower, self._upper, margin, found, at, branch, nearest
         )
         solutions = [Solution(found[i].copy(), float(at[i]), int(branch[i])) for i in range(count)]
         if status:
-            return solutions, SrsMiss(self._distance_excess(pose), 0, 0.0, np.empty(0))
-        return solutions, SrsMiss(0.0, int(joint), float(excess), nearest)
+            return solutions, SrsMiss(self._distance_excess(pose), 0.0, np.empty(0))
+        return solutions, SrsMiss(0.0, float(excess), nearest)
 
     def follow(
         self, poses: Array, swivels: Array, branch: int, margin: float, max_step: float

@@ -234,7 +234,7 @@ def sweep(
     found_swivel: Array,
     found_branch: NDArray[np.int64],
     nearest: Array,
-) -> tuple[int, int, int, float]:
+) -> tuple[int, int, float]:
     """All branches at all swivel angles.
 
     Args:
@@ -251,18 +251,19 @@ def sweep(
         nearest: (7,) output: the configuration that exceeds its limits the least.
 
     Returns:
-        Number of configurations found; 0, TOO_FAR or TOO_NEAR; the joint that binds and by how much (rad) in `nearest`.
+        Number of configurations found; 0, TOO_FAR or TOO_NEAR; by how much the joint that binds exceeds its limit
+        in `nearest`, rad.
     """
-    count, status, joint, least = 0, 0, 0, np.inf
+    count, status, least = 0, 0, np.inf
     q = np.empty(7)
     for k in range(swivels.shape[0]):
         for branch in range(BRANCHES):
             status = solve(pose, swivels[k], branch, geometry, tool, lower, upper, q)
             if status != 0:
-                return count, status, joint, least
-            worst, which = _excess(q, lower, upper)
+                return count, status, least
+            worst, _ = _excess(q, lower, upper)
             if worst < least:
-                least, joint = worst, which
+                least = worst
                 for i in range(7):
                     nearest[i] = q[i]
             if worst <= -margin:
@@ -271,7 +272,7 @@ def sweep(
                 found_swivel[count] = swivels[k]
                 found_branch[count] = branch
                 count += 1
-    return count, 0, joint, least
+    return count, 0, least
 
 
 @njit(cache=True, nogil=True)

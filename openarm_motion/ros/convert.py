@@ -8,13 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from geometry_msgs.msg import Point
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
-from openarm_interfaces.msg import (
-    ApproachTarget,
-    ArmTarget,
-    CollisionBox,
-    CollisionObject,
-    PlanFailure,
-)
+from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox, CollisionObject, PlanFailure
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -181,7 +175,7 @@ def move_request(goal: MoveArm.Goal) -> MoveRequest:
     """What a goal of /motion/move asks."""
     return MoveRequest(
         goal.arm,
-        _goal(goal),
+        _single_goal(goal),
         boxes_from_msg(goal.obstacles),
         boxes_from_msg(goal.attached),
         goal.hand_empty,
@@ -213,30 +207,27 @@ def execute_request(goal: ExecuteTrajectory.Goal) -> ExecuteRequest:
     return ExecuteRequest(goal.arm, Motion(tuple(names), t, q, v, a), goal.max_start_delay, goal.scene_version)
 
 
-def _goal(goal: MoveArm.Goal) -> Goal:
-    kind, frame = goal.kind, goal.pose.header.frame_id
-    if kind == goal.JOINTS:
-        return JointGoal(np.array(goal.joint_positions, np.float64))
-    if kind == goal.NAMED:
-        return NamedGoal(goal.named)
-    if kind == goal.POSE:
-        return PoseGoal(pose_to_matrix(goal.pose.pose), frame, goal.position_only)
-    if kind == goal.LINEAR:
-        return LineGoal(pose_to_matrix(goal.pose.pose), frame)
-    raise OpenArmError(Code.INVALID_ARGUMENT, f"kind is {kind}; valid: JOINTS 0, POSE 1, LINEAR 2, NAMED 3")
+def _goal(message: MoveArm.Goal | ArmTarget, valid: str) -> JointGoal | NamedGoal | PoseGoal:
+    """A goal of one of the kinds that a motion of one arm and a dual-arm motion have in common."""
+    if message.kind == message.JOINTS:
+        return JointGoal(np.array(message.joint_positions, np.float64))
+    if message.kind == message.NAMED:
+        return NamedGoal(message.named)
+    if message.kind == message.POSE:
+        return PoseGoal(pose_to_matrix(message.pose.pose), message.pose.header.frame_id, message.position_only)
+    raise OpenArmError(Code.INVALID_ARGUMENT, f"kind is {message.kind}; valid: {valid}")
+
+
+def _single_goal(goal: MoveArm.Goal) -> Goal:
+    if goal.kind == goal.LINEAR:
+        return LineGoal(pose_to_matrix(goal.pose.pose), goal.pose.header.frame_id)
+    return _goal(goal, "JOINTS 0, POSE 1, LINEAR 2, NAMED 3")
 
 
 def _dual_goal(target: ArmTarget) -> DualGoal:
-    kind = target.kind
-    if kind == ArmTarget.JOINTS:
-        return JointGoal(np.array(target.joint_positions, np.float64))
-    if kind == ArmTarget.NAMED:
-        return NamedGoal(target.named)
-    if kind == ArmTarget.YIELD:
+    if target.kind == ArmTarget.YIELD:
         return YieldGoal(target.named or "home")
-    if kind == ArmTarget.POSE:
-        return PoseGoal(pose_to_matrix(target.pose.pose), target.pose.header.frame_id, target.position_only)
-    raise OpenArmError(Code.INVALID_ARGUMENT, f"kind is {kind}; valid: JOINTS 0, POSE 1, NAMED 3, YIELD 4")
+    return _goal(target, "JOINTS 0, POSE 1, NAMED 3, YIELD 4")
 
 
 def trajectory_msg(trajectory: Trajectory) -> JointTrajectory:
@@ -255,7 +246,7 @@ def held_markers(held: Mapping[str, tuple[str, Sequence[Box]]]) -> MarkerArray:
     return array
 
 
-def _marker(name: str, id: int, kind: int | None, frame: str, color: tuple[float, float, float, float]) -> Marker:
+def _marker(name: str, id: int, kind: int, frame: str, color: tuple[float, float, float, float]) -> Marker:
     marker = Marker(ns=name, id=id, type=kind, action=Marker.ADD)
     marker.header.frame_id = frame
     marker.color.r, marker.color.g, marker.color.b, marker.color.a = color

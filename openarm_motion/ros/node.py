@@ -27,11 +27,12 @@ from openarm_motion.collision.solids import Box
 from openarm_motion.config import MotionConfig
 from openarm_motion.ros import convert
 from openarm_motion.ros.robot import NodeRobot
-from openarm_motion.service.motion_service import MotionService, make_arms, table_box
+from openarm_motion.service.motion_service import MotionService, Report, make_arms, table_box
 from openarm_motion.service.requests import ApproachAnswer, MotionAnswer, MoveAnswer, MoveArmsAnswer
 from openarm_motion.timing.trajectory import Trajectory
 
 AnswerT = TypeVar("AnswerT", bound=MotionAnswer)
+RequestT = TypeVar("RequestT")
 
 #: Pace of feedback while planning, s.
 _FEEDBACK = 0.1
@@ -86,12 +87,11 @@ class MotionNode(BaseNode[MotionConfig]):
         def report(stage: str, tried: float) -> None:
             feedback.stage, feedback.tried = stage, int(tried)
 
-        def ask() -> Awaitable[ApproachAnswer]:
-            return self.service.plan_approach(convert.approach_request(handle.request), cancelled(handle), report)
-
         timer = self.create_timer(_FEEDBACK, lambda: handle.publish_feedback(feedback), clock=self.steady_clock)
         try:
-            answer = await _answered(ApproachAnswer, ask)
+            answer = await _answered(
+                ApproachAnswer, handle, convert.approach_request, self.service.plan_approach, report
+            )
         finally:
             self.destroy_timer(timer)
         result = PlanApproach.Result(chosen=-1, start_delay=answer.start_delay)
@@ -103,9 +103,7 @@ class MotionNode(BaseNode[MotionConfig]):
 
     async def _on_move(self, handle: ServerGoalHandle) -> MoveArm.Result:
         report = _reporter(handle, MoveArm.Feedback())
-        answer = await _answered(
-            MoveAnswer, lambda: self.service.move(convert.move_request(handle.request), cancelled(handle), report)
-        )
+        answer = await _answered(MoveAnswer, handle, convert.move_request, self.service.move, report)
         result = MoveArm.Result(start_delay=answer.start_delay)
         if answer.trajectory is not None:
             result.trajectory = convert.trajectory_msg(answer.trajectory)
@@ -113,10 +111,7 @@ class MotionNode(BaseNode[MotionConfig]):
 
     async def _on_move_arms(self, handle: ServerGoalHandle) -> MoveArms.Result:
         report = _reporter(handle, MoveArms.Feedback())
-        answer = await _answered(
-            MoveArmsAnswer,
-            lambda: self.service.move_arms(convert.move_arms_request(handle.request), cancelled(handle), report),
-        )
+        answer = await _answered(MoveArmsAnswer, handle, convert.move_arms_request, self.service.move_arms, report)
         result = MoveArms.Result()
         if answer.plan is not None:
             result.start_delays, result.clearance = list(answer.plan.start_delays), answer.plan.clearance
@@ -124,16 +119,8 @@ class MotionNode(BaseNode[MotionConfig]):
         return _end(handle, result, answer)
 
     async def _on_execute(self, handle: ServerGoalHandle) -> ExecuteTrajectory.Result:
-        feedback = ExecuteTrajectory.Feedback()
-
-        def report(stage: str, progress: float) -> None:
-            feedback.progress = progress
-            handle.publish_feedback(feedback)
-
-        answer = await _answered(
-            MotionAnswer,
-            lambda: self.service.execute(convert.execute_request(handle.request), cancelled(handle), report),
-        )
+        report = _reporter(handle, ExecuteTrajectory.Feedback())
+        answer = await _answered(MotionAnswer, handle, convert.execute_request, self.service.execute, report)
         return _end(handle, ExecuteTrajectory.Result(start_delay=answer.start_delay), answer)
 
     # --- services
@@ -210,22 +197,25 @@ def table_boxes(scene: str) -> tuple[Box, ...]:
     return (table_box(load_scene(scene).table),) if scene else ()
 
 
-def cancelled(handle: ServerGoalHandle) -> Callable[[], bool]:
-    """Return a function that says whether a goal is to be cancelled."""
-    return lambda: bool(handle.is_cancel_requested)
-
-
-async def _answered(kind: type[AnswerT], ask: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
-    """The service's answer; what is wrong with the message is one, too."""
+async def _answered(
+    kind: type[AnswerT],
+    handle: ServerGoalHandle,
+    convert_goal: Callable[[Any], RequestT],
+    ask: Callable[[RequestT, Callable[[], bool], Report], Awaitable[AnswerT]],
+    report: Report,
+) -> AnswerT:
+    """The service's answer to a goal; what is wrong with the message is one, too."""
     try:
-        return await ask()
+        return await ask(convert_goal(handle.request), lambda: bool(handle.is_cancel_requested), report)
     except OpenArmError as error:
         return kind(error=error, message=error.message)
 
 
-def _reporter(handle: ServerGoalHandle, feedback: Any) -> Callable[[str, float], None]:
+def _reporter(handle: ServerGoalHandle, feedback: Any) -> Report:
     def report(stage: str, progress: float) -> None:
-        feedback.stage, feedback.progress = stage, progress
+        if hasattr(feedback, "stage"):
+            feedback.stage = stage
+        feedback.progress = progress
         handle.publish_feedback(feedback)
 
     return report

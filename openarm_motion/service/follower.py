@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_motion.service.robot import ArmController, RobotInterface, TrajectoryGoal, Watch
+from openarm_motion.service.robot import RobotInterface, TrajectoryGoal, Watch
 
 if TYPE_CHECKING:
     from openarm_motion.planning.arm import Arm
@@ -37,6 +37,18 @@ class MotionInProgress:
     def rest(self, now_ns: int) -> Motion:
         """Return what is left of it, beginning now."""
         return self.motion.later((self.since_ns - now_ns) * 1e-9)
+
+
+@dataclass(eq=False)
+class _Execution:
+    """One call of `TrajectoryFollower.follow`; `missing` is how long its controller has been missing, s."""
+
+    motion: Motion
+    begin_ns: int
+    cancelled: Callable[[], bool]
+    progress: Callable[[float], None]
+    watch: Watch
+    missing: float = 0.0
 
 
 class TrajectoryFollower:
@@ -71,37 +83,29 @@ class TrajectoryFollower:
             OpenArmError: NOT_READY, without controller or joint states; ROBOT_LOST, when either vanishes on the way;
                 EXECUTION_FAILED, with the controller's reason or the joint that did not arrive; TIMEOUT; CANCELLED.
         """
-        watch = Watch(self._robot)
+        run = _Execution(motion, begin_ns, cancelled, progress, Watch(self._robot))
         self.begin(motion, begin_ns)
         try:
-            await watch.fresh()
-            if not await watch.until(self._controller.ready, limit=_READY):
+            await run.watch.fresh()
+            if not await run.watch.until(self._controller.ready, limit=_READY):
                 text = f"no controller offers {self._controller.name}; is the bridge or driver running?"
                 raise OpenArmError(Code.NOT_READY, text)
-            lost = _Lost(self._robot, self._controller, self._config.stale_after, watch)
-            await self._send(lost, motion, begin_ns, cancelled, progress)
-            await self._arrive(lost, motion, cancelled)
+            await self._send(run)
+            await self._arrive(run)
         finally:
             self.active = None
         progress(1.0)
 
-    async def _send(
-        self,
-        lost: _Lost,
-        motion: Motion,
-        begin_ns: int,
-        cancelled: Callable[[], bool],
-        progress: Callable[[float], None],
-    ) -> None:
-        name, goal = self._controller.name, self._controller.start(motion, begin_ns)
+    async def _send(self, run: _Execution) -> None:
+        name, goal = self._controller.name, self._controller.start(run.motion, run.begin_ns)
         try:
-            if not await lost.watch.until(lambda: goal.accepted is not None, lost.check, _ANSWER):
+            if not await run.watch.until(lambda: goal.accepted is not None, lambda: self._check(run), _ANSWER):
                 raise OpenArmError(Code.ROBOT_LOST, f"{name} did not answer a goal within {_ANSWER:g} s")
             if not goal.accepted:
                 raise OpenArmError(Code.EXECUTION_FAILED, f"{name} rejected the trajectory")
-            if not begin_ns:
-                self.begin(motion)  # it begins when it is accepted
-            stopping = await self._watch_goal(lost, goal, motion, cancelled, progress)
+            if not run.begin_ns:
+                self.begin(run.motion)  # it begins when it is accepted
+            stopping = await self._watch_goal(run, goal)
         except OpenArmError:
             goal.cancel()
             raise
@@ -110,53 +114,56 @@ class TrajectoryFollower:
             raise OpenArmError(Code.CANCELLED, f"cancelled; the {self._arm.name} arm holds where it is")
         if not success:
             raise OpenArmError(Code.EXECUTION_FAILED, f"controller of the {self._arm.name} arm: {text}")
-        if stopping and cancelled():
+        if stopping and run.cancelled():
             raise OpenArmError(Code.CANCELLED, f"cancelled as the {self._arm.name} arm arrived; it holds there")
 
-    async def _watch_goal(
-        self,
-        lost: _Lost,
-        goal: TrajectoryGoal,
-        motion: Motion,
-        cancelled: Callable[[], bool],
-        progress: Callable[[float], None],
-    ) -> bool:
+    async def _watch_goal(self, run: _Execution, goal: TrajectoryGoal) -> bool:
         """Wait for the end of an accepted goal; return whether it was cancelled here."""
-        name, limit = self._controller.name, motion.duration + self._config.overtime
+        name, duration = self._controller.name, run.motion.duration
         since: float | None = None
 
         def check() -> None:
             nonlocal since
-            lost.check()
+            self._check(run)
             elapsed = (self._robot.states.latest()[0] - self.active.since_ns) * 1e-9 if self.active else 0.0
-            progress(min(1.0, max(0.0, elapsed / max(motion.duration, 1e-3))))
-            if elapsed > limit:
-                text = f"{name} has not ended {elapsed:.1f} s after a start of {motion.duration:.1f} s"
+            run.progress(min(1.0, max(0.0, elapsed / max(duration, 1e-3))))
+            if elapsed > duration + self._config.overtime:
+                text = f"{name} has not ended {elapsed:.1f} s after a start of {duration:.1f} s"
                 raise OpenArmError(Code.TIMEOUT, text)
-            if since is None and cancelled():
+            if since is None and run.cancelled():
                 goal.cancel()
                 since = self._robot.now()
             if since is not None and self._robot.now() - since > _ANSWER:
                 raise OpenArmError(Code.CANCELLED, f"cancelled, but {name} did not confirm that it holds")
 
-        await lost.watch.until(lambda: goal.outcome is not None, check)
+        await run.watch.until(lambda: goal.outcome is not None, check)
         return since is not None
 
-    async def _arrive(self, lost: _Lost, motion: Motion, cancelled: Callable[[], bool]) -> None:
+    async def _arrive(self, run: _Execution) -> None:
         """Wait until the joints are where the motion ends; what a controller says is not evidence."""
         states, settle_ns = self._robot.states, self._config.settle * 1e9
         arrived_ns = states.latest()[0]
 
         def ended() -> bool:
             late = states.latest()[0] - arrived_ns > settle_ns
-            return late or cancelled() or not self._missed(motion)
+            return late or run.cancelled() or not self._missed(run.motion)
 
-        await lost.watch.until(ended, lost.check)
-        missed = self._missed(motion)
-        if missed and cancelled():
+        await run.watch.until(ended, lambda: self._check(run))
+        missed = self._missed(run.motion)
+        if missed and run.cancelled():
             raise OpenArmError(Code.CANCELLED, f"cancelled; the {self._arm.name} arm holds where it is")
         if missed:
             raise OpenArmError(Code.EXECUTION_FAILED, f"{missed}; blocked?")
+
+    def _check(self, run: _Execution) -> None:
+        """Notice that joint states or the controller vanish during a motion."""
+        limit = self._config.stale_after
+        if run.watch.silence > limit:
+            age = self._robot.state_age()
+            raise OpenArmError(Code.ROBOT_LOST, f"no /joint_states for {age:.1f} s, expected one within {limit:g} s")
+        run.missing = 0.0 if self._controller.ready() else run.missing + run.watch.awake
+        if run.missing > _GONE:
+            raise OpenArmError(Code.ROBOT_LOST, f"controller {self._controller.name} is gone")
 
     def _missed(self, motion: Motion) -> str:
         """How far from its end the arm is, in a sentence; empty when it is there."""
@@ -171,20 +178,3 @@ class TrajectoryFollower:
         if distance > limit:
             return f"the tool ended {distance * 1e3:.1f} mm from its goal, expected within {limit * 1e3:g}"
         return ""
-
-
-class _Lost:
-    """Notices that joint states or the controller vanish during a motion."""
-
-    def __init__(self, robot: RobotInterface, controller: ArmController, limit: float, watch: Watch) -> None:
-        self._robot, self._controller, self._limit, self.watch = robot, controller, limit, watch
-        self._missing = 0.0
-
-    def check(self) -> None:
-        limit = self._limit
-        if self.watch.silence > limit:
-            age = self._robot.state_age()
-            raise OpenArmError(Code.ROBOT_LOST, f"no /joint_states for {age:.1f} s, expected one within {limit:g} s")
-        self._missing = 0.0 if self._controller.ready() else self._missing + self.watch.awake
-        if self._missing > _GONE:
-            raise OpenArmError(Code.ROBOT_LOST, f"controller {self._controller.name} is gone")

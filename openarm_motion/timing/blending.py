@@ -121,24 +121,15 @@ def time_quintic(names: Sequence[str], waypoints: Array, limits: JointLimits, pe
         period: Greatest time between two samples, s.
     """
     parts: list[Trajectory] = []
-    for start, _, difference in segments(waypoints):
-        size = np.abs(difference)
-        slowest = [
-            float(np.max(peak * size / limit)) ** (1.0 / (k + 1))
-            for k, (peak, limit) in enumerate(
-                zip(_QUINTIC, (limits.velocity, limits.acceleration, limits.jerk), strict=True)
-            )
-        ]
-        duration = max(slowest)
-        u = np.linspace(0.0, 1.0, max(2, int(np.ceil(duration / period)) + 1))[:, None]
-        s, v, a = (
-            u**3 * (10.0 - 15.0 * u + 6.0 * u**2),
-            30.0 * u**2 * (1.0 - u) ** 2 / duration,
-            60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / duration**2,
-        )
-        parts.append(
-            Trajectory(tuple(names), u[:, 0] * duration, start + s * difference, v * difference, a * difference)
-        )
+    for start, end, difference in segments(waypoints):
+        peaks = zip(_QUINTIC, (limits.velocity, limits.acceleration, limits.jerk), strict=True)
+        ratios = [float(np.max(peak * np.abs(difference) / limit)) for peak, limit in peaks]
+        duration = max(ratio ** (1.0 / order) for order, ratio in enumerate(ratios, start=1))
+        rest = np.zeros((2, difference.size))
+        # between two samples a trajectory is a quintic polynomial already
+        whole = Trajectory(tuple(names), np.array([0.0, duration]), np.stack([start, end]), rest, rest)
+        t = np.linspace(0.0, duration, max(2, int(np.ceil(duration / period)) + 1))
+        parts.append(Trajectory(tuple(names), t, *whole.at(t)))
     return joined(tuple(names), parts, waypoints[0], period)
 
 

@@ -159,15 +159,10 @@ def profile(length: float, velocity: float, acceleration: float, jerk: float) ->
     if result not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise OpenArmError(Code.INTERNAL, f"ruckig answered {result} for a way of {length:g} from rest to rest")
     pieces = answer.profiles[0][0]
-    h, j = np.array(pieces.t), np.array(pieces.j)
-    t = np.concatenate([[0.0], np.cumsum(h)])
-    s, v, a = np.zeros(h.size), np.zeros(h.size), np.zeros(h.size)
-    for i in range(h.size - 1):
-        a[i + 1] = a[i] + h[i] * j[i]
-        v[i + 1] = v[i] + h[i] * (a[i] + 0.5 * h[i] * j[i])
-        s[i + 1] = s[i] + h[i] * (v[i] + h[i] * (0.5 * a[i] + h[i] * j[i] / 6.0))
-    real = h > 1e-12
-    return Profile(t[:-1][real], s[real], v[real], a[real], j[real], float(t[-1]))
+    h = np.array(pieces.t)
+    t, real = np.concatenate([[0.0], np.cumsum(h)]), h > 1e-12
+    s, v, a, j = (np.array(values)[: h.size][real] for values in (pieces.p, pieces.v, pieces.a, pieces.j))
+    return Profile(t[:-1][real], s, v, a, j, float(t[-1]))
 
 
 def straight_profile(difference: Array, limits: JointLimits) -> Profile:
