@@ -120,12 +120,13 @@ def parse_urdf(text: str) -> tuple[str, dict[str, Link], dict[str, Joint]]:
     return root.get("name", ""), links, joints
 
 
-def _origin(element: ET.Element) -> Array:
-    origin = element.find("origin")
-    if origin is None:
+def origin(element: ET.Element) -> Array:
+    """Return the pose (4, 4) of a link's shape or of a joint in its parent; the identity where there is none."""
+    found = element.find("origin")
+    if found is None:
         return np.eye(4)
-    roll, pitch, yaw = floats(origin.get("rpy", "0 0 0"), 3, origin)
-    return se3.make(se3.matrix_from_rpy(roll, pitch, yaw), floats(origin.get("xyz", "0 0 0"), 3, origin))
+    roll, pitch, yaw = floats(found.get("rpy", "0 0 0"), 3, found)
+    return se3.make(se3.matrix_from_rpy(roll, pitch, yaw), floats(found.get("xyz", "0 0 0"), 3, found))
 
 
 def _rgba(material: ET.Element) -> Rgba | None:
@@ -149,7 +150,7 @@ def _primitive(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Primit
     size = tuple(value for key, count in _SIZES[kind] for value in floats(attribute(shape, key), count, shape))
     material = element.find("material")
     name, rgba = ("", None) if material is None else (material.get("name", ""), _rgba(material))
-    return Primitive(element.get("name", ""), kind, size, _origin(element), name, rgba or colors.get(name))
+    return Primitive(element.get("name", ""), kind, size, origin(element), name, rgba or colors.get(name))
 
 
 def _link(element: ET.Element, colors: Mapping[str, Rgba | None]) -> Link:
@@ -195,7 +196,7 @@ def _joint(element: ET.Element) -> Joint:
         type=kind,  # pyright: ignore[reportArgumentType]
         parent=_child(element, "parent", "link"),
         child=_child(element, "child", "link"),
-        T_parent_joint=_origin(element),
+        T_parent_joint=origin(element),
         axis=axis / norm,
         lower=lower,
         upper=upper,

@@ -8,15 +8,15 @@ and each piece gets the box about it; no point of the mesh is left outside.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import coal
 import numpy as np
 
-from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.urdf import origin
 from openarm_common.types import Array
 
 #: A cut must make the boxes smaller by this share in all, and there are so many cuts in a row at most.
@@ -54,52 +54,45 @@ def load_robot(urdf: Path, srdf: Path | None = None, packages: Mapping[str, Path
     return RobotDescription.from_urdf(ET.tostring(robot, encoding="unicode"), text)
 
 
-def boxes_about(triangles: Array) -> list[tuple[Array, Array]]:
-    """Lower and upper corners (3,) of boxes that together hold triangles (n, 3, 3)."""
-    return _cut(triangles, _CUTS)
+def boxes_about(polygons: Sequence[Array], cuts: int = _CUTS) -> list[tuple[Array, Array]]:
+    """Lower and upper corners (3,) of boxes that together hold convex polygons (n, 3).
 
-
-def _cut(triangles: Array, cuts: int) -> list[tuple[Array, Array]]:
-    points = triangles.reshape(-1, 3)
+    Args:
+        polygons: Triangles of a mesh, or what cuts left of them.
+        cuts: How often a piece may be cut again.
+    """
+    points = np.concatenate(polygons)
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(high - low, _THIN)
-    if cuts == 0:
-        return [(low, high)]
     axis = int(np.argmax(size))
-    best, pieces = float(np.prod(size)) * (1.0 - _SAVED), None
-    for share in (0.25, 0.5, 0.75):
-        at = low[axis] + share * size[axis]
-        halves = [_side(triangles, axis, at, below) for below in (True, False)]
-        if any(len(half) == 0 for half in halves):
-            continue
-        volume = sum(float(np.prod(np.maximum(np.ptp(half.reshape(-1, 3), axis=0), _THIN))) for half in halves)
-        if volume < best:
-            best, pieces = volume, halves
-    if pieces is None:
+    planes = [low[axis] + share * size[axis] for share in (0.25, 0.5, 0.75)] if cuts else []
+    halves = [[_clipped(polygons, axis, at, sign) for sign in (1.0, -1.0)] for at in planes]
+    pieces = min((half for half in halves if all(half)), key=_volume, default=[polygons])
+    if _volume(pieces) >= (1.0 - _SAVED) * _volume([polygons]):
         return [(low, high)]
-    return [box for piece in pieces for box in _cut(piece, cuts - 1)]
+    return [box for piece in pieces for box in boxes_about(piece, cuts - 1)]
 
 
-def _side(triangles: Array, axis: int, at: float, below: bool) -> Array:
-    """The part of each triangle on one side of a plane, as triangles."""
+def _volume(pieces: Sequence[Sequence[Array]]) -> float:
+    """Of the boxes about pieces of a mesh in all, m³."""
+    return sum(float(np.prod(np.maximum(np.ptp(np.concatenate(piece), axis=0), _THIN))) for piece in pieces)
+
+
+def _clipped(polygons: Sequence[Array], axis: int, at: float, sign: float) -> list[Array]:
+    """The part of each polygon on one side of a plane: below `at` for `sign` 1, above for -1."""
     out: list[Array] = []
-    sign = 1.0 if below else -1.0
-    for corners in triangles:
-        room = sign * (at - corners[:, axis])
-        if np.all(room >= 0.0):
-            out.append(corners)
+    for polygon in polygons:
+        room = sign * (at - polygon[:, axis])
+        if np.all(room <= 0.0) and np.any(room < 0.0):
             continue
-        if np.all(room <= 0.0):
-            continue
-        kept: list[Array] = []
-        for i in range(3):
-            j = (i + 1) % 3
-            if room[i] >= 0.0:
-                kept.append(corners[i])
-            if (room[i] > 0.0) != (room[j] > 0.0) and room[i] != room[j]:
-                kept.append(corners[i] + room[i] / (room[i] - room[j]) * (corners[j] - corners[i]))
-        out += [np.array([kept[0], kept[k], kept[k + 1]]) for k in range(1, len(kept) - 1)]
-    return np.array(out).reshape(-1, 3, 3)
+        ends, left = np.roll(polygon, -1, axis=0), np.roll(room, -1)
+        crossing = room * left < 0.0
+        share = (room[crossing] / (room[crossing] - left[crossing]))[:, None]
+        cuts = polygon[crossing] + share * (ends[crossing] - polygon[crossing])
+        # each cut comes behind the corner that its edge begins at
+        order = np.argsort(np.concatenate([np.flatnonzero(room >= 0.0), np.flatnonzero(crossing) + 0.5]))
+        out.append(np.concatenate([polygon[room >= 0.0], cuts])[order])
+    return out
 
 
 def _boxed(
@@ -115,13 +108,12 @@ def _boxed(
         raise OpenArmError(Code.CONFIG_INVALID, f"{urdf}: link {link!r}: can't read mesh {path}: {error}") from error
     vertices = np.array([loaded.vertex(i) for i in range(loaded.num_vertices)], dtype=np.float64)
     corners = [[loaded.tri_indices(i)[k] for k in range(3)] for i in range(loaded.num_tris)]
-    T = _origin(shape)
+    T, placed = origin(shape), shape.find("origin")
+    rpy = "0 0 0" if placed is None else placed.get("rpy", "0 0 0")
     out: list[ET.Element] = []
     for k, (low, high) in enumerate(boxes_about(vertices[np.array(corners)])):
         box = ET.Element("collision", {"name": f"{link}_{path.stem}_{k}"})
         centre = T[:3, :3] @ (0.5 * (low + high)) + T[:3, 3]
-        origin = shape.find("origin")
-        rpy = "0 0 0" if origin is None else origin.get("rpy", "0 0 0")
         ET.SubElement(box, "origin", {"xyz": _text(centre), "rpy": rpy})
         ET.SubElement(ET.SubElement(box, "geometry"), "box", {"size": _text(np.maximum(high - low, _THIN))})
         out.append(box)
@@ -143,16 +135,6 @@ def _found(name: str, urdf: Path, packages: Mapping[str, Path]) -> Path:
     if not path.is_file():
         raise OpenArmError(Code.CONFIG_INVALID, f"{urdf}: there is no mesh {path}")
     return path
-
-
-def _origin(shape: ET.Element) -> Array:
-    T = np.eye(4)
-    origin = shape.find("origin")
-    if origin is not None:
-        T[:3, 3] = [float(x) for x in origin.get("xyz", "0 0 0").split()]
-        roll, pitch, yaw = (float(x) for x in origin.get("rpy", "0 0 0").split())
-        T[:3, :3] = se3.matrix_from_rpy(roll, pitch, yaw)
-    return T
 
 
 def _text(values: Array) -> str:
