@@ -130,6 +130,15 @@ class LineChecks(ABC):
     #: (n,) how far the points that a joint moves are from its axis, at most, m.
     levers: Array
 
+    @property
+    @abstractmethod
+    def arms(self) -> Sequence[CollisionScene]:
+        """The scene of each arm, in the order of their joints."""
+
+    @abstractmethod
+    def contacts(self, q: ArrayLike) -> list[Contact]:
+        """All pairs that are nearer than they may be, the deepest first."""
+
     @abstractmethod
     def collides(self, q: ArrayLike) -> bool:
         """Whether some pair is nearer than it may be at a configuration (n,)."""
@@ -189,6 +198,11 @@ class CollisionScene(LineChecks):
         self._data = robot.model.createData()
         self._geometry_data = pin.GeometryData(self._geometry)
         self._set_margins()
+
+    @property
+    def arms(self) -> Sequence[CollisionScene]:
+        """This scene alone."""
+        return (self,)
 
     @property
     def robot(self) -> CollisionRobot:

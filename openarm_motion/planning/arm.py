@@ -7,9 +7,11 @@ Everything that is planned goes through here; it holds no state between requests
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.robot import CollisionRobot
 from openarm_motion.collision.solids import Box
-from openarm_motion.config import MotionConfig, PlanningConfig
+from openarm_motion.config import MotionConfig
 from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_motion.kinematics.line import Line
@@ -66,7 +68,102 @@ class StartState:
     environment: Environment = NOTHING
 
 
-class Arm:
+class PlanningGroup(ABC):
+    """Joints that are planned together: those of one arm, or of two as one.
+
+    Attributes:
+        title: For messages, for example "the left arm".
+        config: Parameters.
+        names: The joints.
+        lower: (n,) joint limits.
+        upper: (n,) joint limits.
+    """
+
+    title: str
+    config: MotionConfig
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+
+    @abstractmethod
+    def limits(self, scale: float) -> JointLimits:
+        """Joint limits at the velocity scale of a request."""
+
+    @abstractmethod
+    def plan(
+        self, scene: LineChecks, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
+    ) -> PlannedPath:
+        """Free path to one of several configurations (k, n), an earlier one preferred.
+
+        Raises:
+            OpenArmError: NO_PLAN, saying what is in the way where that is known; CANCELLED.
+        """
+
+    def query(
+        self, scene: LineChecks, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
+    ) -> PlanQuery:
+        """What a planner is asked for a path to one of several goals (k, n); steps are `fineness` times finer."""
+        search, limits = self.config.planning, self.limits(now.scale)
+        step, travel = search.edge_step / fineness, search.edge_travel / fineness
+        return PlanQuery(
+            start=now.start,
+            goals=goals,
+            lower=self.lower,
+            upper=self.upper,
+            collides=scene.collides,
+            edge_free=lambda a, b: scene.edge_free(a, b, step, travel),
+            cost=lambda a, b: segment_time(a, b, limits),
+            time_limit=time_limit,
+            iterations=search.iterations,
+            seed=search.seed,
+            stopped=now.stopped,
+            fast=cache(lambda: FastScene(scene.arms, scene.arms[0].distances)),
+            resolution=(step, travel),
+            limits=(limits.velocity, limits.acceleration, limits.jerk),
+        )
+
+    def plan_validated(
+        self,
+        scene: LineChecks,
+        now: StartState,
+        goals: Array,
+        time_limit: float,
+        validate: Callable[[Any, Trajectory], object] = validate_trajectory,
+    ) -> ValidatedPlan:
+        """Free path to one of several configurations, timed, and validated on the exact layer.
+
+        Where the validation finds what the search stepped over, the search is repeated with finer steps.
+
+        Args:
+            scene: What it keeps clear of.
+            now: Where it starts.
+            goals: (k, n) rad.
+            time_limit: s.
+            validate: Raises `PlanFailedError` for a trajectory in a scene.
+
+        Raises:
+            OpenArmError: as `plan`; IN_COLLISION, when the finest search did not help.
+        """
+        end = time.monotonic() + time_limit
+        fault, contact = "", None
+        for fineness in _FINENESS:
+            path = self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
+            for trajectory in self.timings(path, now.scale):
+                try:
+                    validate(scene, trajectory)
+                    return ValidatedPlan(path, trajectory)
+                except PlanFailedError as error:
+                    fault, contact = error.message, error.contact
+        text = f"the plan of {self.title} failed the validation: {fault}"
+        raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
+
+    def timings(self, path: PlannedPath, scale: float) -> Iterator[Trajectory]:
+        """Timed free paths, the best first; see `blending.timings`."""
+        search = self.config.planning
+        return timings(search.timing, self.names, path.waypoints, self.limits(scale), search.period)
+
+
+class Arm(PlanningGroup):
     """One arm.
 
     Args:
@@ -88,10 +185,11 @@ class Arm:
         static: Sequence[Box] = (),
         planner: Planner | None = None,
     ) -> None:
-        self.name = name
+        self.name, self.title = name, f"the {name} arm"
         self.config = config
         self.description = description
         self.kinematics = ArmKinematics(description, config.tool_link.format(arm=name))
+        self.names, self.lower, self.upper = self.kinematics.names, self.kinematics.lower, self.kinematics.upper
         self.inverse = InverseKinematics(self.kinematics, config.planning.swivels)
         self.robot = CollisionRobot(description, self.kinematics)
         self.static: tuple[Box, ...] = tuple(static)
@@ -108,11 +206,6 @@ class Arm:
             np.array(limits.acceleration, dtype=np.float64),
             np.array(limits.jerk, dtype=np.float64),
         )
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The arm's joints."""
-        return self.kinematics.names
 
     def start_state(
         self,
@@ -240,7 +333,7 @@ class Arm:
             raise PlanFailedError(Code.IN_COLLISION, text, "start", contact)
 
     def plan(
-        self, scene: CollisionScene, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
+        self, scene: LineChecks, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
     ) -> PlannedPath:
         """Free path to one of several configurations (k, n), an earlier one preferred.
 
@@ -259,88 +352,10 @@ class Arm:
             blocked = "" if contact is None else f"; on the direct way {contact}"
             raise PlanFailedError(Code.NO_PLAN, error.message + blocked, "search", contact) from error
 
-    def plan_validated(self, scene: CollisionScene, now: StartState, goals: Array, time_limit: float) -> ValidatedPlan:
-        """Free path to one of several configurations, timed, and validated on the exact layer.
-
-        Where the validation finds what the search stepped over, the search is repeated with finer steps.
-
-        Raises:
-            OpenArmError: as `plan`; IN_COLLISION, when the finest search did not help.
-        """
-        end = time.monotonic() + time_limit
-        fault, contact = "", None
-        for fineness in _FINENESS:
-            path = self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
-            for trajectory in self.timings(path, now.scale):
-                try:
-                    validate_trajectory(scene, trajectory)
-                    return ValidatedPlan(path, trajectory)
-                except PlanFailedError as error:
-                    fault, contact = error.message, error.contact
-        text = f"the {self.name} arm's plan failed the validation: {fault}"
-        raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
-
-    def query(
-        self, scene: CollisionScene, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
-    ) -> PlanQuery:
-        """What a planner is asked for a path to one of several goals (k, n); steps are `fineness` times finer."""
-        bounds = (self.kinematics.lower, self.kinematics.upper)
-        fast = cache(lambda: FastScene([scene], scene.distances))
-        search, limits = self.config.planning, self.limits(now.scale)
-        return plan_query(search, scene, fast, bounds, limits, now, goals, time_limit, fineness)
-
-    def timings(self, path: PlannedPath, scale: float) -> Iterator[Trajectory]:
-        """Timed free paths, the best first; see `blending.timings`."""
-        search = self.config.planning
-        return timings(search.timing, self.names, path.waypoints, self.limits(scale), search.period)
-
     def time_line(self, line: Line, scale: float) -> Trajectory:
         """Timed straight line."""
         speed = self.config.limits.straight_speed * self.scale(scale)
         return time_path(self.names, line.q, line.s, self.limits(scale), speed, self.config.planning.period)
-
-
-def plan_query(
-    search: PlanningConfig,
-    scene: LineChecks,
-    fast: Callable[[], FastScene],
-    bounds: tuple[Array, Array],
-    limits: JointLimits,
-    now: StartState,
-    goals: Array,
-    time_limit: float,
-    fineness: float,
-) -> PlanQuery:
-    """Return what a planner is asked for a path to one of several goals.
-
-    Args:
-        search: Parameters.
-        scene: What the path keeps clear of.
-        fast: Makes the fast layer's view of the scene.
-        bounds: Lower and upper joint limits (n,).
-        limits: Of velocity, acceleration and jerk.
-        now: Where it starts, and whether it was stopped.
-        goals: (k, n) rad.
-        time_limit: s.
-        fineness: Checks are so many times closer than the parameters say.
-    """
-    step, travel = search.edge_step / fineness, search.edge_travel / fineness
-    return PlanQuery(
-        start=now.start,
-        goals=goals,
-        lower=bounds[0],
-        upper=bounds[1],
-        collides=scene.collides,
-        edge_free=lambda a, b: scene.edge_free(a, b, step, travel),
-        cost=lambda a, b: segment_time(a, b, limits),
-        time_limit=time_limit,
-        iterations=search.iterations,
-        seed=search.seed,
-        stopped=now.stopped,
-        fast=fast,
-        resolution=(step, travel),
-        limits=(limits.velocity, limits.acceleration, limits.jerk),
-    )
 
 
 def segment_time(a: Array, b: Array, limits: JointLimits) -> float:

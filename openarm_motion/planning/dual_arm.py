@@ -2,7 +2,7 @@
 """Motions of both arms at once that keep them apart all the way. Base frame, m, rad, s.
 
 Together: one path of all joints, timed as one. Staggered: each arm has a path of its own, and one of them starts later,
-by as little as keeps them apart; only pairs of moments are checked for that, nothing is planned anew.
+by as little as keeps them apart; only pairs of moments are checked for that, nothing is planned again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,15 +19,13 @@ from numpy.typing import ArrayLike
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision.exact import CollisionScene, Contact, LineChecks
-from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.solids import Box
-from openarm_motion.planning.arm import Arm, StartState, plan_query
+from openarm_motion.planning.arm import Arm, PlanningGroup, StartState
 from openarm_motion.planning.coordination import ActiveMotion, least_delay
 from openarm_motion.planning.failure import PlanFailedError
-from openarm_motion.planning.planner import PlanQuery
+from openarm_motion.planning.planner import PlannedPath
 from openarm_motion.planning.rrt import FastPlanner
-from openarm_motion.timing.blending import timings
 from openarm_motion.timing.trajectory import JointLimits, Trajectory
 from openarm_motion.timing.validation import dense_times, validate_trajectory
 
@@ -49,6 +46,11 @@ class DualArmScene(LineChecks):
         self.first, self.second = first, second
         self._split = split
         self.levers = np.concatenate([first.levers, second.levers])
+
+    @property
+    def arms(self) -> Sequence[CollisionScene]:
+        """Both scenes."""
+        return self.first, self.second
 
     def collides(self, q: ArrayLike) -> bool:
         """Whether some pair is nearer than it may be at a configuration (n1 + n2,)."""
@@ -88,7 +90,7 @@ class DualArmScene(LineChecks):
         return a, b
 
 
-class DualArm:
+class DualArm(PlanningGroup):
     """Two arms of one robot that are planned together.
 
     Args:
@@ -97,11 +99,12 @@ class DualArm:
     """
 
     def __init__(self, first: Arm, second: Arm) -> None:
-        self.arms = (first, second)
+        self.arms, self.title, self.config = (first, second), "both arms", first.config
         self.names: tuple[str, ...] = (*first.names, *second.names)
         self.split = first.kinematics.n
-        self.lower: Array = np.concatenate([first.kinematics.lower, second.kinematics.lower])
-        self.upper: Array = np.concatenate([first.kinematics.upper, second.kinematics.upper])
+        self.lower, self.upper = (
+            np.concatenate(ends) for ends in ((first.lower, second.lower), (first.upper, second.upper))
+        )
 
     def parts(self, values: Array) -> tuple[Array, Array]:
         """What belongs to each arm, of values (..., n1 + n2)."""
@@ -151,13 +154,11 @@ class DualArm:
             np.concatenate([a.jerk, b.jerk]),
         )
 
-    def query(
-        self, scene: DualArmScene, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
-    ) -> PlanQuery:
-        """What a planner is asked for a path to one of several configurations (k, n1 + n2); as `Arm.query`."""
-        fast = cache(lambda: FastScene([scene.first, scene.second], scene.first.distances))
-        search, bounds = self.arms[0].config.planning, (self.lower, self.upper)
-        return plan_query(search, scene, fast, bounds, self.limits(now.scale), now, goals, time_limit, fineness)
+    def plan(
+        self, scene: LineChecks, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
+    ) -> PlannedPath:
+        """See `PlanningGroup`; the planner is that of the suite, whatever the configuration says."""
+        return FastPlanner().plan(self.query(scene, now, goals, time_limit, fineness))
 
 
 #: Pairs of goals that one search gets.
@@ -167,8 +168,6 @@ _TRAVEL = 0.004
 _SEEN = SEPARATION - 0.25 * _TRAVEL
 #: Checks from one coarse check to the next.
 _STRIDE = 8
-#: Steps of the searches, how many times finer.
-_FINENESS = (1.0, 4.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,26 +211,21 @@ def plan_together(both: DualArm, now: StartState, wanted: DualArmGoals, time_lim
     scene = both.scene(now.state, wanted.obstacles, held=wanted.held, environment=now.environment)
     for arm, part, start in zip(both.arms, scene.placed(now.start), both.parts(now.start), strict=True):
         arm.relax(part, start)
-    goals = _pairs(scene, wanted.goals)
-    limits, search = both.limits(now.scale), both.arms[0].config.planning
-    least, fault, contact = _least(scene, now.start), "", None
-    for fineness in _FINENESS:
-        left = max(end - time.monotonic(), 0.1)
-        path = FastPlanner().plan(both.query(scene, now, goals, left, fineness))
-        for whole in timings(search.timing, both.names, path.waypoints, limits, search.period):
-            try:
-                validate_trajectory(scene, whole, _TRAVEL)
-            except PlanFailedError as error:
-                fault, contact = error.message, error.contact
-                continue
-            gap = separation(scene, whole)
-            if gap >= least:
-                q, v, a = (both.parts(x) for x in (whole.q, whole.v, whole.a))
-                first, second = (Trajectory(arm.names, whole.t, q[i], v[i], a[i]) for i, arm in enumerate(both.arms))
-                return DualArmPlan((first, second), (0.0, 0.0), gap)
-            fault, contact = f"the arms would come within {gap * 1e3:.1f} mm of each other", None
-    text = f"the plan of both arms failed the validation: {fault}"
-    raise PlanFailedError(Code.IN_COLLISION, text, "certificate", contact)
+    goals, least = _pairs(scene, wanted.goals), _least(scene, now.start)
+    gap = np.nan
+
+    def validate(scene: DualArmScene, whole: Trajectory) -> None:
+        nonlocal gap
+        validate_trajectory(scene, whole, _TRAVEL)
+        gap = separation(scene, whole)
+        if gap < least:
+            text = f"the arms would come within {gap * 1e3:.1f} mm of each other"
+            raise PlanFailedError(Code.IN_COLLISION, text, "certificate")
+
+    whole = both.plan_validated(scene, now, goals, end - time.monotonic(), validate).trajectory
+    q, v, a = (both.parts(x) for x in (whole.q, whole.v, whole.a))
+    first, second = (Trajectory(arm.names, whole.t, q[i], v[i], a[i]) for i, arm in enumerate(both.arms))
+    return DualArmPlan((first, second), (0.0, 0.0), gap)
 
 
 def plan_staggered(both: DualArm, now: StartState, wanted: DualArmGoals, time_limit: float) -> DualArmPlan:
