@@ -40,7 +40,6 @@ class OmplPlanner:
         goal = int(np.argmin(distances))
         # the search works with values moved into its bounds; the ends are those that were asked for
         path[0], path[-1] = query.start, query.goals[goal]
-        path = shorten(path, edges.free, query.cost, SHORTENINGS, np.random.default_rng(query.seed))
         return PlannedPath(path, goal, edges.count)
 
     def _search(self, query: PlanQuery, edges: _Counter) -> Array:
@@ -53,9 +52,9 @@ class OmplPlanner:
             bounds.setHigh(i, float(query.upper[i]))
         space.setBounds(bounds)
         information = ob.SpaceInformation(space)
-        # python references must outlive the search: OMPL holds plain pointers
-        validity, motion = _Validity(information, query, n), _Motion(information, edges, n)
-        information.setStateValidityChecker(validity)
+        # this reference must outlive the search: OMPL holds a plain pointer
+        motion = _Motion(information, edges, n)
+        information.setStateValidityChecker(lambda state: not query.collides(np.array(state[0:n])))
         information.setMotionValidator(motion)
         information.setup()
 
@@ -77,6 +76,7 @@ class OmplPlanner:
             planner.setRange(RANGE)
             planner.setProblemDefinition(problem)
             planner.setup()
+            simplifier = og.PathSimplifier(information)
         end, samples = time.monotonic() + query.time_limit, itertools.count()
 
         def enough() -> bool:  # asked once a sample
@@ -93,69 +93,15 @@ class OmplPlanner:
                 f"no free path to any of {len(query.goals)} goal(s) within {limit}"
                 f" ({edges.count} lines checked); allow more time, or move what is in the way",
             )
-        states = problem.getSolutionPath().getStates()
-        return np.array([list(s[0:n]) for s in states], dtype=np.float64)
-
-
-def shorten(
-    path: Array,
-    edge_free: Callable[[Array, Array], bool],
-    cost: Callable[[Array, Array], float],
-    attempts: int,
-    rng: np.random.Generator,
-) -> Array:
-    """Make a polyline cheaper: leave way points out, cut corners, pull way points towards their neighbours.
-
-    Args:
-        path: (m, n) way points; the ends stay.
-        edge_free: Whether a straight line is free.
-        cost: Of one segment; fewer segments are cheaper when it counts stops.
-        attempts: Number of random attempts.
-        rng: Random numbers.
-    """
-    points = _skip([*path], edge_free)
-    for _ in range(attempts):
-        if len(points) < 3:
-            break
-        if rng.random() < 0.5:
-            i = int(rng.integers(1, len(points) - 1))
-            a, b = points[i - 1], points[i + 1]
-            middle = a + (b - a) * float(
-                np.clip((points[i] - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-12), 0, 1)
-            )
-            moved = points[i] + rng.random() * (middle - points[i])
-            fresh, old = [a, moved, b], points[i - 1 : i + 2]
-            first, last = i - 1, i + 1
-        else:
-            first, last = (int(k) for k in np.sort(rng.choice(len(points) - 1, 2, replace=False)))
-            u, w = rng.random(2)
-            a = points[first] + u * (points[first + 1] - points[first])
-            b = points[last] + w * (points[last + 1] - points[last])
-            fresh, old = [points[first], a, b, points[last + 1]], points[first : last + 2]
-            last += 1
-        if _cost(fresh, cost) < 0.99 * _cost(old, cost) and all(edge_free(p, q) for p, q in itertools.pairwise(fresh)):
-            points = _skip([*points[:first], *fresh, *points[last + 1 :]], edge_free)
-    return np.array(points)
-
-
-def _skip(points: list[Array], edge_free: Callable[[Array, Array], bool]) -> list[Array]:
-    """Greedily go from each way point to the furthest one that a free line reaches."""
-    kept, i = [points[0]], 0
-    while i < len(points) - 1:
-        j = len(points) - 1
-        while j > i + 1 and not edge_free(points[i], points[j]):
-            j -= 1
-        kept.append(points[j])
-        i = j
-    return kept
-
-
-def _cost(points: list[Array], cost: Callable[[Array, Array], float]) -> float:
-    return sum(cost(a, b) for a, b in itertools.pairwise(points))
+        path = problem.getSolutionPath()
+        simplifier.reduceVertices(path)
+        simplifier.partialShortcutPath(path, SHORTENINGS)
+        simplifier.reduceVertices(path)
+        return np.array([list(s[0:n]) for s in path.getStates()], dtype=np.float64)
 
 
 class _Counter:
-    """Counts the lines that are checked, and remembers the answers: shortening asks for some again."""
+    """Counts the lines that are checked, and remembers the answers: simplification asks for some again."""
 
     def __init__(self, edge_free: Callable[[Array, Array], bool]) -> None:
         self._edge_free = edge_free
@@ -168,16 +114,6 @@ class _Counter:
             self.count += 1
             self._known[key] = self._edge_free(a, b)
         return self._known[key]
-
-
-class _Validity(ob.StateValidityChecker):
-    def __init__(self, information: Any, query: PlanQuery, n: int) -> None:
-        super().__init__(information)
-        self._query, self._n = query, n
-
-    def isValid(self, state: Any) -> bool:
-        # a numpy bool would raise std::bad_cast
-        return not self._query.collides(np.array(state[0 : self._n]))
 
 
 class _Motion(ob.MotionValidator):

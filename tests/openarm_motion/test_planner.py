@@ -14,7 +14,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
 from openarm_motion.collision.solids import Box
 from openarm_motion.planning.arm import Arm, segment_time
-from openarm_motion.planning.ompl_planner import OmplPlanner, shorten
+from openarm_motion.planning.ompl_planner import OmplPlanner
 from openarm_motion.planning.planner import PlannedPath, PlanQuery
 
 
@@ -215,17 +215,21 @@ def test_the_reason_for_no_plan_names_what_blocks_the_direct_way(right: Arm, hom
         arm.plan(arm.scene(home, [post]), arm.start_state(home), goal[None], 0.1)
 
 
-def test_shortening_makes_a_detour_direct() -> None:
-    path = np.array([[0.0, 0.0], [0.0, 5.0], [5.0, 5.0], [5.0, 0.0], [1.0, 0.0]])
-    free = shorten(path, lambda a, b: True, lambda a, b: float(np.linalg.norm(b - a)), 20, np.random.default_rng(0))
-    np.testing.assert_array_equal(free, path[[0, -1]])
-
+def test_what_the_search_finds_is_shortened() -> None:
     def around_a_disc(a: np.ndarray, b: np.ndarray) -> bool:
         u = np.linspace(0, 1, 200)[:, None]
-        return bool(np.all(np.linalg.norm(a + u * (b - a) - [0.5, 1.0], axis=1) > 0.9))
+        return bool(np.all(np.linalg.norm(a + u * (b - a) - [0.5, 0.0], axis=1) > 0.9))
 
-    path = np.array([[-1.0, 0.0], [-1.0, 5.0], [5.0, 5.0], [2.0, 0.0]])
-    length = lambda p: float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum())  # noqa: E731
-    short = shorten(path, around_a_disc, lambda a, b: float(np.linalg.norm(b - a)) + 0.1, 200, np.random.default_rng(0))
-    assert length(short) < 0.7 * length(path)
-    assert all(around_a_disc(a, b) for a, b in itertools.pairwise(short))
+    start, goal = np.array([-1.0, 0.0]), np.array([2.0, 0.0])
+    path = OmplPlanner().plan(
+        PlanQuery(
+            start=start,
+            goals=goal[None],
+            lower=np.full(2, -6.0),
+            upper=np.full(2, 6.0),
+            collides=lambda q: not around_a_disc(q, q),
+            edge_free=around_a_disc,
+        )
+    )
+    assert all(around_a_disc(a, b) for a, b in itertools.pairwise(path.waypoints))
+    assert float(np.linalg.norm(np.diff(path.waypoints, axis=0), axis=1).sum()) < 1.3 * 3.6
