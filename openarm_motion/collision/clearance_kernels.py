@@ -292,13 +292,8 @@ def check_listed(start: int, count: int, end: int, share: float, model: Model, w
     world, sizes, radii, pairs, keeps = work.world, model.sizes, model.radii, model.pairs, model.keep
     bodies, poses, frames, done = model.bodies, model.poses, work.frames, work.done
     lists, sways, kept = work.lists, work.sways, 0
-    balls, about, field, corner, edge = (
-        model.sphere_groups,
-        model.sphere_bounds,
-        model.field,
-        model.corner,
-        model.edge,
-    )
+    balls, about, field = model.sphere_groups, model.sphere_bounds, model.field
+    corner, edge = model.corner, model.edge
     for at in range(start, start + count):
         g = lists[at]
         enough = float(share * sways[g])

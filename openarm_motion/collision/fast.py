@@ -125,21 +125,17 @@ class _Packer:
         for s, scene in enumerate(scenes):
             shapes, places = scene.shapes(), scene.joint_poses()
             parents = scene.robot.model.parents
-            index = {k: (k if k < links else k - links + len(self._kinds)) for k in range(len(shapes))}
-            if s == 0:
-                index = {k: k for k in range(len(shapes))}
-            for joint, T, shape in shapes if s == 0 else shapes[links:]:
+            known = links if s else 0  # the robot's shapes are those of the first scene
+            offset = len(self._kinds) - known
+            index = {k: k if k < known else k + offset for k in range(len(shapes))}
+            for joint, T, shape in shapes[known:]:
                 self._add(joint, T, shape, places, parents, joints)
             for i, j, keep in scene.required():
                 pair = (min(index[i], index[j]), max(index[i], index[j]))
                 if pair not in seen:
                     seen.add(pair)
                     self._keep.append((*pair, keep + _ROUNDING))
-            self._cover(scene, index)
-
-    def _cover(self, scene: CollisionScene, index: dict[int, int]) -> None:
-        """Clearance to the map of what moves."""
-        self._covered.update({index[k]: keep for k, keep in scene.map_clearance().items()})
+            self._covered.update({index[k]: keep for k, keep in scene.map_clearance().items()})
 
     def _add(
         self,

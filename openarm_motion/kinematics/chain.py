@@ -7,15 +7,16 @@ joint name is written down here. Poses are `T_base_tool` (4, 4) in the descripti
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.description import Joint, RobotDescription
 from openarm_common.types import Array
 from openarm_motion.kinematics import chain_kernels as kernels
 
@@ -209,27 +210,13 @@ class ArmLinks:
     @classmethod
     def of(cls, description: RobotDescription, kinematics: ArmKinematics) -> ArmLinks:
         """Sort the links of `description` for the arm of `kinematics`."""
-        arm = set(kinematics.names)
-        last = kinematics.names[-1]
-        moving: set[str] = set()
-        gripper: set[str] = set()
-        fixed: set[str] = set()
-        carriers: set[str] = set()
-        gripper_joints: list[str] = []
-        body: dict[str, str] = {}
-        for link in description.links:
-            movers = [joint for joint in description.chain(link) if joint.type != "fixed"]
-            names = [joint.name for joint in movers]
-            body[link] = movers[-1].child if movers else description.root
-            if not names:
-                fixed.add(link)
-            if arm.intersection(names):
-                moving.add(link)
-            if last in names and names[-1] != last:
-                gripper.add(link)
-                first = movers[names.index(last) + 1]
-                carriers.add(first.parent)
-                gripper_joints += [j.name for j in movers[names.index(last) + 1 :] if j.mimic is None]
+        chains = {link: [j for j in description.chain(link) if j.type != "fixed"] for link in description.links}
+        body = {link: joints[-1].child if joints else description.root for link, joints in chains.items()}
+        moving = {link for link, joints in chains.items() if any(j.name in kinematics.names for j in joints)}
+        after = {link: _after(joints, kinematics.names[-1]) for link, joints in chains.items()}
+        gripper = {link for link, joints in after.items() if joints}
+        carriers = {joints[0].parent for joints in after.values() if joints}
+        gripper_joints = [j.name for joints in after.values() for j in joints if j.mimic is None]
         neighbours = frozenset(
             frozenset((body[joint.parent], body[joint.child]))
             for joint in description.joints.values()
@@ -241,8 +228,13 @@ class ArmLinks:
             moving=frozenset(moving),
             gripper=frozenset(gripper),
             hand=frozenset(hand | {kinematics.tool_link}),
-            fixed=frozenset(fixed),
+            fixed=frozenset(link for link, joints in chains.items() if not joints),
             gripper_joints=tuple(dict.fromkeys(gripper_joints)),
             body=body,
             neighbours=neighbours,
         )
+
+
+def _after(joints: Sequence[Joint], name: str) -> list[Joint]:
+    """The joints of a chain that come after that of a name."""
+    return list(itertools.dropwhile(lambda joint: joint.name != name, joints))[1:]

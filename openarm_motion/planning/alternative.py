@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 
@@ -117,14 +118,8 @@ def _planned(arm: Arm, scene: CollisionScene, now: StartState, goals: Array) -> 
 def _poses_around(pose: Array) -> Iterator[Array]:
     """The pose itself and others about it, the nearest first: up, back along the tool, aside, forwards, down."""
     yield pose
-    back = -pose[:3, 2]
-    ways = [
-        np.array([0.0, 0.0, 1.0]),
-        back,
-        *(np.array(w) for w in ((0, 1.0, 0), (0, -1.0, 0), (-1.0, 0, 0), (1.0, 0, 0))),
-    ]
-    for ring in _RINGS:
-        for way in (*ways, np.array([0.0, 0.0, -1.0])):
-            other = pose.copy()
-            other[:3, 3] += ring * way
-            yield other
+    ways = np.array([[0, 0, 1], -pose[:3, 2], [0, 1, 0], [0, -1, 0], [-1, 0, 0], [1, 0, 0], [0, 0, -1]])
+    for ring, way in itertools.product(_RINGS, ways):
+        other = pose.copy()
+        other[:3, 3] += ring * way
+        yield other

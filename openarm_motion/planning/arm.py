@@ -119,7 +119,7 @@ class PlanningGroup(ABC):
             stopped=now.stopped,
             fast=cache(lambda: FastScene(scene.arms, scene.arms[0].distances)),
             resolution=(step, travel),
-            limits=(limits.velocity, limits.acceleration, limits.jerk),
+            limits=limits,
         )
 
     def plan_validated(
@@ -201,11 +201,8 @@ class Arm(PlanningGroup):
                 f"limits.velocity has {len(limits.velocity)} numbers, arm {name!r} has {self.kinematics.n} joints:"
                 f" {', '.join(self.kinematics.names)}",
             )
-        self._limits = JointLimits(
-            np.array(limits.velocity, dtype=np.float64),
-            np.array(limits.acceleration, dtype=np.float64),
-            np.array(limits.jerk, dtype=np.float64),
-        )
+        values = (limits.velocity, limits.acceleration, limits.jerk)
+        self._limits = JointLimits(*(np.array(value, dtype=np.float64) for value in values))
 
     def start_state(
         self,

@@ -147,12 +147,7 @@ class DualArm(PlanningGroup):
 
     def limits(self, scale: float) -> JointLimits:
         """Limits of all joints at a velocity scale."""
-        a, b = (arm.limits(scale) for arm in self.arms)
-        return JointLimits(
-            np.concatenate([a.velocity, b.velocity]),
-            np.concatenate([a.acceleration, b.acceleration]),
-            np.concatenate([a.jerk, b.jerk]),
-        )
+        return JointLimits(*map(np.concatenate, zip(*(arm.limits(scale) for arm in self.arms), strict=True)))
 
     def plan(
         self, scene: LineChecks, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0
@@ -338,13 +333,8 @@ def _alone(
 def _pairs(scene: DualArmScene, goals: tuple[Array, Array]) -> Array:
     """Goals of both arms that go together, the preferred ones first; (k, n1 + n2)."""
     order = sorted(np.ndindex(len(goals[0]), len(goals[1])), key=sum)
-    found: list[Array] = []
-    for i, j in order:
-        q = np.concatenate([goals[0][i], goals[1][j]])
-        if not scene.collides(q):
-            found.append(q)
-            if len(found) == _GOALS:
-                break
+    pairs = (np.concatenate([goals[0][i], goals[1][j]]) for i, j in order)
+    found = list(itertools.islice((q for q in pairs if not scene.collides(q)), _GOALS))
     if not found:
         contact = scene.contacts(np.concatenate([goals[0][0], goals[1][0]]))[0]
         text = f"goals of both arms: {contact} (all {len(order)} pairs of goals collide)"

@@ -96,6 +96,7 @@ class Planner(Protocol):
         Raises:
             OpenArmError: NO_PLAN, when none was found in the time limit; CANCELLED, when the query was stopped.
         """
+        ...
 
 
 def cancelled() -> OpenArmError:

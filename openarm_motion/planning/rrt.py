@@ -73,17 +73,7 @@ class FastPlanner:
         while True:
             seed = (query.seed + 7919 * chunk) % 2**31
             a, b, checked = kernels.grow(
-                trees,
-                parents,
-                counts,
-                bounds,
-                RANGE,
-                resolution,
-                scene.levers,
-                scene.model,
-                work,
-                _CHUNK,
-                seed,
+                trees, parents, counts, bounds, RANGE, resolution, scene.levers, scene.model, work, _CHUNK, seed
             )
             edges, chunk = edges + checked, chunk + 1
             if a >= 0:
@@ -99,15 +89,7 @@ class FastPlanner:
         points[: len(path)] = path
         limits = np.ones((3, n)) if query.limits is None else np.stack(query.limits)
         count = kernels.shorten(
-            points,
-            len(path),
-            SHORTENINGS,
-            query.seed,
-            limits,
-            resolution,
-            scene.levers,
-            scene.model,
-            work,
+            points, len(path), SHORTENINGS, query.seed, limits, resolution, scene.levers, scene.model, work
         )
         return PlannedPath(points[:count].copy(), int(roots[back[-1]]), edges + len(query.goals))
 

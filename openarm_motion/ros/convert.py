@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from geometry_msgs.msg import Point
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
 from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox, CollisionObject, PlanFailure
 from trajectory_msgs.msg import JointTrajectory
@@ -15,6 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import (
     matrix_to_pose,
+    point,
     pose_to_matrix,
     trajectory_from_msg,
     trajectory_to_msg,
@@ -98,7 +98,7 @@ def solid_msg(solid: Solid, frame: str) -> CollisionObject:
     message.pose.header.frame_id = frame
     message.pose.pose = matrix_to_pose(solid.T)
     if isinstance(solid, Mesh):
-        message.vertices = [Point(x=float(x), y=float(y), z=float(z)) for x, y, z in solid.vertices]
+        message.vertices = [point(vertex) for vertex in solid.vertices]
     return message
 
 
@@ -136,12 +136,12 @@ def preview_markers(paths: Mapping[str, Array], frame: str) -> MarkerArray:
     array = MarkerArray(markers=[Marker(action=Marker.DELETEALL)])
     for k, (arm, points) in enumerate(paths.items()):
         line = _marker(f"{arm}/way", 3 * k, Marker.LINE_STRIP, frame, _PREVIEW_COLOR)
-        line.points = [Point(x=float(x), y=float(y), z=float(z)) for x, y, z in points]
+        line.points = [point(p) for p in points]
         line.scale.x = 0.005
         array.markers.append(line)
         for i, (what, at) in enumerate((("start", points[0]), ("end", points[-1]))):
             end = _marker(f"{arm}/{what}", 3 * k + 1 + i, Marker.SPHERE, frame, _PREVIEW_COLOR)
-            end.pose.position = Point(x=float(at[0]), y=float(at[1]), z=float(at[2]))
+            end.pose.position = point(at)
             end.scale = vector(np.full(3, 0.02 + 0.01 * i))
             array.markers.append(end)
     return array

@@ -34,9 +34,11 @@ class FieldSource(Protocol):
 
     def latest(self) -> DistanceField:
         """Return the newest field; NOT_READY when there is none."""
+        ...
 
     def intact(self, field: DistanceField) -> bool:
         """Whether a field is still as it was: ask after using it."""
+        ...
 
 
 class MapView:

@@ -42,13 +42,16 @@ class TrajectoryGoal(Protocol):
     @property
     def accepted(self) -> bool | None:
         """Whether the controller took it; None while it has not answered."""
+        ...
 
     @property
     def outcome(self) -> Outcome | None:
         """How it ended; None before."""
+        ...
 
     def cancel(self) -> None:
         """Withdraw it: the arm comes to rest and holds."""
+        ...
 
 
 class ArmController(Protocol):
@@ -57,12 +60,15 @@ class ArmController(Protocol):
     @property
     def name(self) -> str:
         """For messages."""
+        ...
 
     def ready(self) -> bool:
         """Whether it is there."""
+        ...
 
     def start(self, motion: Motion, begin_ns: int) -> TrajectoryGoal:
         """Send a trajectory that begins at a robot time, or at once when that is 0."""
+        ...
 
 
 class RobotInterface(Protocol):
@@ -71,24 +77,31 @@ class RobotInterface(Protocol):
     @property
     def states(self) -> RobotStateBuffer:
         """Joint states and frames; their newest stamp is robot time."""
+        ...
 
     def state_age(self) -> float:
         """Time since the newest joint state arrived, s; infinite before the first."""
+        ...
 
     def now(self) -> float:
         """Monotonic time, s."""
+        ...
 
     def controller(self, arm: str) -> ArmController:
         """The controller of an arm."""
+        ...
 
     async def pause(self) -> None:
         """Give control back until something may have changed."""
+        ...
 
     async def compute(self, work: Callable[[], T], nominal: float = 0.1) -> T:
         """Run work that takes some ms; `nominal` is its duration where time is simulated, s."""
+        ...
 
     async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
         """Run several coroutines concurrently until all have ended; then raise the first error."""
+        ...
 
 
 class Watch:

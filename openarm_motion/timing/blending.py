@@ -122,7 +122,7 @@ def time_quintic(names: Sequence[str], waypoints: Array, limits: JointLimits, pe
     """
     parts: list[Trajectory] = []
     for start, end, difference in segments(waypoints):
-        peaks = zip(_QUINTIC, (limits.velocity, limits.acceleration, limits.jerk), strict=True)
+        peaks = zip(_QUINTIC, limits, strict=True)
         ratios = [float(np.max(peak * np.abs(difference) / limit)) for peak, limit in peaks]
         duration = max(ratio ** (1.0 / order) for order, ratio in enumerate(ratios, start=1))
         rest = np.zeros((2, difference.size))
@@ -143,10 +143,7 @@ def _overlap(last: _Segment, way: Profile, difference: Array, ends: float, limit
         borders = borders[(borders > ends - overlap) & (borders < ends)]
         t = np.concatenate([np.linspace(ends - overlap, ends - 1e-9, _CHECKS), borders, borders - 1e-9])
         one, two = last.at(t), fresh.at(t)
-        if all(
-            np.all(np.abs(one[k] + two[k]) <= limit * _ROUNDING)
-            for k, limit in enumerate((limits.velocity, limits.acceleration, limits.jerk), start=1)
-        ):
+        if all(np.all(np.abs(one[k] + two[k]) <= limit * _ROUNDING) for k, limit in enumerate(limits, start=1)):
             return overlap
     return 0.0
 

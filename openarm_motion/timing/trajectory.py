@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import ruckig
@@ -29,8 +30,7 @@ _NOTHING = 1e-9
 SPACING = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class JointLimits:
+class JointLimits(NamedTuple):
     """Velocity, acceleration and jerk limits of the joints, (n,) each."""
 
     velocity: Array
@@ -45,7 +45,7 @@ class JointLimits:
         """
         if not 0.0 < scale <= 1.0:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"velocity_scale is {scale}, expected 0 < scale <= 1")
-        return JointLimits(self.velocity * scale, self.acceleration * scale, self.jerk * scale)
+        return JointLimits(*(limit * scale for limit in self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ def profile(length: float, velocity: float, acceleration: float, jerk: float) ->
 def straight_profile(difference: Array, limits: JointLimits) -> Profile:
     """Fastest way from 0 to 1 of a straight segment (n,), from rest to rest, on which no joint exceeds a limit."""
     size = np.maximum(np.abs(difference), 1e-12)
-    v, a, j = (float(np.min(x / size)) for x in (limits.velocity, limits.acceleration, limits.jerk))
+    v, a, j = (float(np.min(limit / size)) for limit in limits)
     return profile(1.0, v, a, j)
 
 
@@ -214,7 +214,7 @@ def time_path(
     d1, d2, d3 = (curve.derivative(k) for k in (1, 2, 3))
     fine = np.linspace(0.0, float(s[-1]), _FINE)
     steepest = np.maximum(np.abs(d1(fine)).max(axis=0), 1e-9)
-    v, a, j = (float(np.min(x / steepest)) for x in (limits.velocity, limits.acceleration, limits.jerk))
+    v, a, j = (float(np.min(limit / steepest)) for limit in limits)
     way = profile(float(s[-1]), min(speed, v), a, j)
     t = np.union1d(np.linspace(0.0, way.duration, _FINE), np.concatenate([way.t, way.t + 1e-9]))
     x, dx, ddx, dddx = (value[:, None] for value in way.at(t))
