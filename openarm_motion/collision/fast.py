@@ -30,6 +30,8 @@ from openarm_motion.collision.shape_kernels import BOX, CYLINDER, SPHERE
 _ROUNDING = 1e-6
 #: Edge of the cells that shapes are cut into before each is put into a sphere, m.
 _CELL = 0.045
+#: Of one cell, with nothing near to it.
+_NO_MAP = DistanceMap(np.full((1, 1, 1), np.inf, np.float32), np.zeros(3), 1.0, np.inf)
 
 
 class FastScene:
@@ -178,10 +180,10 @@ class _Packer:
         spheres, sphere_groups, bounds, covered = self._spheres()
         if self._field is not None:  # a cell of the map, which is put where it is when it is checked
             self._put(BOX, np.full(3, 0.5 * self._field.resolution), 0, np.eye(4))
-        field = self._field
-        slack = 0.0 if field is None else float(np.sqrt(3.0)) * field.resolution
-        if field is not None and len(spheres) and float(spheres[:, 3].max()) + slack > field.reach:
-            need = float(spheres[:, 3].max()) + slack
+        field = self._field or _NO_MAP
+        slack = float(np.sqrt(3.0)) * field.resolution
+        need = float(spheres[:, 3].max(initial=0.0)) + slack
+        if need > field.reach:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,
                 f"distances of the map are cut at {field.reach:.3f} m, expected {need:.3f} m or more",
@@ -217,11 +219,9 @@ class _Packer:
             sphere_bounds=bounds,
             sphere_shapes=covered[:, 0].astype(np.int64),
             sphere_keep=covered[:, 1].copy(),
-            field=np.full((1, 1, 1), np.inf, np.float32)
-            if field is None
-            else np.ascontiguousarray(field.distances, np.float32),
-            corner=np.zeros(3) if field is None else np.array(field.corner, np.float64),
-            edge=np.array([1.0 if field is None else field.resolution, slack]),
+            field=np.ascontiguousarray(field.distances, np.float32),
+            corner=np.array(field.corner, np.float64),
+            edge=np.array([field.resolution, slack]),
         )
 
     def _clusters(self) -> tuple[list[_Cluster], dict[int, int]]:

@@ -127,23 +127,12 @@ class DualArm(PlanningGroup):
             held: Boxes held by each arm, its tool frame.
             environment: Bodies of the planning scene and the map.
         """
-        scenes = [self.scene_of(i, state, boxes, separation, held, environment) for i in range(2)]
-        return DualArmScene(scenes[0], scenes[1], self.split)
-
-    def scene_of(
-        self,
-        index: int,
-        state: Mapping[str, float],
-        boxes: Sequence[Box] = (),
-        separation: float = SEPARATION,
-        held: tuple[Sequence[Box], Sequence[Box]] = ((), ()),
-        environment: Environment = NOTHING,
-    ) -> CollisionScene:
-        """Surroundings of one of the arms, the other one in them where `state` says; arguments as `scene`."""
-        carried = self.arms[1 - index].robot.on_tool(held[1 - index])
-        return self.arms[index].scene(
-            state, boxes, held[index], environment=environment, carried=carried, arms=separation
+        carried = [arm.robot.on_tool(mine) for arm, mine in zip(self.arms, held, strict=True)]
+        first, second = (
+            arm.scene(state, boxes, held[i], environment=environment, carried=carried[1 - i], arms=separation)
+            for i, arm in enumerate(self.arms)
         )
+        return DualArmScene(first, second, self.split)
 
     def limits(self, scale: float) -> JointLimits:
         """Limits of all joints at a velocity scale."""
@@ -320,7 +309,7 @@ def _alone(
 ) -> Trajectory:
     """The path of one arm with the other one where `state` says."""
     arm, start = both.arms[index], both.parts(now.start)[index]
-    scene = both.scene_of(index, state, wanted.obstacles, held=wanted.held, environment=now.environment)
+    scene = both.scene(state, wanted.obstacles, held=wanted.held, environment=now.environment).arms[index]
     arm.relax(scene, start)
     goals = [q for q in wanted.goals[index] if not scene.collides(q)][:_GOALS]
     if not goals:
