@@ -18,7 +18,7 @@ from openarm_motion.planning.rrt import warm_search
 
 
 def warm() -> None:
-    """Run each kernel once with the types that the package uses; the compiled code is cached beside the sources."""
+    """Run each kernel once with the types that the package uses; the compiled code is cached next to the sources."""
     description = RobotDescription.load()
     kinematics = ArmKinematics(description, description.tcp_link(SIDES[0]))
     inverse = InverseKinematics(kinematics)

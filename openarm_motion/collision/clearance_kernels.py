@@ -200,7 +200,7 @@ def map_distance(frame: Array, ball: Array, field: NDArray[np.float32], corner: 
     x = frame[0, 0] * ball[0] + frame[0, 1] * ball[1] + frame[0, 2] * ball[2] + frame[0, 3] - corner[0]
     y = frame[1, 0] * ball[0] + frame[1, 1] * ball[1] + frame[1, 2] * ball[2] + frame[1, 3] - corner[1]
     z = frame[2, 0] * ball[0] + frame[2, 1] * ball[1] + frame[2, 2] * ball[2] + frame[2, 3] - corner[2]
-    # the nearest cell stands for a point outside: what is in the map is no nearer to the point than to it
+    # the nearest cell represents a point outside: what is in the map is no nearer to the point than to it
     i = min(max(math.floor(x * inverse), 0), nx - 1)
     j = min(max(math.floor(y * inverse), 0), ny - 1)
     k = min(max(math.floor(z * inverse), 0), nz - 1)

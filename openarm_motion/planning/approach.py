@@ -121,7 +121,7 @@ class Refused:
         return cls(id, error.code, message, stage)
 
 
-#: A configuration nearer to a joint limit than this is thought less of, rad.
+#: A configuration nearer to a joint limit than this costs more, rad.
 _COMFORT = 0.3
 #: Targets checked for a start configuration before the search is tried.
 _GOALS = 24

@@ -32,7 +32,7 @@ SHORTENINGS = 60
 
 
 def never() -> bool:
-    """Answer of a query that nobody stops."""
+    """Never stop a query."""
     return False
 
 

@@ -65,7 +65,7 @@ class NodeRobot:
         return self._controllers[arm]
 
     async def pause(self) -> None:
-        """Sleep until the next tick of a timer that runs while anybody waits."""
+        """Sleep until the next tick of a timer that runs while a coroutine waits."""
         if not self._waiting and self._timer.is_canceled():
             self._wake = Future(executor=self._node.executor)
             self._timer.reset()

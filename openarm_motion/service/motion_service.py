@@ -69,7 +69,7 @@ _STRATEGIES: dict[Strategy, Callable[[DualArm, StartState, DualArmGoals, float],
 
 
 def silent(stage: str, progress: float) -> None:
-    """Report to nobody."""
+    """Discard a report."""
 
 
 def table_box(table: Table) -> Box:
@@ -357,7 +357,7 @@ class MotionService:
         return lambda now: moves.to_pose_on_line(arm, now, pose, around)
 
     def _goals(self, arm: Arm, start: Array, target: ArmGoal) -> Callable[[StartState], Array]:
-        """Configurations (k, n) that a goal of a dual-arm motion stands for; as `_planner`."""
+        """Configurations (k, n) that a goal of a dual-arm motion allows; as `_planner`."""
         goal = target.goal
         if isinstance(goal, JointGoal):
             q = arm.configuration(goal.q, f"goal of the {arm.name} arm", 1e-3)
