@@ -111,7 +111,7 @@ def _boxed(
     T, placed = origin(shape), shape.find("origin")
     rpy = "0 0 0" if placed is None else placed.get("rpy", "0 0 0")
     out: list[ET.Element] = []
-    for k, (low, high) in enumerate(boxes_about(vertices[np.array(corners)])):
+    for k, (low, high) in enumerate(boxes_about([*vertices[np.array(corners)]])):
         box = ET.Element("collision", {"name": f"{link}_{path.stem}_{k}"})
         centre = T[:3, :3] @ (0.5 * (low + high)) + T[:3, 3]
         ET.SubElement(box, "origin", {"xyz": _text(centre), "rpy": rpy})

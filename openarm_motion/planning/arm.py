@@ -112,7 +112,6 @@ class PlanningGroup(ABC):
             upper=self.upper,
             collides=scene.collides,
             edge_free=lambda a, b: scene.edge_free(a, b, step, travel),
-            cost=lambda a, b: segment_time(a, b, limits),
             time_limit=time_limit,
             iterations=search.iterations,
             seed=search.seed,

@@ -136,7 +136,8 @@ class DualArm(PlanningGroup):
 
     def limits(self, scale: float) -> JointLimits:
         """Limits of all joints at a velocity scale."""
-        return JointLimits(*map(np.concatenate, zip(*(arm.limits(scale) for arm in self.arms), strict=True)))
+        first, second = (arm.limits(scale) for arm in self.arms)
+        return JointLimits(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))
 
     def plan(
         self, scene: LineChecks, now: StartState, goals: Array, time_limit: float, fineness: float = 1.0

@@ -11,8 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
-
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 
@@ -36,10 +34,6 @@ def never() -> bool:
     return False
 
 
-def _length(a: Array, b: Array) -> float:
-    return float(np.linalg.norm(b - a))
-
-
 @dataclass(frozen=True, eq=False)
 class PlanQuery:
     """What to plan.
@@ -51,7 +45,6 @@ class PlanQuery:
         upper: (n,) bounds.
         collides: Whether a configuration collides.
         edge_free: Whether the straight joint line between two configurations is free, ends included.
-        cost: Of a straight segment from rest to rest, for example its duration; what shortening makes small.
         time_limit: Wall clock, s.
         iterations: Samples of the search, in place of the time limit; 0 leaves it to the time. The same query then ends
             the same way on a busy machine.
@@ -59,7 +52,7 @@ class PlanQuery:
         stopped: Asked often; planning ends with CANCELLED when it says True.
         fast: Makes the fast layer's view of the same; None leaves the two questions above.
         resolution: Turn of a joint (rad) and travel of a point (m) between two checks of a line.
-        limits: Velocity, acceleration and jerk (n,) of the joints, which make a segment's cost on the fast layer.
+        limits: Velocity, acceleration and jerk (n,) of the joints, which say how long a segment takes.
     """
 
     start: Array
@@ -68,7 +61,6 @@ class PlanQuery:
     upper: Array
     collides: Callable[[Array], bool]
     edge_free: Callable[[Array, Array], bool]
-    cost: Callable[[Array, Array], float] = _length
     time_limit: float = 5.0
     iterations: int = 0
     seed: int = 1

@@ -246,7 +246,7 @@ def held_markers(held: Mapping[str, tuple[str, Sequence[Box]]]) -> MarkerArray:
     return array
 
 
-def _marker(name: str, id: int, kind: int, frame: str, color: tuple[float, float, float, float]) -> Marker:
+def _marker(name: str, id: int, kind: int | None, frame: str, color: tuple[float, float, float, float]) -> Marker:
     marker = Marker(ns=name, id=id, type=kind, action=Marker.ADD)
     marker.header.frame_id = frame
     marker.color.r, marker.color.g, marker.color.b, marker.color.a = color

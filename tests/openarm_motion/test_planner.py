@@ -13,13 +13,12 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
 from openarm_motion.collision.solids import Box
-from openarm_motion.planning.arm import Arm, segment_time
+from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.ompl_planner import OmplPlanner
 from openarm_motion.planning.planner import PlannedPath, PlanQuery
 
 
 def query(arm: Arm, scene: CollisionScene, start: np.ndarray, goals: np.ndarray, **kwargs: object) -> PlanQuery:
-    limits = arm.limits(0.5)
     return PlanQuery(
         start=start,
         goals=np.atleast_2d(goals),
@@ -27,7 +26,6 @@ def query(arm: Arm, scene: CollisionScene, start: np.ndarray, goals: np.ndarray,
         upper=arm.kinematics.upper,
         collides=scene.collides,
         edge_free=lambda a, b: scene.edge_free(a, b, 0.05, 0.02),
-        cost=lambda a, b: segment_time(a, b, limits),
         **kwargs,
     )
 
