@@ -9,8 +9,7 @@ states are subscribed to only while a sample is taken. The action /calibration/a
 
 from __future__ import annotations
 
-import datetime
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -36,11 +35,11 @@ from openarm_calibration.ros.auto_server import AutoCalibrateServer, fill
 from openarm_calibration.ros.image_capture import ImageCapture, grey
 from openarm_calibration.sampling.gate import Matched, match
 from openarm_calibration.sampling.next_pose import advice
-from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead, load_session, session_path, setup_of
-from openarm_calibration.store.store import CalibrationStore, default_folder
+from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead, head_of, load_session, session_path
+from openarm_calibration.store.store import CalibrationStore, default_folder, now
 from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.answers import ResponseT, answer, answer_async
+from openarm_common.ros.answers import answer_async
 from openarm_common.ros.convert import intrinsics_from_info
 from openarm_common.ros.node import BaseNode, run
 from openarm_common.ros.tf import RobotStateListener
@@ -70,7 +69,7 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         self._result: Result | None = None
         self.algorithm = config.algorithm
         self.use(config.camera)
-        for name, kind, handler in (
+        for name, kind, work in (
             ("take_sample", TakeSample, self._on_take),
             ("remove_sample", RemoveSample, self._on_remove),
             ("get_sample_list", GetSampleList, self._on_list),
@@ -81,12 +80,12 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
             ("save_samples", SampleFile, self._on_save_samples),
             ("load_samples", SampleFile, self._on_load_samples),
         ):
-            self.create_service(kind, f"/calibration/{name}", handler)
+            self.create_service(kind, f"/calibration/{name}", self._handler(work))
         self._auto = AutoCalibrateServer(self)
 
     # --- the session
     def use(self, name: str) -> None:
-        """Begin anew with a camera, without samples.
+        """Start over with a camera, without samples.
 
         Raises:
             OpenArmError: CONFIG_INVALID, listing the cameras.
@@ -130,12 +129,9 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
             OpenArmError: DEGENERATE, INVALID_ARGUMENT.
         """
         name = checked_algorithm(algorithm or self.algorithm)
-        found = self._store.find(self.camera.name)
-        stored = found.calibration if found is not None else None
-        if stored is not None and stored.mount_seed != self.samples.head.mount_seed:
-            stored = None  # of other mounts: its distance means nothing
+        stored = self._store.in_use(self.camera.name, self.samples.head.mount_seed)
         result: Result = await self.in_thread(
-            calibrate, self.samples, algorithm=name, limits=self.config.limits, created=_now(), stored=stored
+            calibrate, self.samples, algorithm=name, limits=self.config.limits, created=now(), stored=stored
         )
         self._result = result
         self._report()
@@ -179,14 +175,10 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         self.diagnose(True, f"{len(self.samples)} samples of {self.camera.name!r}", result=grade)
 
     def _head(self, optics: Intrinsics) -> SessionHead:
-        board = read_board(self.config.board, "parameter board")
-        setup = setup_of(self.description, self.camera.parent)
-        return SessionHead(
-            camera=self.camera.name, setup=setup, parent=self.camera.parent,
-            carrier=self.config.carrier if setup == "to_hand" else self.camera.parent,
-            intrinsics=(optics.width, optics.height, optics.fx, optics.fy, optics.cx, optics.cy),
-            board=board.model_dump(), created=_now(),
-            mount_seed=self.config.seed if self.camera.mount_error else None,
+        seed = self.config.seed if self.camera.mount_error else None
+        return head_of(
+            self.camera.name, self.camera.parent, self.description, optics,
+            read_board(self.config.board, "parameter board"), self.config.carrier, mount_seed=seed, created=now(),
         )  # fmt: skip
 
     def _check_optics(self, optics: Intrinsics) -> None:
@@ -203,103 +195,73 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         self.samples = SampleSet(self._head(optics), self.description)
 
     # --- services
-    async def _on_take(self, _: TakeSample.Request, response: TakeSample.Response) -> TakeSample.Response:
-        async def take() -> str:
-            with self.work("taking a sample"):
-                sample = await self.take()
-            response.sample = sample.name
-            return (
-                f"{sample.name}: {len(sample.detection.ids)} marks, residual {sample.detection.residual:.2f} px, stamps"
-                f" {(sample.t_joints_ns - sample.t_image_ns) / 1e6:+.1f} ms apart"
-            )
+    def _handler(self, work: Callable[[Any, Any], Awaitable[str]]) -> Callable[[Any, Any], Awaitable[Any]]:
+        """Return the callback of a service whose work fills a response and returns its message."""
 
-        await answer_async(response, take)
-        response.samples = self._names()
-        return response
+        async def serve(request: Any, response: Any) -> Any:
+            await answer_async(response, lambda: work(request, response))
+            if hasattr(response, "samples"):
+                response.samples = [sample.name for sample in self.samples.samples]
+            return response
 
-    def _on_remove(self, request: RemoveSample.Request, response: RemoveSample.Response) -> RemoveSample.Response:
-        def remove() -> str:
-            self._require_idle()
-            removed = self.samples.remove(request.sample)
-            self._change(self.samples)
-            return f"removed {removed.name}"
+        return serve
 
-        return self._with_samples(response, remove)
+    async def _on_take(self, _: TakeSample.Request, response: TakeSample.Response) -> str:
+        with self.work("taking a sample"):
+            sample = await self.take()
+        response.sample = sample.name
+        return (
+            f"{sample.name}: {len(sample.detection.ids)} marks, residual {sample.detection.residual:.2f} px, stamps"
+            f" {(sample.t_joints_ns - sample.t_image_ns) / 1e6:+.1f} ms apart"
+        )
 
-    def _on_list(self, _: GetSampleList.Request, response: GetSampleList.Response) -> GetSampleList.Response:
+    async def _on_remove(self, request: RemoveSample.Request, _: RemoveSample.Response) -> str:
+        self._require_idle()
+        removed = self.samples.remove(request.sample)
+        self._change(self.samples)
+        return f"removed {removed.name}"
+
+    async def _on_list(self, _: GetSampleList.Request, response: GetSampleList.Response) -> str:
         response.camera = self.camera.name
         response.advice = advice([self.samples.pose(sample.joints) for sample in self.samples.samples])
-        text = f"{len(self.samples)} samples of {self.camera.name!r} and {self.samples.board.label}"
-        return self._with_samples(response, lambda: text)
+        return f"{len(self.samples)} samples of {self.camera.name!r} and {self.samples.board.label}"
 
-    def _on_save_samples(self, request: SampleFile.Request, response: SampleFile.Response) -> SampleFile.Response:
-        def save() -> str:
-            digest = self.samples.save(session_path(request.path))
-            return f"{len(self.samples)} samples in {request.path}, hash {digest[:12]}"
+    async def _on_save_samples(self, request: SampleFile.Request, _: SampleFile.Response) -> str:
+        digest = self.samples.save(session_path(request.path))
+        return f"{len(self.samples)} samples in {request.path}, hash {digest[:12]}"
 
-        return self._with_samples(response, save)
+    async def _on_load_samples(self, request: SampleFile.Request, _: SampleFile.Response) -> str:
+        self._require_idle()
+        samples, digest = load_session(session_path(request.path), self.description)
+        if samples.head.camera != self.camera.name or samples.head.parent != self.camera.parent:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"{request.path} is of camera {samples.head.camera!r} on {samples.head.parent!r}, this node"
+                f" calibrates {self.camera.name!r} on {self.camera.parent!r}",
+            )
+        self._change(samples)
+        return f"{len(samples)} samples from {request.path}, hash {digest[:12]}"
 
-    def _on_load_samples(self, request: SampleFile.Request, response: SampleFile.Response) -> SampleFile.Response:
-        def load() -> str:
-            self._require_idle()
-            samples, digest = load_session(session_path(request.path), self.description)
-            if samples.head.camera != self.camera.name or samples.head.parent != self.camera.parent:
-                raise OpenArmError(
-                    Code.INVALID_ARGUMENT,
-                    f"{request.path} is of camera {samples.head.camera!r} on {samples.head.parent!r}, this node"
-                    f" calibrates {self.camera.name!r} on {self.camera.parent!r}",
-                )
-            self._change(samples)
-            return f"{len(samples)} samples from {request.path}, hash {digest[:12]}"
+    async def _on_compute(self, request: ComputeCalibration.Request, response: ComputeCalibration.Response) -> str:
+        checked_algorithm(request.algorithm or self.algorithm)
+        with self.work("solving"):
+            result = await self.solve(request.algorithm)
+        fill(response, result, self.camera.link_frame)
+        response.held_out_px = result.verdict.figures["leave_one_out_px"]
+        response.held_out = result.verdict.figures["leave_one_out"]
+        return str(response.message)
 
-        return self._with_samples(response, load)
+    async def _on_save(self, request: SaveCalibration.Request, response: SaveCalibration.Response) -> str:
+        response.path = str(self.save(force=request.force))
+        return f"stored in {response.path}"
 
-    async def _on_compute(
-        self, request: ComputeCalibration.Request, response: ComputeCalibration.Response
-    ) -> ComputeCalibration.Response:
-        async def compute() -> str:
-            checked_algorithm(request.algorithm or self.algorithm)
-            with self.work("solving"):
-                result = await self.solve(request.algorithm)
-            fill(response, result, self.camera.link_frame)
-            response.held_out_px = result.verdict.figures["leave_one_out_px"]
-            response.held_out = result.verdict.figures["leave_one_out"]
-            return str(response.message)
-
-        return await answer_async(response, compute)
-
-    def _on_save(
-        self, request: SaveCalibration.Request, response: SaveCalibration.Response
-    ) -> SaveCalibration.Response:
-        def save() -> str:
-            response.path = str(self.save(force=request.force))
-            return f"stored in {response.path}"
-
-        return answer(response, save)
-
-    def _on_algorithms(self, _: ListAlgorithms.Request, response: ListAlgorithms.Response) -> ListAlgorithms.Response:
+    async def _on_algorithms(self, _: ListAlgorithms.Request, response: ListAlgorithms.Response) -> str:
         response.algorithms, response.current = list(ALGORITHMS), self.algorithm
-        return answer(response, lambda: f"{self.algorithm} is set")
+        return f"{self.algorithm} is set"
 
-    def _on_set(self, request: SetAlgorithm.Request, response: SetAlgorithm.Response) -> SetAlgorithm.Response:
-        def use() -> str:
-            self.algorithm = checked_algorithm(request.algorithm)
-            return f"{self.algorithm} is set"
-
-        return answer(response, use)
-
-    def _with_samples(self, response: ResponseT, work: Callable[[], str]) -> ResponseT:
-        """Answer with the names of the samples, too."""
-        filled: Any = answer(response, work)
-        filled.samples = self._names()
-        return response
-
-    def _names(self) -> list[str]:
-        return [sample.name for sample in self.samples.samples]
-
-
-def _now() -> str:
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    async def _on_set(self, request: SetAlgorithm.Request, _: SetAlgorithm.Response) -> str:
+        self.algorithm = checked_algorithm(request.algorithm)
+        return f"{self.algorithm} is set"
 
 
 def main() -> None:

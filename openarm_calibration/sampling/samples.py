@@ -248,12 +248,6 @@ class SampleSet:
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-def setup_of(description: RobotDescription, parent: str) -> Literal["in_hand", "to_hand"]:
-    """Return whether a camera on a link moves with the arm, or is fixed and observes a board that the arm carries."""
-    moves = any(joint.type != "fixed" for joint in description.chain(parent))
-    return "in_hand" if moves else "to_hand"
-
-
 def head_of(
     camera: str, parent: str, description: RobotDescription, optics: Intrinsics, board: Board, carrier: str, **more: Any
 ) -> SessionHead:
@@ -268,9 +262,9 @@ def head_of(
         carrier: Link that holds the board of a camera that does not move.
         more: Other fields.
     """
-    setup = setup_of(description, parent)
+    moves = any(joint.type != "fixed" for joint in description.chain(parent))
     return SessionHead(
-        camera=camera, setup=setup, parent=parent, carrier=parent if setup == "in_hand" else carrier,
+        camera=camera, setup="in_hand" if moves else "to_hand", parent=parent, carrier=parent if moves else carrier,
         intrinsics=astuple(optics), board=board.model_dump(), **more,
     )  # fmt: skip
 
