@@ -18,7 +18,7 @@ from rclpy.action.server import ServerGoalHandle
 from openarm_calibration.handeye.offline import Result
 from openarm_calibration.handeye.verdict import estimate_delay
 from openarm_calibration.ros.image_capture import wait_until
-from openarm_calibration.sampling.next_pose import PoseSearch, Proposal
+from openarm_calibration.sampling.next_pose import PoseSearch
 from openarm_calibration.sampling.samples import Sample, session_path
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
@@ -124,7 +124,7 @@ class _Run:
             await self._first()
         missed = 0
         while len(self._node.samples) < self._poses:
-            proposal = await self._next()
+            q = await self._next()
             self._report("sampling", "")
             try:
                 await self._take()
@@ -132,7 +132,7 @@ class _Run:
                 if error.code not in _NO_SAMPLE:
                     raise
                 missed += 1
-                self._miss(proposal, error)
+                self._miss(q, error)
                 if missed >= _MISSES:
                     raise OpenArmError(
                         error.code, f"{missed} poses in a row gave no sample; of the last: {error.message}"
@@ -160,8 +160,8 @@ class _Run:
             ) from error
         await self._node.in_thread(self._search.learn, self._node.samples)
 
-    async def _next(self) -> Proposal:
-        """Move to the most informative pose that the arm reaches.
+    async def _next(self) -> Array:
+        """Move to the most informative pose that the arm reaches, and return the posture.
 
         Raises:
             OpenArmError: The planner's error for the last one, when none is reached; CANCELLED and the like at once.
@@ -171,18 +171,18 @@ class _Run:
         while tried < self._config.tries:
             self._report("looking", "for the most informative pose")
             state = await self._node.capture.state()
-            for proposal in await self._node.in_thread(self._search.propose, self._node.samples, state, _AT_ONCE):
+            for q in await self._node.in_thread(self._search.propose, self._node.samples, state, _AT_ONCE):
                 self._report("moving", f"try {tried + 1}: the arm did not reach the one before" if tried else "")
                 tried += 1
                 try:
-                    await self._move(proposal.q, self._config.velocity_scale, self._stopped)
+                    await self._move(q, self._config.velocity_scale, self._stopped)
                 except OpenArmError as error:
                     if error.code not in _ELSEWHERE:
                         raise
                     fault = error
-                    self._search.refuse(proposal)
+                    self._search.refuse(q)
                     continue
-                return proposal
+                return q
         last = fault.message if fault is not None else "none was proposed"
         raise OpenArmError(Code.NO_PLAN, f"the arm reaches none of {tried} poses; of the last: {last}")
 
@@ -197,9 +197,9 @@ class _Run:
                 if error.code != Code.MOVING or time.monotonic() > until:
                     raise
 
-    def _miss(self, proposal: Proposal, error: OpenArmError) -> None:
-        self._search.refuse(proposal)
-        posture = ", ".join(f"{q:.2f}" for q in proposal.q)
+    def _miss(self, q: Array, error: OpenArmError) -> None:
+        self._search.refuse(q)
+        posture = ", ".join(f"{position:.2f}" for position in q)
         self._result.missed.append(f"({posture}): {error.message}")
         self._node.get_logger().info(f"no sample at ({posture}): {error.message}")
 

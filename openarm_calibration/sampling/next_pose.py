@@ -25,6 +25,7 @@ from openarm_calibration.handeye.solve import SolveConfig, solve
 from openarm_calibration.sampling.bodies import Bodies, chain_poses
 from openarm_calibration.sampling.samples import SampleSet
 from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
@@ -38,20 +39,22 @@ MOST_TILT = math.radians(55.0)
 ENOUGH = 12
 
 
-def visible(board: Board, T_camera_board: Array, row: Array, size: tuple[int, int]) -> bool:
-    """Return whether all marks would be in the image (width, height), not tilted too far, and seen from the front.
+def visible(board: Board, T_camera_board: Array, optics: Intrinsics, margin: float) -> bool:
+    """Return whether all marks would be in the image, not tilted too far, and seen from the front.
 
     Args:
         board: The board.
         T_camera_board: (4, 4).
-        row: (4,) fx, fy, cx, cy.
-        size: Width and height of the image, px.
+        optics: Of the camera.
+        margin: Kept from the edge of the image in addition to `EDGE`, px.
     """
     direction = T_camera_board[:3, 3] / max(float(np.linalg.norm(T_camera_board[:3, 3])), 1e-9)
     if float(T_camera_board[:3, 2] @ direction) < math.cos(MOST_TILT):
         return False
+    row = np.array([optics.fx, optics.fy, optics.cx - margin, optics.cy - margin])
     pixels = project(board.points, board.radius, T_camera_board, row)
-    inside = (pixels > EDGE) & (pixels < np.array(size) - 1.0 - EDGE)
+    size = np.round((optics.width - 2 * margin, optics.height - 2 * margin))
+    inside = (pixels > EDGE) & (pixels < size - 1.0 - EDGE)
     return bool(np.isfinite(pixels).all() and inside.all())
 
 
@@ -132,21 +135,6 @@ class Belief:
         return math.isfinite(self.sigma_translation)
 
 
-@dataclass(frozen=True, eq=False)
-class Proposal:
-    """A posture, and what a sample there would leave of the error.
-
-    Args:
-        q: (n,) positions of the joints that move camera or board, in the order of `SampleSet.joint_names`.
-        sigma_translation: Predicted error of the position with it, m.
-        sigma_rotation: The same of the rotation, rad.
-    """
-
-    q: Array
-    sigma_translation: float
-    sigma_rotation: float
-
-
 class PoseSearch:
     """Remembers which postures show the board, and proposes the next.
 
@@ -195,12 +183,12 @@ class PoseSearch:
         self.belief = Belief(X, Z, *solution.sigma()) if credible else before
         return self.belief
 
-    def refuse(self, proposal: Proposal) -> None:
-        """A posture that can't be had, or did not show the board, is not proposed again, nor its neighbours."""
-        self._refused.append(proposal.q)
+    def refuse(self, q: Array) -> None:
+        """Do not propose a posture (n,) again that can't be reached or did not show the board, nor its neighbours."""
+        self._refused.append(q)
 
-    def propose(self, samples: SampleSet, state: Mapping[str, float], most: int = 12) -> list[Proposal]:
-        """Return the next poses, best first.
+    def propose(self, samples: SampleSet, state: Mapping[str, float], most: int = 12) -> list[Array]:
+        """Return the next postures (n,) in the order of `SampleSet.joint_names`, best first.
 
         Args:
             samples: So far.
@@ -226,11 +214,11 @@ class PoseSearch:
             )
         ranked = self._ranked(samples, Z, found)
         here = _vector(samples, state)
-        out: list[Proposal] = []
+        out: list[Array] = []
         while ranked and len(out) < most:
             limit = _AS_GOOD * min(score for score, _ in ranked)
             near = [k for k, (score, _) in enumerate(ranked) if score <= limit]
-            best = min(near, key=lambda k: float(np.abs(ranked[k][1].q - here).max()))
+            best = min(near, key=lambda k: float(np.abs(ranked[k][1] - here).max()))
             out.append(ranked.pop(best)[1])
         return out
 
@@ -267,7 +255,7 @@ class PoseSearch:
             views = self._views(samples, drawn, Z)
             for k in np.flatnonzero(self._centred(samples, views)):
                 q, T = drawn[k], views[k]
-                if not self._seen(samples, T, margin):
+                if not visible(samples.board, T, samples.head.optics, margin):
                     continue
                 links = self._description.link_poses({**state, **_joints(samples, q)})
                 shapes = self._bodies.place(links)
@@ -300,15 +288,8 @@ class PoseSearch:
         large = optics.fx * samples.board.diameter / np.maximum(views[:, 2, 3], 1e-6) > self._config.smallest
         return inside & large
 
-    def _seen(self, samples: SampleSet, T: Array, margin: float) -> bool:
-        """Return whether all marks are in the image, so far from its edge."""
-        optics = samples.head.optics
-        row = np.array([optics.fx, optics.fy, optics.cx - margin, optics.cy - margin])
-        size = (round(optics.width - 2 * margin), round(optics.height - 2 * margin))
-        return visible(samples.board, T, row, size)
-
-    def _ranked(self, samples: SampleSet, Z: Array, found: list[tuple[Array, Array]]) -> list[tuple[float, Proposal]]:
-        """Return what each posture leaves of the error: a score, smaller is better."""
+    def _ranked(self, samples: SampleSet, Z: Array, found: list[tuple[Array, Array]]) -> list[tuple[float, Array]]:
+        """Return what each posture leaves of the error (a score, smaller is better), and the posture."""
         config, optics, board = self._config, samples.head.optics, samples.board
         noise = Noise(config.px, config.robot_translation, config.robot_rotation)
         row = np.array([optics.fx, optics.fy, optics.cx, optics.cy])
@@ -318,14 +299,13 @@ class PoseSearch:
         before: Array = np.diag(np.concatenate([wide, np.ones(6)]) ** -2.0)
         if len(samples):
             before = before + information_at(samples.problem(), X_all, Z_all, noise)
-        out: list[tuple[float, Proposal]] = []
+        out: list[tuple[float, Array]] = []
         for q, T in found:
             pixels = project(board.points, board.radius, T, row)
             view = View(board.points, pixels, samples.pose(_joints(samples, q)), samples.head.setup, board.radius)
             gain = information_at(assemble([view], [optics], [T]), X_all, Z_all, noise)
             variance = np.diag(invert_scaled(before + gain))[:6]
-            sigma_t, sigma_r = math.sqrt(variance[:3].sum()), math.sqrt(variance[3:].sum())
-            out.append((float(np.sum(variance / UNITS**2)), Proposal(q, sigma_t, sigma_r)))
+            out.append((float(np.sum(variance / UNITS**2)), q))
         return out
 
 
