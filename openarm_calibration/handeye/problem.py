@@ -310,9 +310,13 @@ class Problem:
         """(cameras, 4) fx, fy, cx, cy."""
         return np.array([[k.fx, k.fy, k.cx, k.cy] for k in self.intrinsics])
 
-    def camera_rows(self) -> Array:
-        """Return (n, 4) fx, fy, cx, cy of each view's camera."""
-        return self.intrinsics_rows[self.camera]
+    def camera_rows(self, change: Array | float = 0.0) -> Array:
+        """Return (n, 4) fx, fy, cx, cy of each view's camera, changed by (cameras, 4)."""
+        return (self.intrinsics_rows + change)[self.camera]
+
+    def equations(self, T: Array, change: Array | float = 0.0, scale: float = 1.0) -> tuple[Array, Array, Array]:
+        """Return `normal_equations` at poses (n, 4, 4), a change of the intrinsics (cameras, 4) and a board scale."""
+        return normal_equations(self.points, self.pixels, self.offsets, self.radii, T, self.camera_rows(change), scale)
 
     def subset(self, keep: Sequence[int] | Indices | NDArray[np.bool_]) -> Problem:
         """Return the problem with some of its views (indices or a mask); the per-view fits are kept."""

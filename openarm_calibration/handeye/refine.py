@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from openarm_calibration.handeye.problem import Extra, Problem, chain, design, layout, moved, normal_equations
+from openarm_calibration.handeye.problem import Extra, Problem, chain, design, layout, moved
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
@@ -272,10 +272,7 @@ def linearise(problem: Problem, state: State, px: float, extras: Sequence[Extra]
     correction = state.correction[problem.pose]
     shifted = correction - state.delay * problem.rate if state.delay else correction
     T, B = chain(problem, state.X, state.Z, shifted)
-    rows = problem.camera_rows() + state.intrinsics[problem.camera]
-    squares, slopes, costs = normal_equations(
-        problem.points, problem.pixels, problem.offsets, problem.radii, T, rows, state.scale
-    )
+    squares, slopes, costs = problem.equations(T, state.intrinsics, state.scale)
     weight = px**-2.0
     M, b = squares * weight, slopes * weight
     G, K = design(problem, state.X, state.Z, T, B, extras)

@@ -21,7 +21,7 @@ from scipy import stats
 
 from openarm_calibration.handeye.closed_form import closed_form
 from openarm_calibration.handeye.observability import FEWEST, condition_number, require_accuracy, require_motion
-from openarm_calibration.handeye.problem import Extra, Problem, chain, design, normal_equations
+from openarm_calibration.handeye.problem import Extra, Problem, chain, design
 from openarm_calibration.handeye.refine import Estimate, Noise, pixel_noise, refine
 from openarm_common import se3
 from openarm_common.config import Config
@@ -65,10 +65,7 @@ def pose_tests(problem: Problem, used: Mask, estimate: Estimate, limit: float, u
         By number of the pose, as `problem.pose` counts.
     """
     T, B = chain(problem, estimate.X, estimate.Z)
-    squares, _, _ = normal_equations(
-        problem.points, problem.pixels, problem.offsets, problem.radii, problem.free,
-        problem.camera_rows() + estimate.intrinsics[problem.camera], estimate.scale,
-    )  # fmt: skip
+    squares, _, _ = problem.equations(problem.free, estimate.intrinsics, estimate.scale)
     M = squares[:, :6, :6] * estimate.noise.px**-2.0
     G, K = design(problem, estimate.X, estimate.Z, T, B, estimate.extras)
     extra = 6 * (problem.cameras + problem.boards)
@@ -289,9 +286,7 @@ def _spoiled(problem: Problem, used: Mask, estimate: Estimate) -> bool:
 def _reprojection(problem: Problem, X: Array, Z: Array) -> Array:
     """Return (n,) rms of each view without corrections, px."""
     T, _ = chain(problem, X, Z)
-    _, _, cost = normal_equations(
-        problem.points, problem.pixels, problem.offsets, problem.radii, T, problem.camera_rows(), 1.0
-    )
+    _, _, cost = problem.equations(T)
     return np.sqrt(cost / (2.0 * problem.marks))
 
 

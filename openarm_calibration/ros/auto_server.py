@@ -68,7 +68,6 @@ class AutoCalibrateServer:
 
     def __init__(self, node: CalibrationNode) -> None:
         self._node = node
-        self._config = node.config.auto
         self._mover = ActionClient(node, MoveArm, "/motion/move")
         self._server = ActionServer(
             node, AutoCalibrate, "/calibration/auto", self._execute, cancel_callback=lambda _: CancelResponse.ACCEPT
@@ -288,23 +287,14 @@ class _Run:
 
         far = max(node.samples.samples, key=away)
         both = node.samples.copy()
-        begun, ended, seen = len(both), False, 0
-
-        async def follow() -> None:
-            nonlocal ended
-            try:
-                q = np.array([far.joints[name] for name in names])
-                await self._move(
-                    q, self._config.delay_velocity_scale, lambda: self._stopped() or seen >= _ENOUGH_MOVING
-                )
-            finally:
-                ended = True
-
+        begun, seen = len(both), 0
+        q = np.array([far.joints[name] for name in names])
         executor = node.executor
-        if executor is None:
-            raise OpenArmError(Code.INTERNAL, "the node has no executor")
-        motion = executor.create_task(follow)
-        while not ended and seen < _ENOUGH_MOVING:
+        assert executor is not None  # it runs this coroutine
+        motion = executor.create_task(
+            self._move, q, self._config.delay_velocity_scale, lambda: self._stopped() or seen >= _ENOUGH_MOVING
+        )
+        while not motion.done() and seen < _ENOUGH_MOVING:
             self._report("delay", f"{seen} images of the moving arm")
             try:
                 t_ns, matched, detection, _ = await node.observe(moving=True)

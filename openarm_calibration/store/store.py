@@ -110,10 +110,11 @@ class StoredCalibration(Config):
             T_parent_link: (4, 4).
             provenance: Other fields.
         """
-        x, y, z = (float(v) for v in T_parent_link[:3, 3])
-        qx, qy, qz, qw = (float(v) for v in se3.quat_xyzw_from_matrix(T_parent_link[:3, :3]))
-        data = {"camera": camera, "parent": parent, "position": (x, y, z), "quaternion_xyzw": (qx, qy, qz, qw)}
-        return validate(cls, {**data, **provenance}, f"calibration of {camera!r}")
+        mount = {
+            "position": T_parent_link[:3, 3].tolist(),
+            "quaternion_xyzw": se3.quat_xyzw_from_matrix(T_parent_link[:3, :3]).tolist(),
+        }
+        return validate(cls, {"camera": camera, "parent": parent, **mount, **provenance}, f"calibration of {camera!r}")
 
     def digest(self) -> str:
         """Return the hash of all fields."""
