@@ -107,9 +107,9 @@ class _Run:
         self._poses = int(self._goal.poses) or config.poses
         self._enough_t = self._goal.sigma_translation or config.sigma_translation
         self._enough_r = self._goal.sigma_rotation or config.sigma_rotation
-        standing = node.samples.head.setup == "to_hand"
-        place = (config.on_hand if standing else config.on_table).pose
-        self._standing = standing
+        fixed = node.samples.head.setup == "to_hand"
+        place = (config.on_hand if fixed else config.on_table).pose
+        self._fixed = fixed
         self._search = PoseSearch(node.description, node.camera.T_parent_optical, place, config.search)
 
     # --- taking samples
@@ -151,7 +151,7 @@ class _Run:
         except OpenArmError as error:
             if error.code != Code.NOTHING_DETECTED:
                 raise
-            key = "on_hand" if self._standing else "on_table"
+            key = "on_hand" if self._fixed else "on_table"
             raise OpenArmError(
                 Code.NOTHING_DETECTED,
                 f"the position of the board is not configured (parameter auto.{key}.position), and it is not in view:"
@@ -186,7 +186,7 @@ class _Run:
         raise OpenArmError(Code.NO_PLAN, f"the arm reaches none of {tried} poses; of the last: {last}")
 
     async def _take(self) -> Sample:
-        """Take a sample as soon as the arm stands still."""
+        """Take a sample as soon as the arm is at rest."""
         until = time.monotonic() + self._config.settle_timeout
         while True:
             self._check()
@@ -246,7 +246,7 @@ class _Run:
         thick = self._config.plate
         box = CollisionBox(id="calibration board", size=vector((*self._node.samples.board.size, thick)))
         T_carrier_box = Z @ se3.make(None, (0.0, 0.0, thick / 2.0))  # the board's z points into it
-        if not self._standing:
+        if not self._fixed:
             box.pose = matrix_to_pose(T_carrier_box)
             goal.obstacles = [box]
             return
@@ -259,7 +259,7 @@ class _Run:
 
     # --- solving
     async def solve(self) -> None:
-        """Solve, judge, and do with the result what was asked."""
+        """Solve, judge, and store the result if the goal says so."""
         goal, result, node = self._goal, self._result, self._node
         self._report("solving", f"{len(node.samples)} samples")
         if goal.session:

@@ -35,7 +35,7 @@ from openarm_common.types import Array
 EDGE = 12.0
 #: Views that are tilted more are not detected well.
 MOST_TILT = math.radians(55.0)
-#: Samples that people are asked for.
+#: Samples that advice aims at.
 ENOUGH = 12
 
 
@@ -276,8 +276,8 @@ class PoseSearch:
         head = samples.head
         in_hand = head.setup == "in_hand"
         moving = chain_poses(self._description, head.parent if in_hand else head.carrier, q)
-        standing = self._description.link_pose(head.base if in_hand else head.parent, {})
-        A = se3.inverse(standing) @ moving
+        fixed = self._description.link_pose(head.base if in_hand else head.parent, {})
+        A = se3.inverse(fixed) @ moving
         return se3.inverse(self.belief.X) @ (inverses(A) if in_hand else A) @ Z
 
     def _centred(self, samples: SampleSet, views: Array) -> NDArray[np.bool_]:
