@@ -52,6 +52,11 @@ class CalibrationOptions:
     domain: int | None = None
     sets: tuple[str, ...] = ()
 
+    @property
+    def goal(self) -> dict[str, Any]:
+        """What `CalibrationClient.auto` is given for every camera."""
+        return {"poses": self.poses, "sigma": self.enough, "measure_delay": self.delay, "save": self.save}
+
 
 @dataclass
 class CalibrationListeners:
@@ -118,15 +123,9 @@ def run_calibration(options: CalibrationOptions, listeners: CalibrationListeners
                 listeners.on_camera(camera)
                 if k:
                     reset_world(client, scene_of(camera))
+                session = str((run.run_dir / f"{camera}.npz").absolute())
                 run.results[camera] = client.auto(
-                    camera,
-                    poses=options.poses,
-                    sigma=options.enough,
-                    measure_delay=options.delay,
-                    save=options.save,
-                    session=str((run.run_dir / f"{camera}.npz").absolute()),
-                    on_feedback=listeners.on_feedback,
-                    stop=stop,
+                    camera, **options.goal, session=session, on_feedback=listeners.on_feedback, stop=stop
                 )
                 if stop.is_set():
                     return

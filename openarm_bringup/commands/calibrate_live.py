@@ -16,6 +16,8 @@ from openarm_common.errors import Code, OpenArmError
 if TYPE_CHECKING:
     from openarm_interfaces.action import AutoCalibrate
 
+    from openarm_bringup.calibration.run import CalibrationOptions
+
 #: Of the node's parameter auto.poses.
 MOST_POSES = 100
 
@@ -47,12 +49,7 @@ def auto(
         running: Use the graph that runs, with the board in place, instead of a simulated one.
         domain: ROS_DOMAIN_ID; a free one, or that of the running graph, when not given.
     """
-    from openarm_bringup.calibration.run import (
-        CalibrationListeners,
-        CalibrationOptions,
-        chosen_cameras,
-        run_calibration,
-    )
+    from openarm_bringup.calibration.run import CalibrationListeners, CalibrationOptions, run_calibration
 
     if poses and not 4 <= poses <= MOST_POSES:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--poses {poses}: expected 4 to {MOST_POSES}; 10 to 15 are usual")
@@ -64,15 +61,13 @@ def auto(
     if store is not None:
         store_in(store)
     show = _Show()
-    if running:
-        return _running(camera, poses, save, delay, domain, show)
-    cameras = ("overhead", "wrist") if camera == "both" else chosen_cameras((camera,))
     options = CalibrationOptions(
-        cameras=cameras, mount_seed=seed, poses=poses, save=save, store=store, delay=delay, domain=domain,
-        sets=tuple(set_),
+        ("overhead", "wrist") if camera == "both" else (camera,),
+        mount_seed=seed, poses=poses, save=save, store=store, delay=delay, domain=domain, sets=tuple(set_),
     )  # fmt: skip
-    listeners = CalibrationListeners(show.event, show.ready, show.camera, show.feedback)
-    run = run_calibration(options, listeners)
+    if running:
+        return _running(options, show)
+    run = run_calibration(options, CalibrationListeners(show.event, show.ready, show.camera, show.feedback))
     for name in run.results:
         _page(run.run_dir / f"{name}.npz", run.run_dir / f"{name}.html")
     return _outcome(run.results, run.error, run.run_dir)
@@ -107,21 +102,20 @@ def sample(*, remove: str | None = None, session: str = "", advice: bool = False
     return Outcome(done.success, done.message, done.code or Code.OK, data, f"next: {now.advice}")
 
 
-def _running(camera: str, poses: int, save: bool, delay: bool, domain: int | None, show: _Show) -> Outcome:
-    if camera == "both":
+def _running(options: CalibrationOptions, show: _Show) -> Outcome:
+    if len(options.cameras) > 1:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, "--running needs --camera NAME: the board has to be moved between the cameras"
         )
-    join_graph(domain)
+    join_graph(options.domain)
     from openarm_calibration.ros.client import CalibrationClient
 
+    (camera,) = options.cameras
     show.camera(camera)
     stop = threading.Event()
     with requires_node("calibration", "calibrate"), CalibrationClient() as client:
         try:
-            result = client.auto(
-                camera, poses=poses, measure_delay=delay, save=save, on_feedback=show.feedback, stop=stop
-            )
+            result = client.auto(camera, **options.goal, on_feedback=show.feedback, stop=stop)
         except KeyboardInterrupt:
             return Outcome(False, "cancelled by Ctrl-C; the arm holds where it is", Code.CANCELLED)
     return _outcome({camera: result}, None, None)
