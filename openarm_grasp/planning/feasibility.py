@@ -7,7 +7,7 @@ rad.
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,74 +16,12 @@ from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, held_box, obstacle_boxes, propose, target_box
+from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, propose
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import other_grasps, place_targets
-from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace, Trajectory
 from openarm_grasp.robot.skills import Skills
-
-
-def grasp_request(
-    arm: str,
-    offered: Sequence[GraspCandidate],
-    target: Detection,
-    others: Sequence[Detection],
-    config: GraspConfig,
-    now: Detection | None = None,
-) -> PlanGrasp:
-    """What the planner is asked for a grasp.
-
-    Args:
-        arm: Whose.
-        offered: The candidates.
-        target: The object.
-        others: What else stands on the table.
-        config: Parameters.
-        now: The object where it stands until then, when that is elsewhere: the map shows it there.
-    """
-    gone = () if now is None else (target_box(now, config),)
-    return PlanGrasp(arm, tuple(offered), obstacle_boxes(others, config), target_box(target, config), gone)
-
-
-def place_request(
-    arm: str,
-    ways: Sequence[PlaceTarget],
-    target: Detection,
-    others: Sequence[Detection],
-    candidate: GraspCandidate,
-    config: GraspConfig,
-    after: Trajectory | None = None,
-) -> PlanPlace:
-    """What the planner is asked for a place; the map may still show the object where it was.
-
-    Args:
-        arm: Whose.
-        ways: To put the object down.
-        target: The object before the grasp.
-        others: What else stands on the table.
-        candidate: How the hand holds it.
-        config: Parameters.
-        after: Trajectory whose end is the start; None starts at the present joints.
-    """
-    held, stood = held_box(target, candidate, config), (target_box(target, config),)
-    return PlanPlace(arm, tuple(ways), obstacle_boxes(others, config), held, after, stood)
-
-
-async def refusal_of(work: Awaitable[object]) -> OpenArmError | None:
-    """Await a plan; return why it cannot be done, None when it can.
-
-    Raises:
-        OpenArmError: When it was not found out.
-    """
-    try:
-        await work
-    except OpenArmError as error:
-        if error.code not in NO_WAY:
-            raise
-        return error
-    return None
 
 
 class FeasibilityCheck:
@@ -97,43 +35,46 @@ class FeasibilityCheck:
     def __init__(self, robot: Skills, context: GraspContext) -> None:
         self._robot, self._context = robot, context
 
-    async def pick(
+    async def refusal(
         self,
         arm: str,
-        target: Detection,
-        others: Sequence[Detection],
-        offered: Sequence[GraspCandidate] | None = None,
-        now: Detection | None = None,
-    ) -> tuple[GraspCandidate, Planned]:
-        """Plan a grasp of an object that stands there.
+        found: Sighting,
+        place: Sequence[float] | None = None,
+        *,
+        yaw: float | None = None,
+        now: Sighting | None = None,
+    ) -> OpenArmError | None:
+        """Why an arm cannot pick the object, and put it where it is wanted; None when it can.
 
         Args:
             arm: Whose.
-            target: The object.
-            others: What else stands on the table.
-            offered: The grasps to choose from; every one when not given.
-            now: The object where it stands until then, when that is elsewhere.
-
-        Returns:
-            The grasp that can be made, and its plan.
+            found: The object and its neighbours.
+            place: Footprint centre (x, y), base frame, m; None: the grasp alone is planned.
+            yaw: Of the object there; None: unconstrained.
+            now: The object where it stands until then, when that is elsewhere; for a grasp alone.
 
         Raises:
-            OpenArmError: One of `NO_WAY`; what the robot raises.
+            OpenArmError: What the robot raises, when it was not found out.
         """
-        config = self._context.config
-        offered = self._offered(arm, target, others) if offered is None else tuple(offered)
-        plan = await self._robot.plan(grasp_request(arm, offered, target, others, config, now))
-        return offered[plan.chosen], plan
+        try:
+            if place is None:
+                await self._robot.plan_grasp(arm, self._offered(arm, found), found, now)
+            else:
+                await self.pick_and_place(arm, found, (np.array(place[:2], dtype=np.float64),), yaw=yaw)
+        except OpenArmError as error:
+            if error.code not in NO_WAY:
+                raise
+            return error
+        return None
 
-    def _offered(self, arm: str, target: Detection, others: Sequence[Detection]) -> tuple[GraspCandidate, ...]:
+    def _offered(self, arm: str, found: Sighting) -> tuple[GraspCandidate, ...]:
         shoulder = self._context.shoulders.get(arm, (0.0, 0.0))
-        return propose(target, self._context.config, shoulder_xy=shoulder, others=others)
+        return propose(found.target, self._context.config, shoulder_xy=shoulder, others=found.others)
 
     async def pick_and_place(
         self,
         arm: str,
-        target: Detection,
-        others: Sequence[Detection],
+        found: Sighting,
         spots: Sequence[Array],
         *,
         yaw: float | None = None,
@@ -143,31 +84,30 @@ class FeasibilityCheck:
 
         Args:
             arm: Whose.
-            target: The object.
-            others: What else stands on the table.
+            found: The object and its neighbours.
             spots: (2,) footprint centres, best first.
             yaw: Of the object there; None: unconstrained.
             used: Ways to put it down that are of no use.
 
         Raises:
-            OpenArmError: As `pick`.
+            OpenArmError: One of `NO_WAY`; what the robot raises.
         """
-        config, left = self._context.config, self._offered(arm, target, others)
+        target, left = found.target, self._offered(arm, found)
         refused: OpenArmError | None = None
         while True:
             try:
-                candidate, plan = await self.pick(arm, target, others, left)
+                plan = await self._robot.plan_grasp(arm, left, found)
             except OpenArmError as error:
                 if refused is None or error.code not in NO_WAY:
                     raise
                 raise refused from error
-            offered = place_targets(target, candidate, spots, config, yaw=yaw)
+            candidate = left[plan.chosen]
+            offered = place_targets(target, candidate, spots, self._context.config, yaw=yaw)
             ways = [way for way in offered if not any(_same(way, other, any_turn=target.round) for other in used)]
             try:
                 if not ways:
                     raise OpenArmError(Code.UNREACHABLE, "no other way to put it down is left")
-                request = place_request(arm, ways, target, others, candidate, config, plan.retreat)
-                end = await self._robot.plan(request)
+                end = await self._robot.plan_place(arm, ways, found, candidate, plan.retreat)
                 return ways[end.chosen]
             except OpenArmError as error:
                 left = other_grasps(left, candidate, error.code, target, yaw)

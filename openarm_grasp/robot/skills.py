@@ -16,9 +16,9 @@ from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
 from openarm_grasp.evidence.verdicts import Evidence
-from openarm_grasp.perception.detections import in_base
+from openarm_grasp.perception.detections import Sighting, in_base
 from openarm_grasp.planning.arms import ARMS
-from openarm_grasp.planning.candidates import Box
+from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget, held_box, obstacle_boxes, target_box
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 
 #: Errors of a robot that end a request at once, with the arm where it is.
@@ -102,6 +102,43 @@ class Skills:
         """Plan; raises with the planner's code."""
         self.robot.check()
         return await self.robot.plan(request)
+
+    async def plan_grasp(
+        self, arm: str, ways: Sequence[GraspCandidate], found: Sighting, now: Sighting | None = None
+    ) -> Planned:
+        """Plan one of several grasps.
+
+        Args:
+            arm: Whose.
+            ways: The candidates.
+            found: The object and its neighbours.
+            now: The object where it stands until then, when that is elsewhere: the map shows it there.
+        """
+        config = self._config
+        target, obstacles = target_box(found.target, config), obstacle_boxes(found.others, config)
+        gone = () if now is None else (target_box(now.target, config),)
+        return await self.plan(PlanGrasp(arm, tuple(ways), obstacles, target, gone))
+
+    async def plan_place(
+        self,
+        arm: str,
+        ways: Sequence[PlaceTarget],
+        found: Sighting,
+        candidate: GraspCandidate,
+        after: Trajectory | None = None,
+    ) -> Planned:
+        """Plan how to put the object down; the map may still show it where it was.
+
+        Args:
+            arm: Whose.
+            ways: To put the object down.
+            found: The object before the grasp, and its neighbours.
+            candidate: How the hand holds it.
+            after: Trajectory whose end is the start; None starts at the present joints.
+        """
+        held, obstacles = held_box(found.target, candidate, self._config), obstacle_boxes(found.others, self._config)
+        stood = (target_box(found.target, self._config),)
+        return await self.plan(PlanPlace(arm, tuple(ways), obstacles, held, after, stood))
 
     async def reach(self, arms: Sequence[str], T_base_tcp: Array) -> dict[str, float]:
         """How far each arm's TCP stays from a point, m by arm; those of which nothing is known are left out."""

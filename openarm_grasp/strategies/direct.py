@@ -5,10 +5,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from openarm_grasp.planning.arms import ARMS
-from openarm_grasp.planning.feasibility import FeasibilityCheck, refusal_of
+from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import GraspOutcome
 from openarm_grasp.strategies.task import Task
@@ -20,13 +18,13 @@ async def direct(task: Task) -> GraspOutcome:
     outcome = await pick_and_place(task, asked)
     if not task.may_go_on(outcome) or not task.findings.place_refused or asked.place is None:
         return outcome
-    found, place = task.findings.need_sighting(), np.array(asked.place[:2], dtype=np.float64)
+    found = task.findings.need_sighting()
     task.note("no arm that was asked can do it alone; looking for another way")
     feasible = FeasibilityCheck(task.robot, task.context)
     for arm in ARMS:
         if arm in task.findings.refusals:
             continue
-        if await refusal_of(feasible.pick_and_place(arm, found.target, found.others, (place,), yaw=asked.place_yaw)):
+        if await feasible.refusal(arm, found, asked.place, yaw=asked.place_yaw):
             continue
         why = f"the {arm} arm does it alone, from the other side"
         return await pick_and_place(task, replace(asked, arm=arm, why=why))

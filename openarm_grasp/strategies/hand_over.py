@@ -22,7 +22,7 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import PlaceTarget
-from openarm_grasp.planning.feasibility import FeasibilityCheck, refusal_of, standing_at
+from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import clear_spots, grid
 from openarm_grasp.strategies.pick_and_place import pick_and_place
@@ -64,12 +64,11 @@ async def hand_over(task: Task) -> GraspOutcome | None:
     known = task.outcome
     if known is None or asked.place is None or not task.findings.place_refused:
         return None
-    feasible, place = FeasibilityCheck(task.robot, task.context), np.array(asked.place[:2], dtype=np.float64)
     number, refused = 0, None
     while True:
         found = task.findings.need_sighting()
         try:
-            way = await plan_hand_over(feasible, task.context, found, place, asked.place_yaw)
+            way = await plan_hand_over(task, found)
         except OpenArmError as error:
             if refused is None or error.code not in (*NO_WAY, Code.PLACE_FAILED):
                 raise
@@ -114,30 +113,25 @@ def middle_spots(target: Detection, others: Sequence[Detection], context: GraspC
     return tuple(np.array([x, y]) for _, x, y in sorted(ranked))
 
 
-async def plan_hand_over(
-    feasible: FeasibilityCheck, context: GraspContext, seen: Sighting, place: Array, place_yaw: float | None
-) -> HandOver:
+async def plan_hand_over(task: Task, seen: Sighting) -> HandOver:
     """Find a way through the middle.
 
     The giver says where and how it can set the object down; what the taker cannot use is left out, and it is asked
     again. A place from which the taker could go on, but not from all around it, is the last resort.
 
     Args:
-        feasible: To plan with.
-        context: Parameters.
+        task: What is asked for.
         seen: The object and its neighbours.
-        place: (2,) where it shall stand in the end.
-        place_yaw: And how it is turned there; None: any.
 
     Raises:
         OpenArmError: NO_PLAN or PLACE_FAILED, with what each arm lacks; what the robot raises.
     """
-    spots = middle_spots(seen.target, seen.others, context)
+    spots = middle_spots(seen.target, seen.others, task.context)
     order = ARMS if seen.target.p_base[1] >= 0.0 else ARMS[::-1]
     faults: list[str] = []
     for giver, taker in (order, order[::-1]):
         try:
-            return await _between(feasible, context.config.hand_over, seen, (giver, taker), spots, place, place_yaw)
+            return await _between(task, seen, giver, taker, spots)
         except OpenArmError as error:
             if error.code not in NO_WAY:
                 raise
@@ -145,22 +139,14 @@ async def plan_hand_over(
     raise OpenArmError(Code.NO_PLAN, f"no hand-over through the middle: {'; '.join(faults)}")
 
 
-async def _between(
-    feasible: FeasibilityCheck,
-    config: HandOverConfig,
-    seen: Sighting,
-    arms: tuple[str, str],
-    spots: Sequence[Array],
-    place: Array,
-    place_yaw: float | None,
-) -> HandOver:
-    giver, taker = arms
+async def _between(task: Task, seen: Sighting, giver: str, taker: str, spots: Sequence[Array]) -> HandOver:
+    feasible, config, asked = FeasibilityCheck(task.robot, task.context), task.context.config.hand_over, task.request
     useless: list[PlaceTarget] = []
     best: tuple[int, HandOver] | None = None
     fault = ""
     for _ in range(config.tries):
         try:
-            way = await feasible.pick_and_place(giver, seen.target, seen.others, spots, used=useless)
+            way = await feasible.pick_and_place(giver, seen, spots, used=useless)
         except OpenArmError as error:
             if error.code not in NO_WAY or not fault:
                 raise
@@ -168,9 +154,9 @@ async def _between(
         found = HandOver(giver, taker, way.position[:2], seen.target.yaw + way.yaw_offset)
         there = standing_at(seen.target, way.position, way.yaw_offset)
         refusal, copes = None, -1
-        for stands in (there, *_around(there, config)):
+        for target in (there, *_around(there, config)):
             copes += 1
-            refusal = await refusal_of(feasible.pick_and_place(taker, stands, seen.others, (place,), yaw=place_yaw))
+            refusal = await feasible.refusal(taker, replace(seen, target=target), asked.place, yaw=asked.place_yaw)
             if refusal is not None:
                 break
         if refusal is None:

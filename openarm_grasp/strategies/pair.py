@@ -16,7 +16,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
 from openarm_grasp.perception.detections import SAME_PLACE, Sighting, find, on_table
 from openarm_grasp.planning.arms import ARMS
-from openarm_grasp.planning.feasibility import FeasibilityCheck, refusal_of
+from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.robot.coordination import ArmCoordination, coordinated
 from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
@@ -202,11 +202,7 @@ async def _fault(pair: Pair, found: Sequence[Sighting], arms: tuple[Side, Side])
     """Why the arms cannot do this; "" when they can."""
     feasible = FeasibilityCheck(pair.robot, pair.session.context)
     for request, one, arm in zip(pair.requests, found, arms, strict=True):
-        if request.place is None:
-            refusal = await refusal_of(feasible.pick(arm, one.target, one.others))
-        else:
-            place, yaw = np.array(request.place[:2], dtype=np.float64), request.place_yaw
-            refusal = await refusal_of(feasible.pick_and_place(arm, one.target, one.others, (place,), yaw=yaw))
+        refusal = await feasible.refusal(arm, one, request.place, yaw=request.place_yaw)
         if refusal is not None:
             return refusal.message
     return ""

@@ -25,7 +25,6 @@ from openarm_grasp.perception.detections import Frame, Sighting, apart, find, la
 from openarm_grasp.planning import candidates
 from openarm_grasp.planning.arms import ARMS, arm_order, out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
-from openarm_grasp.planning.feasibility import grasp_request, place_request
 from openarm_grasp.planning.options import NoWayError, Options, not_placeable, options_of, planned
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, placing_error
 from openarm_grasp.robot.interface import Frames, Planned
@@ -447,12 +446,12 @@ async def _plan_with(
     run: Run, sighting: Sighting, offered: tuple[GraspCandidate, ...], why: str
 ) -> tuple[Grasp, Planned, str]:
     """Plan with one arm; a grasp after which the object cannot be placed is replaced by another."""
-    arm, request, config, target, others = run.arm, run.request, run.config, sighting.target, sighting.others
+    arm, request = run.arm, run.request
     while True:
         run.offered = offered
         run.enter(State.PLAN, why)
         try:
-            found = await run.robot.plan(grasp_request(arm, offered, target, others, config))
+            found = await run.robot.plan_grasp(arm, offered, sighting)
         except OpenArmError as error:
             reraise_stop(error)
             refusals = error.refusals if isinstance(error, NoWayError) else {}
@@ -468,14 +467,13 @@ async def _plan_with(
         run.enter(State.PLAN, f"{chosen}; planning the place")
         try:
             # From the end of the lift; PLACE plans from where the arm then is.
-            asked = place_request(arm, grasp.places, target, others, candidate, config, found.retreat)
-            end = await run.robot.plan(asked)
+            end = await run.robot.plan_place(arm, grasp.places, sighting, candidate, found.retreat)
         except OpenArmError as error:
             reraise_stop(error)
             run.findings.place_refused = True
             why = f"it could grasp, but not place: {error.message.removeprefix(f'{arm} arm: ')}"
             # Held by other faces or leaning otherwise, it may come to stand where it is wanted.
-            left = other_grasps(offered, candidate, error.code, target, request.place_yaw)
+            left = other_grasps(offered, candidate, error.code, sighting.target, request.place_yaw)
             dropped = [c for c in offered if c not in left]
             run.options = not_placeable(run.options, arm, dropped, candidate, Verdict(error.code, why))
             run.grasp = None
@@ -569,7 +567,7 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned) -> tuple[Grasp, Planne
     run.enter(State.MOVE_TO_PREGRASP, f"{text}; correcting")
     robot.stop_observing()
     try:
-        corrected = await robot.plan(grasp_request(grasp.arm, run.offered, target, before.others, run.config))
+        corrected = await robot.plan_grasp(grasp.arm, run.offered, sighting)
     except OpenArmError as error:
         reraise_stop(error)
         return grasp, plan, f"the correction cannot be planned, going on without: {error.message}"
@@ -696,8 +694,7 @@ async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why:
     """Plan from where the arm is how to put the object down in one of these ways."""
     run.enter(State.PLACE, why)
     run.robot.stop_observing()
-    found = grasp.sighting
-    plan = await run.robot.plan(place_request(grasp.arm, ways, found.target, found.others, grasp.candidate, run.config))
+    plan = await run.robot.plan_place(grasp.arm, ways, grasp.sighting, grasp.candidate)
     return plan, ways[plan.chosen]
 
 

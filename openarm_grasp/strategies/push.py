@@ -26,7 +26,7 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting, find
 from openarm_grasp.planning.arms import ARMS, arm_order
 from openarm_grasp.planning.candidates import UP, GraspCandidate
-from openarm_grasp.planning.feasibility import FeasibilityCheck, grasp_request, refusal_of, standing_at
+from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
@@ -115,8 +115,9 @@ async def plan_push(task: Task, found: Sighting) -> Push:
 async def _taker(task: Task, found: Sighting, end: Array) -> str:
     """The arm that grasps the object there."""
     feasible, fault = FeasibilityCheck(task.robot, task.context), OpenArmError(Code.UNREACHABLE, "no arm")
+    there = replace(found, target=standing_at(found.target, end))
     for arm in arm_order("auto", float(end[1]), task.context.config.approach.overlap_half_width):
-        refusal = await refusal_of(feasible.pick(arm, standing_at(found.target, end), found.others, now=found.target))
+        refusal = await feasible.refusal(arm, there, now=found)
         if refusal is None:
             return arm
         fault = refusal
@@ -132,7 +133,7 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
             faults.append(f"{arm} hand: {found.target.label!r} would tip over")
             continue
         try:
-            plan = await robot.plan(grasp_request(arm, ways, found.target, found.others, config))
+            plan = await robot.plan_grasp(arm, ways, found)
         except OpenArmError as error:
             if error.code not in NO_WAY:
                 raise

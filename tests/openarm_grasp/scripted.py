@@ -129,6 +129,7 @@ class World(Skills):
                 {"left": (0.0, 0.15), "right": (0.0, -0.15)},
             )
         )
+        self._config = self.session.context.config
         self.deadline_ns = 0
         self.robot = self  # type: ignore[assignment]
         self._target, self._label, self._line = np.zeros(3), "", np.zeros(3)
