@@ -141,10 +141,10 @@ class DetectConfig(Config):
 
 
 class NearLookConfig(Config):
-    """A second look from before the object, by a camera that rides on the hand; without its detector it is left out."""
+    """A second observation from the pre-grasp, by a camera mounted on the hand; skipped without its detector."""
 
     enabled: bool = Field(default=True, description="whether the camera on the hand is asked before the grasp")
-    camera: str = Field(default="wrist", description="that rides on the hand")
+    camera: str = Field(default="wrist", description="that is mounted on the hand")
     arm: Literal["left", "right"] = Field(default="right", description="whose hand")
     topic: str = Field(default="/wrist/detections_3d", description="what its detector finds")
     frames: int = Field(default=2, ge=1, le=10, description="that are averaged")
@@ -193,7 +193,7 @@ class HandOverConfig(Config):
 class PushConfig(Config):
     """How objects that no arm can grasp are pushed into reach."""
 
-    most: int = Field(default=3, ge=0, le=10, description="pushes of one object, each followed by a look; 0: none")
+    most: int = Field(default=3, ge=0, le=10, description="pushes of one object, each followed by a check; 0: none")
     lengths: tuple[float, ...] = Field(default=(0.06, 0.10), description="lengths of a push that are tried, m")
     directions: int = Field(default=12, ge=1, le=72, description="directions of a push that are tried")
     gap: float = Field(default=0.012, ge=0.005, le=0.05, description="hand to object before it is pushed, m")
@@ -230,7 +230,7 @@ class LimitsConfig(Config):
 class DriftConfig(Config):
     """When residuals of grasps raise an alarm."""
 
-    window: int = Field(default=10, ge=3, le=100, description="grasps that are looked at")
+    window: int = Field(default=10, ge=3, le=100, description="grasps that are evaluated")
     least: int = Field(default=5, ge=3, le=100, description="grasps before an alarm may be raised")
     bias: float = Field(default=0.004, gt=0.0, le=0.05, description="mean residual that is an alarm, m")
     sigmas: float = Field(default=3.0, gt=0.0, le=10.0, description="and it must be so many times its own error")

@@ -31,6 +31,11 @@ class GraspContext:
         """That of a robot at a table."""
         return cls(config, table, {arm: _shoulder(robot, arm) for arm in ARMS})
 
+    @property
+    def clear_of_objects(self) -> float:
+        """Height of a hand, base frame, m; one that is lower may be among the objects."""
+        return self.table.top_z + 2.0 * self.config.approach.lift_height
+
 
 def _shoulder(robot: RobotDescription, arm: Side) -> tuple[float, float]:
     """(x, y) of the arm's first joint, base frame, m."""

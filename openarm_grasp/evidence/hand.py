@@ -119,4 +119,4 @@ class Silence:
             what = (
                 "robot time went back" if self.went_back else f"/joint_states has been silent for {self.seconds:.1f} s"
             )
-            raise OpenArmError(Code.ROBOT_LOST, f"{what}: the bridge (or robot driver) has stopped or started anew")
+            raise OpenArmError(Code.ROBOT_LOST, f"{what}: the bridge (or robot driver) has stopped or restarted")

@@ -99,7 +99,7 @@ def judge_grip(e: Evidence, config: HeldConfig, *, was_held: bool = False) -> Gr
             empty, f"{gap}, but the fingers press with {abs(e.effort):.1f} N, expected over {config.min_effort:g} N"
         )
     if config.use_finger_force and min(e.pads, default=0.0) < config.min_pad_force:
-        felt = f"a finger pad feels {min(e.pads):.1f} N" if e.pads else "no sensor tells what the finger pads feel"
+        felt = f"a finger pad feels {min(e.pads):.1f} N" if e.pads else "no sensor reports the force on the finger pads"
         return GripperVerdict(
             empty, f"{gap}, but {felt}, expected {config.min_pad_force:g} N on each (held.use_finger_force)"
         )
@@ -194,7 +194,7 @@ def judge_place(
 
     Args:
         label: Of the object.
-        p_target: (3,) where its footprint centre shall stand, base frame, m; z is that of the table.
+        p_target: (3,) where its footprint centre should stand, base frame, m; z is that of the table.
         frames: Taken after the arm has left; the newest that shows the object counts.
         tolerance: Largest horizontal distance, m.
         yaw: Of its x axis, where one was asked for, rad; what looks square or round is not judged by it.

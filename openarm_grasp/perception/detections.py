@@ -75,7 +75,7 @@ def apart(a: Detection, b: Detection) -> float:
 def sticks_out(seen: Detection, stood: Detection) -> float:
     """How far what is seen reaches out of the footprint of an object as it stood, m; 0 when it lies within.
 
-    The middles of its edges are looked at: the corners of a box around something round are no part of it.
+    The middles of its edges are compared: the corners of a box around something round are no part of it.
     """
     half = seen.size[:2] / 2.0
     middles = np.array([[half[0], 0.0], [-half[0], 0.0], [0.0, half[1]], [0.0, -half[1]]])
@@ -165,7 +165,7 @@ def _anchor(frame: Frame, label: str, at: Sequence[float] | None, exclude_near: 
     chosen = [d for d in fitting if all(_from(d, p) > SAME_PLACE for p in exclude_near)]
     if not chosen:
         raise OpenArmError(
-            Code.UNKNOWN_OBJECT, f"no {name!r} in view besides {len(fitting)} that shall stay where they are"
+            Code.UNKNOWN_OBJECT, f"no {name!r} in view besides {len(fitting)} that must stay where they are"
         )
     if at is not None:
         near = [d for d in chosen if _from(d, at) <= SAME_PLACE]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How ways to grasp fared: what each was worth, which was chosen, and why the others were not."""
+"""Results of the grasps that were weighed: the score of each, which was chosen, and why the others were not."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class NoWayError(OpenArmError):
 
     Args:
         code: Of the one that got furthest.
-        message: Its reason, which stands for the others.
+        message: Its reason, which represents the others.
         refusals: Why each was refused, by id.
     """
 
@@ -31,7 +31,7 @@ class NoWayError(OpenArmError):
         self.refusals = refusals
 
 
-#: What is said of a way that was not looked at, or not taken.
+#: Message of a way that was not evaluated, or not chosen.
 NOT_NEEDED = "not needed: another was chosen"
 
 

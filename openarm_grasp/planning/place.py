@@ -212,9 +212,9 @@ def check_position(position: Sequence[float], target: Detection, others: Sequenc
 
     Args:
         position: x, y (and a z that is not read), base frame, m.
-        target: The object that shall stand there.
+        target: The object that is to stand there.
         others: Other objects in view.
-        table: Whose top it shall be on.
+        table: Whose top it must be on.
 
     Returns:
         (2,) position.

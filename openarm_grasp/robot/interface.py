@@ -73,7 +73,7 @@ class Planned:
         approach: Straight line to where it grasps or lets go.
         retreat: Straight line away.
         refusals: Why others were refused, by id.
-        limit_margins: Of each way, how near it comes to a joint limit, rad; NaN: refused or not looked at. Empty when
+        limit_margins: Of each way, how near it comes to a joint limit, rad; NaN: refused or not evaluated. Empty when
             the planner does not say.
     """
 

@@ -19,7 +19,7 @@ async def direct(task: Task) -> GraspOutcome:
     if not task.may_go_on(outcome) or not task.findings.place_refused or asked.place is None:
         return outcome
     found = task.findings.need_sighting()
-    task.note("no arm that was asked can do it alone; looking for another way")
+    task.note("no arm that was asked can do it alone; searching for another way")
     feasible = FeasibilityCheck(task.robot, task.context)
     for arm in ARMS:
         if arm in task.findings.refusals:

@@ -58,14 +58,14 @@ class HandOver:
 async def hand_over(task: Task) -> GraspOutcome | None:
     """From hand to hand by way of the middle, when an arm can pick the object and only the other reaches its place.
 
-    When the taker is refused after all, anew from where the object then is.
+    When the taker is refused after all, again from where the object then is.
     """
     asked, most = task.request, task.context.config.hand_over.rounds
     known = task.outcome
     if known is None or asked.place is None or not task.findings.place_refused:
         return None
-    number, refused = 0, None
-    while True:
+    refused = None
+    for number in range(1, most + 1):
         found = task.findings.need_sighting()
         try:
             way = await plan_hand_over(task, found)
@@ -77,7 +77,6 @@ async def hand_over(task: Task) -> GraspOutcome | None:
             x, y, _ = found.target.p_base
             text = f"can be done from ({x:.3f}, {y:.3f}) m: {way}"
             return replace(known, code=Code.OK, message=text, arm=way.taker, proof=Feasible(str(way)))
-        number += 1
         again = "" if number == 1 else f", at try number {number}"
         x, y = (float(v) for v in way.spot)
         why = f"hand-over, 1 of 2: {way}"
@@ -90,9 +89,11 @@ async def hand_over(task: Task) -> GraspOutcome | None:
             text = f"{taken.message}; the {way.giver} arm had brought it to the middle, ({x:.3f}, {y:.3f}) m{again}"
             return replace(taken, message=text)
         refused = replace(taken, arm=way.taker)
-        if number == most or not task.may_go_on(taken):
-            return refused
-        task.note(f"{taken.message}; looking for another way from where it stands now")
+        if not task.may_go_on(taken):
+            break
+        if number < most:
+            task.note(f"{taken.message}; searching for another way from where it stands now")
+    return refused
 
 
 def middle_spots(target: Detection, others: Sequence[Detection], context: GraspContext) -> tuple[Array, ...]:

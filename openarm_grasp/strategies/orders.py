@@ -7,6 +7,7 @@ what came of it. Bins are rectangles on the table, base frame, m.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import Interval
 from openarm_grasp.strategies.request import GraspRequest
 
+#: (x, y), base frame, m.
+Spot = tuple[float, float]
 #: With these another place in a bin may be had.
 _BLOCKED = (Code.IN_COLLISION, Code.UNREACHABLE, Code.NO_PLAN)
 #: Nothing changes these. With any other, what others hid or blocked may be had when they have been taken away.
@@ -34,7 +37,7 @@ class Bin(Config):
     x: Interval = Field(description="near and far edge, m")
     y: Interval = Field(description="right and left edge, m")
 
-    def slots(self, spacing: float) -> tuple[tuple[float, float], ...]:
+    def slots(self, spacing: float) -> tuple[Spot, ...]:
         """Places for objects, row by row, `spacing` apart; a small bin has one, in its middle."""
         return tuple((x, y) for x in _steps(*self.x, spacing) for y in _steps(*self.y, spacing))
 
@@ -91,11 +94,9 @@ class Order:
     each: int | Mapping[str, int] = 1
     placed: list[str] = field(default_factory=list[str])
     failed: dict[str, str] = field(default_factory=dict[str, str])
-    _used: dict[str, int] = field(default_factory=dict[str, int])
+    _used: Counter[str] = field(default_factory=Counter[str])
     _blocked: dict[str, tuple[int, str]] = field(default_factory=dict[str, tuple[int, str]])
-    _stand: dict[str, tuple[tuple[float, float], ...]] = field(
-        default_factory=dict[str, tuple[tuple[float, float], ...]]
-    )
+    _stand: dict[str, tuple[Spot, ...]] = field(default_factory=dict[str, tuple[Spot, ...]])
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -123,7 +124,7 @@ class Order:
                 return GraspRequest(label, exclude_near=stand)
             name = self.bins.of(label)
             slots = self.bins.bins[name].slots(self.bins.spacing)
-            at = self._used.get(name, 0)
+            at = self._used[name]
             if at < len(slots):
                 return GraspRequest(label, place=slots[at], exclude_near=stand)
             self.failed[label] = f"bin {name!r} is full: it has {len(slots)} places"
@@ -136,8 +137,7 @@ class Order:
         self._blocked.pop(label, None)
         next_slot = code is Code.OK or (code in _BLOCKED and request.place is not None)
         if self.bins is not None and next_slot:
-            name = self.bins.of(label)
-            self._used[name] = self._used.get(name, 0) + 1
+            self._used[self.bins.of(label)] += 1
         if code is Code.OK:
             self.placed.append(label)
             if len(where) >= 2:

@@ -29,7 +29,7 @@ Requests = tuple[GraspRequest, GraspRequest]
 
 #: Places nearer to each other than this are served one after the other, m.
 _APART = 0.20
-#: These end a request, and one that runs beside it; no other strategy is tried.
+#: These end a request, and one that runs concurrently; no other strategy is tried.
 ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
 
 
@@ -189,7 +189,7 @@ async def _observe_both(pair: Pair) -> list[Sighting]:
     context, robot = pair.session.context, pair.robot
     robot.set_deadline(pair.requests[0].timeout)
     if not pair.requests[0].dry_run:
-        await robot.go_home(ARMS, back_off_below=context.table.top_z + 2.0 * context.config.approach.lift_height)
+        await robot.go_home(ARMS, back_off_below=context.clear_of_objects)
     frames = (await robot.observe_in_base(context.config.detect.frames)).frames
     found = [
         find(frames, request.label, context.config.detect, at=request.object_at, exclude_near=request.exclude_near)

@@ -3,7 +3,7 @@
 
 `_attempts` is the strategy from beginning to end; the functions below it are its steps, in their order. A step that
 does not succeed raises. What fails with the arm ends the attempt: the hand goes home, and the next attempt observes
-anew and prefers another grasp. Success is said in one place, `succeeded`, from the verdicts on gripper and camera.
+again and prefers another grasp. Success is said in one place, `succeeded`, from the verdicts on gripper and camera.
 Base frame, m.
 """
 
@@ -105,7 +105,7 @@ class Run:
         self.height: float | None = None
         #: The object where it was when the hand was last about to go down.
         self.suspected: Detection | None = None
-        #: Candidates that the planner chooses from, and how those fared that it was offered before.
+        #: Candidates that the planner chooses from, and the results of those that it was offered before.
         self.offered: tuple[GraspCandidate, ...] = ()
         self.options: Options = {}
         self.arm = kept.arm if kept else ""
@@ -339,10 +339,8 @@ async def detect(run: Run, why: str) -> Sighting:
         elif not labels or asked not in ("", *labels):
             code, missing = Code.UNKNOWN_OBJECT, f"no {asked!r} in view; {text}"
             if not labels:
-                code, missing = (
-                    Code.NOTHING_DETECTED,
-                    f"nothing is in view of the camera (asked for {asked or 'any object'!r})",
-                )
+                code = Code.NOTHING_DETECTED
+                missing = f"nothing is in view of the camera (asked for {asked or 'any object'!r})"
             run.enter(State.IDLE, run.missed_round(code, missing))
             why = "the next frame has come"
             try:
@@ -370,8 +368,7 @@ async def _clear_view(run: Run) -> None:
         # A hand that holds something stays where it is; it may be among the objects.
         await run.robot.go_home([arm for arm in ARMS if arm not in run.task.session.kept])
     else:
-        low = run.context.table.top_z + 2.0 * run.config.approach.lift_height
-        await run.robot.go_home(ARMS, back_off_below=low)
+        await run.robot.go_home(ARMS, back_off_below=run.context.clear_of_objects)
 
 
 def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
@@ -400,12 +397,12 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
 
 
 def _standing(found: Iterable[Detection], table_z: float) -> tuple[Detection, ...]:
-    """What stands on the table; what is flat on it is in nobody's way."""
+    """What stands on the table; what is flat on it is no obstacle."""
     return tuple(on_table(d, table_z) for d in found if d.top > table_z + 0.005)
 
 
 async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
-    """Plan the grasp, and the place where one is asked for or nothing shall move; with each arm that may reach.
+    """Plan the grasp, and the place where one is asked for or nothing may move; with each arm that may reach.
 
     Raises:
         NoGraspError: With what each arm lacks.
@@ -589,7 +586,7 @@ def second_look(run: Run, grasp: Grasp, seen: Frames) -> tuple[Detection, GraspC
         near = (d for d in frame.detections if d.label == before.label and apart(d, before) <= config.near.largest)
         frames.append(Frame(frame.t_ns, tuple(near)))
     target = on_table(find(frames, before.label, config.detect).target, run.context.table.top_z)
-    # A box that is observed anew may have its edges swapped.
+    # A box that is observed again may have its edges swapped.
     R = grasp.candidate.T_base_tcp[:3, :3]
     return target, min(candidates.propose(target, config), key=lambda c: se3.angle_between(c.T_base_tcp[:3, :3], R))
 
@@ -659,35 +656,28 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
         OpenArmError: GRASP_LOST.
     """
     run.tried += run.kept is not None
-    try:
-        return await _put_down(run, grasp, grasp.places, why)
-    except OpenArmError as error:
-        reraise_stop(error)
-        if error.code is Code.GRASP_LOST:
-            raise
-        if run.kept is not None:
-            raise _keeps(run, error) from error
-        text = f"{run.label!r} could not be placed ({error.code}): {error.message}"
-        # What kept it from its place may not do so at the next attempt.
-        passing = error.code in (Code.EXECUTION_FAILED, Code.TIMEOUT)
-        failure = run.fail(Code.PLACE_FAILED, text, final=not passing)
-        why = f"{error.message}; putting it back"
-    run.place_target = None
-    target = grasp.sighting.target
-    origin = place_targets(target, grasp.candidate, (target.p_base[:2],), run.config)
-    try:
-        placed = await _put_down(run, grasp, origin, why)
-    except OpenArmError as error:
-        reraise_stop(error)
-        if error.code is Code.GRASP_LOST:
-            raise
-        raise _keeps(run, error) from error
-    return replace(placed, failure=failure)
+    ways, failure = grasp.places, None
+    while True:
+        try:
+            return replace(await _put_down(run, grasp, ways, why), failure=failure)
+        except OpenArmError as error:
+            reraise_stop(error)
+            if error.code is Code.GRASP_LOST:
+                raise
+            if run.kept is not None or failure is not None:
+                raise ObjectKeptError(Code.PLACE_FAILED, _still_held(run, error)) from error
+            text = f"{run.label!r} could not be placed ({error.code}): {error.message}"
+            # What kept it from its place may not do so at the next attempt.
+            passing = error.code in (Code.EXECUTION_FAILED, Code.TIMEOUT)
+            failure = run.fail(Code.PLACE_FAILED, text, final=not passing)
+            why = f"{error.message}; putting it back"
+        run.place_target = None
+        target = grasp.sighting.target
+        ways = place_targets(target, grasp.candidate, (target.p_base[:2],), run.config)
 
 
-def _keeps(run: Run, error: OpenArmError) -> ObjectKeptError:
-    text = f"{error.message}; the {run.arm} hand still holds {run.label!r}: open it over a safe place"
-    return ObjectKeptError(Code.PLACE_FAILED, text)
+def _still_held(run: Run, error: OpenArmError) -> str:
+    return f"{error.message}; the {run.arm} hand still holds {run.label!r}: open it over a safe place"
 
 
 async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str) -> tuple[Planned, PlaceTarget]:
@@ -740,31 +730,21 @@ async def retreat(run: Run, grasp: Grasp, placed: Placed | None) -> None:
     Raises:
         OpenArmError: When there is no way home, also without regard to obstacles; the arm stays where it is.
     """
-    robot, run_home = run.robot, (grasp.arm,)
-    robot.stop_observing()
+    run.robot.stop_observing()
     failure = run.failure if placed is None else placed.failure
-    try:
-        await _leave(run, grasp, placed)
-        await robot.go_home(run_home, _obstacles(run, grasp, placed))
-        return
-    except OpenArmError as error:
-        reraise_stop(error)
-        if run.holding:
-            text = f"{error.message}; the {run.arm} hand still holds {run.label!r}: open it over a safe place"
-            raise _no_way_home(failure, error, text) from error
-        run.hand = Hand.FREE if placed is None else Hand.CLEAR
-        run.enter(State.RESET, f"{error.message}; trying another way home")
-    try:
-        await _leave(run, grasp, placed)
-        await robot.go_home(run_home)
-    except OpenArmError as error:
-        reraise_stop(error)
-        raise _no_way_home(failure, error, error.message) from error
-
-
-def _no_way_home(failure: Verdict | None, error: OpenArmError, text: str) -> OpenArmError:
-    text = f"the arm could not go home: {text}"
-    return OpenArmError(failure.code, f"{failure.reason}; {text}") if failure else OpenArmError(error.code, text)
+    for last, obstacles in ((False, _obstacles(run, grasp, placed)), (True, ())):
+        try:
+            await _leave(run, grasp, placed)
+            await run.robot.go_home((grasp.arm,), obstacles)
+            return
+        except OpenArmError as error:
+            reraise_stop(error)
+            if last or run.holding:
+                text = f"the arm could not go home: {_still_held(run, error) if run.holding else error.message}"
+                code, text = (failure.code, f"{failure.reason}; {text}") if failure else (error.code, text)
+                raise OpenArmError(code, text) from error
+            run.hand = Hand.FREE if placed is None else Hand.CLEAR
+            run.enter(State.RESET, f"{error.message}; trying another way home")
 
 
 async def _leave(run: Run, grasp: Grasp, placed: Placed | None) -> None:

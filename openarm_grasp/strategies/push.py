@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Push an object into reach: a closed hand behind it, low, along a straight line, and a look afterwards.
+"""Push an object into reach: a closed hand behind it, low, along a straight line, and an observation afterwards.
 
 A hand comes to more places than it can grasp at: a grasp also needs room above, and one of a few yaws. Where an object
 can be pushed is not written down but planned: the way behind the object, straight down, and the line itself, with the
@@ -47,7 +47,7 @@ class Push:
     Attributes:
         arm: Whose hand.
         start: (2,) where the object stands.
-        end: (2,) where it shall stand.
+        end: (2,) where it should stand afterwards.
         way: How the hand stands behind it, and its line.
         plan: The trajectories.
     """
@@ -207,8 +207,7 @@ async def _go_home(task: Task, arm: str, T_base_back: Array) -> None:
     except OpenArmError as error:
         reraise_stop(error)
         task.robot.warn(error.message)  # the free path home may still be there
-    low = task.context.table.top_z + 2.0 * task.context.config.approach.lift_height
-    await task.robot.go_home((arm,), back_off_below=low)
+    await task.robot.go_home((arm,), back_off_below=task.context.clear_of_objects)
 
 
 def destinations(target: Detection, others: Sequence[Detection], context: GraspContext) -> tuple[Array, ...]:
@@ -235,13 +234,13 @@ def destinations(target: Detection, others: Sequence[Detection], context: GraspC
 def push_ways(target: Detection, end: Array, config: GraspConfig, hand: Array) -> tuple[GraspCandidate, ...]:
     """How a closed hand may stand behind the object, the most upright first.
 
-    One of its four faces looks ahead, so that a flat side of the object is met flat; it leans sideways, or with its
+    One of its four faces points ahead, so that a flat side of the object is met flat; it leans sideways, or with its
     tips ahead, never over the object. Whatever part of the hand comes first must meet the object at half of its height
     or lower, else the object would tip over.
 
     Args:
         target: The object.
-        end: (2,) where it shall be pushed.
+        end: (2,) where it should be pushed.
         config: Parameters.
         hand: Points (n, 3) of the closed hand, TCP frame.
     """

@@ -204,7 +204,7 @@ class Task:
         return replace(request, timeout=left)
 
     def answer(self, outcome: GraspOutcome, route: str) -> GraspOutcome:
-        """The answer to all of the request; of an object that is neither where it was nor where it shall be, where."""
+        """The answer to all of the request; of an object that is neither where it was nor where it should be, where."""
         route = route if outcome.success else ""
         outcome = replace(outcome, attempts=self.attempts, duration=self.seconds, route=route)
         if outcome.success or not self.displaced:

@@ -115,7 +115,7 @@ def test_a_taker_that_is_refused_after_all_gets_the_object_elsewhere(robot) -> N
     assert (outcome.code, outcome.route, outcome.arm) == (Code.OK, "hand_over", "left")
     assert lifts(two) == ["right", "right", "left"]
     assert outcome.message.endswith("m, at try number 2")
-    assert any("looking for another way from where it stands now" in note for note in two.notes)
+    assert any("searching for another way from where it stands now" in note for note in two.notes)
 
 
 @pytest.mark.requirement("P-12")

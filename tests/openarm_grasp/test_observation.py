@@ -136,7 +136,7 @@ def test_of_several_alike_the_one_at_a_position_is_meant() -> None:
 def test_what_must_stay_is_not_picked_again() -> None:
     both = (seen(x=0.2), seen(x=0.3, score=0.8))
     assert look(frames(both), exclude_near=((0.21, -0.2),)).target.p_base[0] == pytest.approx(0.3)
-    with pytest.raises(OpenArmError, match="besides 2 that shall stay") as error:
+    with pytest.raises(OpenArmError, match="besides 2 that must stay") as error:
         look(frames(both), exclude_near=((0.21, -0.2), (0.3, -0.2)))
     assert error.value.code is Code.UNKNOWN_OBJECT
 

@@ -73,7 +73,7 @@ def test_the_client_means_an_object_by_its_position_and_leaves_others(bench):
     intended, left = results
     assert (intended.success, intended.label) == (True, "blue"), intended.message
     assert left.code is Code.UNKNOWN_OBJECT
-    assert "shall stay where they are" in left.message
+    assert "must stay where they are" in left.message
 
 
 def test_the_client_can_cancel_from_its_feedback(bench):
