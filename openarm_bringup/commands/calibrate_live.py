@@ -110,7 +110,7 @@ def _running(options: CalibrationOptions, show: _Show) -> Outcome:
     join_graph(options.domain)
     from openarm_calibration.ros.client import CalibrationClient
 
-    (camera,) = options.cameras
+    camera = options.cameras[0]
     show.camera(camera)
     stop = threading.Event()
     with requires_node("calibration", "calibrate"), CalibrationClient() as client:
