@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import time
 from datetime import timedelta
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
@@ -22,8 +21,8 @@ def pace(new: int, left: int, seconds: float) -> str:
     return f"{3600.0 * new / seconds:.0f} scenes an hour, {timedelta(seconds=round(left * seconds / new))} left"
 
 
-class Watch:
-    """Shows the progress of a campaign.
+class Watch(Progress):
+    """Shows the progress of a campaign; a context manager.
 
     Args:
         total: Rows in all.
@@ -31,25 +30,17 @@ class Watch:
     """
 
     def __init__(self, total: int, console: Console) -> None:
-        self._console = console
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+        super().__init__(*columns, console=console, disable=not console.is_terminal)
+        self._bar = self.add_task("scenes", total=total)
         self._total = total
         self._before = self._done = self._bad = 0
         self._began = self._printed = time.monotonic()
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-        self._progress = Progress(*columns, console=console, disable=not console.is_terminal)
-        self._bar = self._progress.add_task("scenes", total=total)
-
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._progress.stop()
 
     def begin(self, there: int) -> None:
         """The campaign begins with so many rows from before."""
         self._began, self._before, self._done = time.monotonic(), there, there
-        self._progress.update(self._bar, completed=there)
+        self.update(self._bar, completed=there)
 
     def show(self, row: dict[str, Any]) -> None:
         """A row has come."""
@@ -58,10 +49,10 @@ class Watch:
         self._bad += not row["as_expected"]
         speed = pace(self._done - self._before, self._total - self._done, now - self._began)
         text = f"{self._bad} not as expected; {speed}"
-        self._progress.update(self._bar, completed=self._done, description=text)
+        self.update(self._bar, completed=self._done, description=text)
         if not row["as_expected"]:
             line = f"seed {row['seed']} ({row['kind']}): {row['outcome']}: {row['code']}: {row['message']}"
-            self._console.print(line, style="red", markup=False)
-        if not self._console.is_terminal and now - self._printed > _EVERY_S:
+            self.console.print(line, style="red", markup=False)
+        if not self.console.is_terminal and now - self._printed > _EVERY_S:
             self._printed = now
-            self._console.print(f"{self._done} of {self._total} scenes, {text}", markup=False)
+            self.console.print(f"{self._done} of {self._total} scenes, {text}", markup=False)

@@ -17,14 +17,14 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
 from openarm_common.types import Array
 from openarm_evaluation.campaign import record
-from openarm_evaluation.campaign.arm_clearance import LEAST_CLEARANCE, watch_clearance
-from openarm_evaluation.campaign.link import InProcessRobot
+from openarm_evaluation.campaign.in_process_robot import InProcessRobot
 from openarm_evaluation.campaign.mounts import with_mounts
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import MISSES, PLAN_FAILS, Task
+from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, watch_clearance
 from openarm_evaluation.judging.judge import RULES, at_rest, end_of, judge
 from openarm_evaluation.judging.provenance import scene_hash
 from openarm_evaluation.judging.trial import Step, Trial

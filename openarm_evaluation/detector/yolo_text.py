@@ -45,22 +45,21 @@ def read_labels(text: str, width: int, height: int, classes: int, where: str) ->
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip():
             continue
+        place = f"{where}:{number}"
         try:
-            kind, cx, cy, w, h = (float(word) for word in line.split())
+            kind, cx, cy, w, h = map(float, line.split())
         except ValueError as error:
-            raise OpenArmError(
-                Code.INVALID_ARGUMENT, f"{where}:{number}: {line!r}; expected `class cx cy width height`"
-            ) from error
+            text = f"{place}: {line!r}; expected `class cx cy width height`"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text) from error
         if kind != int(kind) or not 0 <= kind < classes:
-            raise OpenArmError(
-                Code.INVALID_ARGUMENT, f"{where}:{number}: class {kind:g}; expected a whole number 0 .. {classes - 1}"
-            )
+            text = f"{place}: class {kind:g}; expected a whole number 0 .. {classes - 1}"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
         # half of the last of six digits may be missing on either side
         inside = cx - w / 2 >= -1e-5 and cx + w / 2 <= 1 + 1e-5 and cy - h / 2 >= -1e-5 and cy + h / 2 <= 1 + 1e-5
         if not (inside and w > 0.0 and h > 0.0):
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,
-                f"{where}:{number}: box {cx:g} {cy:g} {w:g} {h:g} is empty or leaves the picture; expected shares of"
+                f"{place}: box {cx:g} {cy:g} {w:g} {h:g} is empty or leaves the picture; expected shares of"
                 " the width and height, 0 .. 1, not pixels",
             )
         kinds.append(int(kind))

@@ -125,6 +125,5 @@ def at_rest(sample: Sample, rules: JudgeConfig = RULES) -> bool:
 
 def _tilt(before_xyzw: NDArray[np.float64], after_xyzw: NDArray[np.float64]) -> float:
     """Return by how much the axis that pointed up has left the vertical, rad."""
-    up_in_object = se3.matrix_from_quat_xyzw(before_xyzw).T @ np.array([0.0, 0.0, 1.0])
-    up_now = se3.matrix_from_quat_xyzw(after_xyzw) @ up_in_object
-    return math.acos(min(1.0, max(-1.0, float(up_now[2]))))
+    turn = se3.matrix_from_quat_xyzw(after_xyzw) @ se3.matrix_from_quat_xyzw(before_xyzw).T
+    return math.acos(np.clip(turn[2, 2], -1.0, 1.0))

@@ -15,11 +15,11 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, SceneObject
 from openarm_evaluation.judging.judge import RULES, Sample, Verdict, at_rest, end_of, judge
 from openarm_evaluation.judging.provenance import scene_hash
+from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
 
 if TYPE_CHECKING:
     from openarm_evaluation.judging.ros.observer import Observer
     from openarm_grasp.ros.client import GraspClient, GraspResult
-    from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
 
 #: How near an object must be to its place in the scene file to be that scene's, m.
 _SAME_PLACE = 0.02
@@ -212,9 +212,9 @@ def run_pair(
     observer.forget()
     observer.wait(lambda: observer.joints() or None, SETTLE_TIMEOUT_S, "/joint_states")
 
-    def request() -> Sequence[GraspResult]:
+    def request() -> Sequence[GraspResult | GraspOutcome]:
         both = client.pick_two(first.label, second.label)
-        return both.results or [_failed(OpenArmError(both.code, both.message), item.label) for item in items]
+        return both.results or [GraspOutcome(both.code, both.message, item.label) for item in items]
 
     return _observed(observer, scene, seed, items, request)
 
@@ -224,7 +224,7 @@ def _observed(
     scene: Scene,
     seed: int | None,
     items: Sequence[SceneObject],
-    request: Callable[[], Sequence[GraspResult]],
+    request: Callable[[], Sequence[GraspResult | GraspOutcome]],
     place: tuple[float, ...] | None = None,
 ) -> list[Trial]:
     """Request grasps of objects and judge each by where it was to be placed: as requested, else as the grasp chose."""
@@ -234,7 +234,7 @@ def _observed(
     try:
         results = request()
     except OpenArmError as error:
-        results = [_failed(error, item.label) for item in items]
+        results = [GraspOutcome(error.code, error.message, item.label) for item in items]
     wall_s = (time.monotonic() - began) / len(items)
     for item in items:
         _wait_rest(observer, item.name)
@@ -248,13 +248,6 @@ def _observed(
         steps = [step for step in observer.steps() if len(items) == 1 or step.label == item.label]
         trials.append(Trial(scene, seed, item.name, result, verdict, steps, wall_s))
     return trials
-
-
-def _failed(error: OpenArmError, label: str) -> GraspResult:
-    """Return the result of a request that was not answered."""
-    from openarm_grasp.ros.client import GraspResult
-
-    return GraspResult(False, error.code, error.message, "FAILED", label, "", 0, (0.0, 0.0, 0.0), 0.0)
 
 
 def _wait_rest(observer: Observer, name: str) -> None:

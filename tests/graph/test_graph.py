@@ -21,7 +21,7 @@ from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.shm import ports_of, unused
 from openarm_common.errors import Code
 from openarm_common.scene.scene import load_scene
-from openarm_evaluation.campaign.arm_clearance import LEAST_CLEARANCE, least_clearance
+from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, least_clearance
 from openarm_evaluation.judging.judge import judge
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import run_pair, wait_scene

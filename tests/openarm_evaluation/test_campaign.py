@@ -12,7 +12,7 @@ import pytest
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.codec import read_file
-from openarm_evaluation.campaign import campaign, link, report, trial
+from openarm_evaluation.campaign import campaign, in_process_robot, report, trial
 from openarm_evaluation.campaign.campaign import run_campaign
 from openarm_evaluation.campaign.options import CampaignOptions
 from openarm_evaluation.campaign.progress import pace
@@ -189,7 +189,7 @@ def test_what_cannot_be_held_is_refused_and_everything_of_it_kept(tmp_path) -> N
 @pytest.mark.requirement("P-16")
 def test_nothing_that_decides_reads_ground_truth() -> None:
 
-    for module in (skills, pick_and_place, link):
+    for module in (skills, pick_and_place, in_process_robot):
         text = Path(module.__file__ or "").read_text()
         for word in ("tracks", ".objects()", "body_pose", "qpos"):
             assert word not in text, f"{module.__name__} reads {word}"

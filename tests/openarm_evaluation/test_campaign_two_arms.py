@@ -9,10 +9,10 @@ import pytest
 
 from openarm_common.errors import Code
 from openarm_common.scene.scene import Table, random_scene
-from openarm_evaluation.campaign.arm_clearance import LEAST_CLEARANCE, ArmClearance, least_clearance, watch_clearance
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses, arms_behind
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.trial import Trials
+from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, ArmClearance, least_clearance, watch_clearance
 from openarm_grasp.config import GraspConfig
 from openarm_motion.collision.occupancy import OccupancyMap
 from openarm_motion.service.requests import ExecuteRequest, MotionAnswer

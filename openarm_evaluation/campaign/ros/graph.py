@@ -16,11 +16,11 @@ from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import running_graph, work_until_stopped
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
-from openarm_evaluation.campaign.arm_clearance import least_clearance
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import add_clearance, crashed_row, row_of
+from openarm_evaluation.judging.arm_clearance import least_clearance
 from openarm_evaluation.judging.trial import run_pair, run_trial
 from openarm_grasp.strategies.request import GraspRequest
 

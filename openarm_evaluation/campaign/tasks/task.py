@@ -78,11 +78,6 @@ class Task:
     route: str = ""
     together: bool = False
 
-    @property
-    def possible(self) -> bool:
-        """Whether it may end with all requested objects placed."""
-        return Code.OK in self.codes
-
 
 def nominal(seed: int) -> Task:
     """Make a random scene with one or two requested objects; the others are obstacles."""

@@ -16,7 +16,7 @@ from openarm_common.detection import Detection
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import PALETTE, Scene, SceneObject, parse_scene, random_scene
-from openarm_evaluation.campaign.link import approach_of
+from openarm_evaluation.campaign.in_process_robot import approach_of
 from openarm_evaluation.campaign.robot import arms_behind
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_grasp.config import GraspConfig

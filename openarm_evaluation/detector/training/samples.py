@@ -102,7 +102,7 @@ def vary(sample: Sample, rng: Rng, width: int, height: int) -> Sample:
 
 
 def _recolour(rgb: Image, rng: Rng) -> Image:
-    """Other colours: shape is what the network shall learn, colour is the other detector's."""
+    """Other colours: shape is what the network should learn, colour is the other detector's."""
     out = rgb.astype(np.float32) * rng.uniform(0.7, 1.3, 3).astype(np.float32) + np.float32(rng.uniform(-15.0, 15.0))
     draw = rng.random()
     if draw < 0.4:

@@ -8,6 +8,7 @@ distance so far; so no smaller one is missed. m, s.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -16,10 +17,12 @@ from numpy.typing import NDArray
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
-from openarm_evaluation.campaign.robot import SimRobot
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
 from openarm_sim_bridge.world.world import start_qpos
+
+if TYPE_CHECKING:
+    from openarm_evaluation.campaign.robot import SimRobot
 
 #: Two arms that move simultaneously are never nearer than this, m.
 LEAST_CLEARANCE = 0.020
