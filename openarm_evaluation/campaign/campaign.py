@@ -39,6 +39,7 @@ class Campaign:
     rows: list[Row] = field(default_factory=list[Row])
     wall_s: float = 0.0
     resumed: int = 0
+    report: dict[str, Any] = field(default_factory=dict[str, Any])
 
 
 #: Runs seeds of a campaign in its folder, and hands on each row.
@@ -84,7 +85,7 @@ def run_campaign(
         (runner or run_in_processes)(options, [seed for seed in options.seeds if seed not in done], folder, keep)
     finally:
         campaign.wall_s = time.monotonic() - began
-        write_reports(campaign)
+        campaign.report = write_reports(campaign)
     return campaign
 
 

@@ -223,15 +223,15 @@ class Trials:
 
 def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
     """Run one task in this process and return its row, whatever happens."""
-    task = make_task(options.set_name, seed)
+    task, sets = make_task(options.set_name, seed), options.graph_parameters()
     mounts: Mapping[str, Array] = {}
     try:
         if options.mount_seeds:
             task, mounts = with_mounts(task, options.mount_seeds, folder / "mounts")
         trials = Trials(
             task,
-            SimulatedSenses(depth_noise=options.noise, detector=options.detector, sets=options.graph_parameters()),
-            suite_config(options.graph_parameters()).grasp,
+            SimulatedSenses(sets=sets),
+            suite_config(sets).grasp,
             mounts=mounts,
             folder=folder / "failures" / str(seed),
             again=options.command(seed),

@@ -34,7 +34,7 @@ def campaign(
     """
     from openarm_bringup.supervision import runs
     from openarm_evaluation.campaign.agree import compare, rows_of, text_of
-    from openarm_evaluation.campaign.campaign import run_campaign, write_reports
+    from openarm_evaluation.campaign.campaign import run_campaign
     from openarm_evaluation.campaign.progress import Watch
     from openarm_evaluation.campaign.report import figures
     from openarm_evaluation.campaign.ros.graph import rows_of_graph
@@ -43,7 +43,7 @@ def campaign(
     others = rows_of(against) if against is not None else []
     with Watch(len(options.seeds), console()) as watch:
         result = run_campaign(options, folder, watch.show, watch.begin, rows_of_graph if graph else None)
-    data = write_reports(result)
+    data = result.report
     text = "\n".join(f"{name:<44} {value}" for name, value in figures(data))
     good = sum(bool(row["as_expected"]) for row in result.rows)
     summary = data["summary"]

@@ -20,7 +20,7 @@ from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.detector.training.model import Deployed, Network, grid, loss
 from openarm_evaluation.detector.training.samples import Sample, Samples, vary
-from openarm_evaluation.detector.training.scores import Scores, score
+from openarm_evaluation.detector.training.scores import Scores, Truth, score
 from openarm_perception.detection.boxes import Candidates, Letterbox, decode
 
 #: Sizes (width, height) that weights are exported for and chosen by.
@@ -209,7 +209,7 @@ def evaluate(network: Network, samples: Samples, size: tuple[int, int]) -> Score
     """Figures of a network on a set, its input of (width, height)."""
     deployed = Deployed(network, size[1], size[0]).eval()
     found: list[Candidates] = []
-    truth: list[tuple[np.ndarray[Any, np.dtype[np.int64]], np.ndarray[Any, np.dtype[np.float64]]]] = []
+    truth: list[Truth] = []
     with torch.no_grad():
         for i in range(len(samples)):
             sample = samples[i]

@@ -11,12 +11,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from openarm_bringup.view.wire import jpeg
 from openarm_common.figures import data_uri, render_figure, render_page, sheet
 from openarm_evaluation.detector.training.samples import Sample, Samples
-from openarm_evaluation.detector.training.scores import SHOWN, Scores, score
+from openarm_evaluation.detector.training.scores import SHOWN, Scores, Truth, score
 from openarm_perception.detection.boxes import Candidates, overlap
 from openarm_perception.detection.network import NetworkDetector
 
@@ -39,7 +38,7 @@ def evaluate(
 ) -> Evaluation:
     """Run a detector over a set, or over the first `count` pictures of it."""
     found: list[Candidates] = []
-    truth: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+    truth: list[Truth] = []
     for i in range(len(samples) if count is None else min(count, len(samples))):
         sample = samples[i]
         found.append(network.candidates(sample.rgb, LEAST))
