@@ -124,13 +124,11 @@ class Trials:
             track.clear()
         robot.pass_time(0.1)
         request = replace(ask, arm=task.arm, place=task.place)
-        result: GraspOutcome | OpenArmError
         try:
-            result = self.link.run(carry_out(self.grasp_task(request)))
+            outcome = self.link.run(carry_out(self.grasp_task(request)))
         except OpenArmError as error:
-            result = error
+            outcome = GraspOutcome(error.code, error.message, ask.label)
         wall_s = time.monotonic() - began
-        outcome = result if isinstance(result, GraspOutcome) else GraspOutcome(result.code, result.message, ask.label)
         self._placed_at = outcome.place_position
         return self._trial(outcome, self.steps[first:], wall_s)
 
