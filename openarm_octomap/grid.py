@@ -106,12 +106,9 @@ class OccupancyGrid:
             scans: Images or clouds.
             t_ns: Their stamp.
         """
-        ends = valid = cleared = 0
-        for scan in scans:
-            counts = self._mark(scan)
-            ends, valid, cleared = ends + counts[0], valid + counts[1], cleared + counts[2]
-        changed = self._apply(self._milliseconds(t_ns))
-        return Update(ends, valid, cleared, changed)
+        counts = np.array([self._mark(scan) for scan in scans], np.int64).reshape(-1, 3)
+        ends, valid, cleared = counts.sum(axis=0).tolist()
+        return Update(ends, valid, cleared, self._apply(self._milliseconds(t_ns)))
 
     def decay(self, t_ns: int) -> NDArray[np.int32]:
         """Make occupied cells unknown that were not observed for `decay_s`; flat indices of those."""

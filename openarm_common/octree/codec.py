@@ -72,7 +72,7 @@ class OctreeEncoder:
             if level:
                 parent_first, parent_end = first >> 1, end >> 1
                 first, end = parent_first, parent_end
-                if level < DEPTH:  # the root stands alone
+                if level < DEPTH:  # the root is a single node
                     first, end = parent_first & ~1, (parent_end + 1) & ~1
                 self._shift[level] = parent_first - first
             self._origin[level], self._shape[level], self._offset[level] = first, end - first, total

@@ -112,7 +112,6 @@ def parse_urdf(text: str) -> tuple[str, dict[str, Link], dict[str, Joint]]:
         for role, name in (("parent", joint.parent), ("child", joint.child)):
             if name not in links:
                 raise fault(f"joint {joint.name!r} has the {role} link {name!r}, which does not exist")
-    for joint in joints.values():
         leader = joints.get(joint.mimic) if joint.mimic is not None else None
         if joint.mimic is not None and (leader is None or leader.mimic is not None or leader.type == "fixed"):
             why = "does not exist" if leader is None else "is fixed or mimics a joint itself"

@@ -9,6 +9,7 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, Image
 
 from openarm_common.camera.stream import Frame, FrameStream
 from openarm_common.errors import OpenArmError
@@ -16,6 +17,19 @@ from openarm_common.robot.posture import JointNeed
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.node import QOS_NEWEST
 from openarm_common.ros.tf import RobotStateListener
+
+#: Message types of the streams of a camera.
+_KINDS: Mapping[str, type] = {"color": Image, "depth": Image, "info": CameraInfo}
+
+
+def camera_topics(camera: str, **topics: str) -> dict[str, tuple[type, str]]:
+    """Return the message type and topic of the streams `color`, `depth` and `info` of a camera.
+
+    Args:
+        camera: Its name, filled in for {camera}.
+        topics: Of the streams.
+    """
+    return {stream: (_KINDS[stream], topic.format(camera=camera)) for stream, topic in topics.items()}
 
 
 class CameraStream:

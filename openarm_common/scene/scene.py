@@ -92,7 +92,7 @@ class SceneObject(Config):
 
     `size` is the extents along the object's own axes: a box's edges; a cylinder's diameter, diameter, height; a
     sphere's diameter three times.
-    `position` is x, y, or x, y, z of the centre; without z the object stands on the table.
+    `position` is x, y, or x, y, z of the centre; without z the object is on the table.
     """
 
     name: str = Field(min_length=1, pattern=r"^[a-z][a-z0-9_]*$", description="unique in the scene")

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import PointCloud2
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.camera.stream import Frame
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.posture import JointNeed
-from openarm_common.ros.camera_stream import CameraStream
+from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import depth_image, intrinsics_from_info, points_from_cloud
 from openarm_common.ros.tf import RobotStateListener
 from openarm_octomap.grid import CloudScan, DepthScan
@@ -116,8 +116,7 @@ def depth_source(
         depth, intrinsics = depth_image(frame.items["depth"]), intrinsics_from_info(frame.items["info"])
         return DepthScan(depth, intrinsics, frame.posture.T_base_frame, camera.near, camera.far)
 
-    kinds = {"depth": Image, "info": CameraInfo}
-    inputs = {key: (kinds[key], topic.format(camera=camera.name)) for key, topic in topics.items()}
+    inputs = camera_topics(camera.name, **topics)
     return Source(camera.name, CameraStream(node, states, inputs, camera.optical_frame, joints=joints), to_scan)
 
 

@@ -7,13 +7,11 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from openarm_perception.detection.detector import Detection2D
+from openarm_perception.detection.detector import Detection2D, Image
 from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.detection.pipeline import Perceived
 
-Image = NDArray[np.uint8]
 Box = tuple[int, int, int, int]  # left, top, right, bottom; pixels
 
 _LOCATED = (0, 120, 140)

@@ -21,9 +21,7 @@ from openarm_common.config import Config, RunTimeField, load_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_perception.detection.boxes import Candidates, Letterbox, blob, decode
-from openarm_perception.detection.detector import Detection2D, require_rgb
-
-Image = NDArray[np.uint8]
+from openarm_perception.detection.detector import Detection2D, Image, require_rgb
 
 #: Boxes that come this near to the border of the image may be cut by it, pixels.
 _BORDER = 2.0

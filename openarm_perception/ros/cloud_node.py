@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import Image, PointCloud2
 
 from openarm_common.camera.cameras import depth_camera
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.camera.stream import Frame
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.camera_stream import CameraStream
+from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import cloud_from_points, depth_image, intrinsics_from_info, rgb_image
 from openarm_common.ros.node import QOS_SENSOR, BaseNode, run
 from openarm_common.ros.tf import RobotStateListener
@@ -44,11 +44,10 @@ class _Camera:
         self._node, self._name, self._finder = node, name, finder
         self._deprojector = Deprojector(DepthLimits(near=camera.near, far=camera.far))
         self._filter = CloudFilter(config.filter)
-        topics = {"depth": (Image, config.depth_topic), "info": (CameraInfo, config.info_topic)}
-        topics |= {"color": (Image, config.color_topic)} if config.color else {}
+        color = {"color": config.color_topic} if config.color else {}
+        topics = camera_topics(name, depth=config.depth_topic, info=config.info_topic, **color)
         self.stream = CameraStream(
-            node, states, {key: (kind, topic.format(camera=name)) for key, (kind, topic) in topics.items()},
-            camera.optical_frame, joints="required" if finder else "none",
+            node, states, topics, camera.optical_frame, joints="required" if finder else "none",
             on_frame=self._publish, on_refusal=self._refuse,
         )  # fmt: skip
         self._points = node.create_publisher(PointCloud2, config.points_topic.format(camera=name), QOS_SENSOR)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from openarm_interfaces.srv import MeasureTable
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import Image
 from vision_msgs.msg import Detection2DArray, Detection3DArray
 from visualization_msgs.msg import MarkerArray
 
@@ -26,7 +26,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.robot.posture import JointNeed, Posture
 from openarm_common.ros.answers import answering
-from openarm_common.ros.camera_stream import CameraStream
+from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import array_to_image, depth_image, intrinsics_from_info, rgb_image
 from openarm_common.ros.detections import detections_to_msg
 from openarm_common.ros.node import BASE_FRAME, QOS_SENSOR, BaseNode, reliable, run
@@ -75,8 +75,11 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             self, self.description, joints=False, depth=100, wait=config.transform_wait,
             held_topic=config.held_topic if cuts else "",
         )  # fmt: skip
+        # without a depth topic, objects of known height are located by colour alone
+        depth = {"depth": config.depth_topic} if config.depth_topic else {}
+        topics = camera_topics(config.camera, color=config.color_topic, info=config.info_topic, **depth)
         self._stream = CameraStream(
-            self, states, self._topics(), camera.optical_frame, joints=need,
+            self, states, topics, camera.optical_frame, joints=need,
             max_rate=config.max_rate, on_frame=self._on_frame, on_refusal=self._refuse,
         )  # fmt: skip
         #: The newest frame whose camera pose is known, and when it came.
@@ -126,13 +129,6 @@ class DetectNode(BaseNode[DetectNodeConfig]):
     def measurable(self) -> bool:
         """Whether there is an image that the table can be measured in."""
         return self._newest is not None and time.monotonic() - self._newest_at <= _FRESH
-
-    def _topics(self) -> dict[str, tuple[type, str]]:
-        """Streams that make a frame: without a depth topic, objects of known height are located by colour alone."""
-        config = self.config
-        topics = {"color": (Image, config.color_topic), "info": (CameraInfo, config.info_topic)}
-        topics |= {"depth": (Image, config.depth_topic)} if config.depth_topic else {}
-        return {key: (kind, topic.format(camera=config.camera)) for key, (kind, topic) in topics.items()}
 
     def _follow_demand(self) -> None:
         self._stream.poll()
