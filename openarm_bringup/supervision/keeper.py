@@ -24,19 +24,15 @@ class Probe(Protocol):
 
     def known(self, conditions: Sequence[Ready]) -> frozenset[str]:
         """Return what fulfils the conditions before a start."""
-        ...
 
     def unmet(self, conditions: Sequence[Ready], old: frozenset[str]) -> tuple[str, ...]:
         """Return the conditions that do not hold yet."""
-        ...
 
     def parameters(self, node: str) -> frozenset[str]:
         """Return the names of a node's parameters."""
-        ...
 
     def close(self) -> None:
         """Leave the graph."""
-        ...
 
 
 class NodeState(StrEnum):
@@ -112,7 +108,7 @@ class Keeper:
         code = self.process.returncode
         if code is None:
             self.mapped |= shm.mapped_by(self.process.pid)
-            code = await self.process.stop(self._supervisor.haste, self._supervisor.ladder)
+            code = await self.process.stop(self._supervisor.ladder)
         self._supervisor.tell_guard(f"-{self.process.pid}")
         if self.state not in (NodeState.FAILED, NodeState.EXITED):
             self._enter(NodeState.STOPPED, f"killed ({code})" if self.process.killed else f"code {code}")
@@ -139,7 +135,7 @@ class Keeper:
             )
             if not ended.done() and not getting_ready.done():
                 missing = ", ".join(await supervisor.ask(lambda probe: probe.unmet(conditions, old)))
-                await process.stop(supervisor.haste, supervisor.ladder)
+                await process.stop(supervisor.ladder)
                 return 1, f"was not ready after {self.spec.ready_timeout:g} s; missing: {missing}", 0.0
             ready_at = time.monotonic()
             if getting_ready.done() and not ended.done():

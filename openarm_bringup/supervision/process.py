@@ -9,7 +9,7 @@ import os
 import signal
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TextIO
@@ -18,28 +18,18 @@ from openarm_bringup.supervision.guard import group_alive
 from openarm_common.errors import Code, OpenArmError
 
 
-@dataclass(frozen=True)
+@dataclass
 class Ladder:
-    """How long a process may take after each signal, s."""
+    """How long processes may take after each signal, s; a second Ctrl-C ends the present wait of all of them."""
 
     after_int: float = 5.0
     after_term: float = 5.0
-
-
-class Haste:
-    """Lets a second Ctrl-C cut the present waiting short, everywhere at once."""
-
-    def __init__(self) -> None:
-        self._event = asyncio.Event()
+    hurried: asyncio.Event = field(default_factory=asyncio.Event)
 
     def hurry(self) -> None:
         """End the present stage of every stop that is under way."""
-        self._event.set()
-        self._event = asyncio.Event()
-
-    async def wait(self) -> None:
-        """Return at the next `hurry`."""
-        await self._event.wait()
+        self.hurried.set()
+        self.hurried = asyncio.Event()
 
 
 class NodeProcess:
@@ -92,19 +82,19 @@ class NodeProcess:
             self._pump.cancel()
         return code
 
-    async def stop(self, haste: Haste, ladder: Ladder) -> int:
+    async def stop(self, ladder: Ladder) -> int:
         """Send INT, then TERM, then KILL to the group, each when the one before had no effect in time."""
         for number, grace in ((signal.SIGINT, ladder.after_int), (signal.SIGTERM, ladder.after_term)):
             self._signal(number)
-            if await self._ended_within(grace, haste):
+            if await self._ended_within(grace, ladder.hurried):
                 return await self.wait()
         self.killed = True
         self._signal(signal.SIGKILL)
         return await self.wait()
 
-    async def _ended_within(self, seconds: float, haste: Haste) -> bool:
-        ended, hurried = asyncio.create_task(self._process.wait()), asyncio.create_task(haste.wait())
-        done, pending = await asyncio.wait({ended, hurried}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+    async def _ended_within(self, seconds: float, hurried: asyncio.Event) -> bool:
+        ended, haste = asyncio.create_task(self._process.wait()), asyncio.create_task(hurried.wait())
+        done, pending = await asyncio.wait({ended, haste}, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
         for task in pending:
             task.cancel()
         return ended in done

@@ -23,11 +23,9 @@ _LARGE_EXTRA_MIB = 2.2
 #: Segments grow up to so many times where a graph then still takes no more than this share of the free space.
 _GROWTH, _SHARE = 4, 0.25
 
-_SEGMENT = re.compile(r"^fastrtps_[0-9a-f]{16}$")
-_PORT = re.compile(r"^fastrtps_port(\d+)$")
-#: Distance fields (`openarm_common.octree.distance_field.field_path`), and what one is called while it is made.
-_FIELD = re.compile(r"^openarm_field_([A-Za-z0-9_.-]+)$")
-_UNFINISHED = re.compile(r"^[a-z0-9_]{8}$")
+_PORT = re.compile(r"fastrtps_port(\d+)")
+#: Segments and ports of Fast DDS, and distance fields (`openarm_common.octree.distance_field.field_path`).
+_OURS = re.compile(rf"fastrtps_[0-9a-f]{{16}}|{_PORT.pattern}|openarm_field_[A-Za-z0-9_.-]+")
 
 
 def shm_need_mib(graph: Graph, extra_participants: int = 1) -> float:
@@ -61,20 +59,13 @@ def check_shm(graph: Graph, free_mib: float | None = None) -> None:
     )
 
 
-def clean_command() -> list[str] | None:
-    """Return the command that removes what killed processes left in /dev/shm, or None where Fast DDS has no tool."""
-    beside = Path(sys.executable).parent / "fastdds"
-    tool = str(beside) if beside.exists() else shutil.which("fastdds")
-    return [tool, "shm", "clean"] if tool else None
-
-
 def clean_shm() -> str:
     """Remove the segments of dead processes (those in use are locked and stay); return the output of the tool."""
-    command = clean_command()
-    if command is None:
-        return "fastdds is not installed; segments of killed processes stay in /dev/shm"
     env = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}"}
-    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=20, check=False)
+    tool = shutil.which("fastdds", path=env["PATH"])
+    if tool is None:
+        return "fastdds is not installed; segments of killed processes stay in /dev/shm"
+    done = subprocess.run([tool, "shm", "clean"], env=env, capture_output=True, text=True, timeout=20, check=False)
     return " ".join((done.stdout + done.stderr).split())
 
 
@@ -102,31 +93,18 @@ def mapped_by(pid: int, shm: Path = SHM) -> set[str]:
     except OSError:
         return set()
     names = {line.rpartition("/")[2] for line in lines if f"{shm}/" in line}
-    return {name for name in names if any(kind.match(name) for kind in (_SEGMENT, _PORT, _FIELD))}
-
-
-def ports_of(domain: int, shm: Path = SHM) -> set[str]:
-    """Return the names of the ports of a ROS domain that exist in /dev/shm."""
-    first = 7400 + 250 * domain
-    matches = ((entry.name, _PORT.match(entry.name)) for entry in shm.iterdir())
-    return {name for name, match in matches if match and first <= int(match.group(1)) < first + 250}
-
-
-def fields_of(domain: int, shm: Path = SHM) -> set[str]:
-    """Return the names of the distance fields of a ROS domain in /dev/shm, unfinished ones too."""
-    found: set[str] = set()
-    for entry in shm.iterdir():
-        match = _FIELD.match(entry.name)
-        if match and match.group(1).startswith(str(domain)):
-            rest = match.group(1).removeprefix(str(domain))
-            if not rest or _UNFINISHED.match(rest):
-                found.add(entry.name)
-    return found
+    return {name for name in names if _OURS.fullmatch(name)}
 
 
 def names_of(domain: int, shm: Path = SHM) -> set[str]:
-    """Return the names of all that a graph in a ROS domain may have left in /dev/shm."""
-    return ports_of(domain, shm) | fields_of(domain, shm)
+    """Return the names of all that a graph in a ROS domain may have left in /dev/shm.
+
+    These are the ports of Fast DDS, and distance fields; one that is not finished has a random suffix.
+    """
+    field = re.compile(rf"openarm_field_{domain}([a-z0-9_]{{8}})?")
+    names = [entry.name for entry in shm.iterdir()]
+    ports = {name for name in names if (port := _PORT.fullmatch(name)) and (int(port[1]) - 7400) // 250 == domain}
+    return ports | {name for name in names if field.fullmatch(name)}
 
 
 def unused(names: Iterable[str], shm: Path = SHM) -> list[str]:
@@ -145,7 +123,7 @@ def unused(names: Iterable[str], shm: Path = SHM) -> list[str]:
 def sweep(names: Iterable[str], shm: Path = SHM) -> list[str]:
     """Remove those of the named segments, ports and fields that are no longer in use; return them.
 
-    A process that sends to one that has just died opens its port anew, without the lock by which `fastdds shm clean`
+    A process that sends to one that has just died opens its port again, without the lock by which `fastdds shm clean`
     knows a port; such ports would stay for ever.
     """
     removed = unused(names, shm)

@@ -24,7 +24,7 @@ import psutil
 from openarm_bringup.supervision import environment, guard, runs, shm
 from openarm_bringup.supervision.graph import Graph
 from openarm_bringup.supervision.keeper import Keeper, NodeState, Probe
-from openarm_bringup.supervision.process import Haste, Ladder
+from openarm_bringup.supervision.process import Ladder
 from openarm_common.errors import Code, OpenArmError
 
 T = TypeVar("T")
@@ -75,7 +75,7 @@ class Supervisor:
         self._guard: asyncio.subprocess.Process | None = None
         self.spawning = asyncio.Lock()
         self.stop_asked = asyncio.Event()
-        self.haste, self.ladder, self.poll = Haste(), ladder or Ladder(), poll
+        self.ladder, self.poll = ladder or Ladder(), poll
         self._keepers = {name: Keeper(name, self) for name in self.graph.nodes}
 
     async def start(self) -> None:
@@ -136,7 +136,7 @@ class Supervisor:
     def ask_stop(self) -> None:
         """Ask for the end; a second time: hurry (the next signal at once)."""
         if self.stop_asked.is_set():
-            self.haste.hurry()
+            self.ladder.hurry()
         self.stop_asked.set()
 
     async def stop(self) -> None:

@@ -18,7 +18,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
 from openarm_bringup.supervision.graph import load_graph
-from openarm_bringup.supervision.shm import ports_of, unused
+from openarm_bringup.supervision.shm import names_of, unused
 from openarm_common.errors import Code
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, least_clearance
@@ -185,6 +185,6 @@ def test_ctrl_c_leaves_no_process_and_no_shared_memory(up: Any) -> None:
     assert time.monotonic() - began < 12.0
     assert [pid for pid in pids if psutil.pid_exists(pid)] == []
     # A port that is in use belongs to another process that has joined this domain.
-    assert unused(ports_of(up.domain)) == []
+    assert unused(names_of(up.domain)) == []
     assert up.record() is None
     assert "no process is left" in up.output.read_text()

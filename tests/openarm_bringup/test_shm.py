@@ -14,10 +14,8 @@ import pytest
 from openarm_bringup.supervision.environment import node_arguments, node_environment, write_profile
 from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_bringup.supervision.shm import (
-    fields_of,
     mapped_by,
     names_of,
-    ports_of,
     shm_need_mib,
     sweep,
     with_larger_segments,
@@ -45,7 +43,7 @@ def test_sweep_removes_only_what_is_neither_mapped_nor_locked(tmp_path: Path) ->
     ):
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert mapped_by(os.getpid(), tmp_path) == {mapped.name}
-        names = {*ports_of(0, tmp_path), mapped.name, "fastrtps_port7599"}
+        names = {*names_of(0, tmp_path), mapped.name, "fastrtps_port7599"}
         assert sweep(names, tmp_path) == [dead.name, zombie.name]
     assert sorted(p.name for p in tmp_path.iterdir() if not p.name.startswith("sem.")) == sorted(
         [locked.name, f"{locked.name}_el", mapped.name, stranger.name]
@@ -56,15 +54,15 @@ def test_sweep_removes_only_what_is_neither_mapped_nor_locked(tmp_path: Path) ->
 def test_ports_of_a_domain(tmp_path: Path) -> None:
     for port in (7400, 7649, 7650, 24161):
         make(tmp_path, f"fastrtps_port{port}", lock=False)
-    assert ports_of(0, tmp_path) == {"fastrtps_port7400", "fastrtps_port7649"}
-    assert ports_of(67, tmp_path) == {"fastrtps_port24161"}
+    assert names_of(0, tmp_path) == {"fastrtps_port7400", "fastrtps_port7649"}
+    assert names_of(67, tmp_path) == {"fastrtps_port24161"}
 
 
 def test_the_distance_field_of_a_killed_map_goes_and_that_of_a_living_one_stays(tmp_path: Path) -> None:
     """Also one that was never finished; those of other domains and of tests are not touched."""
     dead = [make(tmp_path, f"openarm_field_4{rest}", lock=False).name for rest in ("", "ab_12xyz")]
     others = [make(tmp_path, f"openarm_field_{name}", lock=False).name for name in ("43", "4_of_a_test", "toy")]
-    assert fields_of(4, tmp_path) == set(dead)
+    assert names_of(4, tmp_path) == set(dead)
     living = tmp_path / others[0]
     with living.open("r+b") as file, mmap.mmap(file.fileno(), 4096):
         assert mapped_by(os.getpid(), tmp_path) == {living.name}

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from rcl_interfaces.srv import ListParameters
 from rclpy.qos import QoSProfile
@@ -41,7 +40,8 @@ class ReadinessClient(ContextNode):
     def known(self, conditions: Sequence[Ready]) -> frozenset[str]:
         """Return the endpoints that fulfil the conditions now; call it before a process is started."""
         for condition in conditions:
-            self._forget(condition.name)
+            self._received.discard(condition.name)
+            self._end_waiting(condition.name)
         return frozenset(gid for condition in conditions for gid in self._endpoints(condition))
 
     def unmet(self, conditions: Sequence[Ready], old: frozenset[str]) -> tuple[str, ...]:
@@ -93,24 +93,17 @@ class ReadinessClient(ContextNode):
             if new is not None:
                 kind, profile = interface(new.topic_type), _like(new.qos_profile)
                 self._waiting[topic] = self._node.create_subscription(
-                    kind, topic, self._receiver(topic), profile, raw=True
+                    kind, topic, lambda _: self._receive(topic), profile, raw=True
                 )
         return False
 
-    def _receiver(self, topic: str) -> Any:
-        def receive(_: bytes) -> None:
-            self._received.add(topic)
-            self._end_waiting(topic)
-
-        return receive
+    def _receive(self, topic: str) -> None:
+        self._received.add(topic)
+        self._end_waiting(topic)
 
     def _end_waiting(self, topic: str) -> None:
         if topic in self._waiting:
             self._node.destroy_subscription(self._waiting.pop(topic))
-
-    def _forget(self, topic: str) -> None:
-        self._received.discard(topic)
-        self._end_waiting(topic)
 
 
 def _like(offered: QoSProfile) -> QoSProfile:
