@@ -54,18 +54,16 @@ def join_graph(domain: int | None) -> None:
         os.environ.setdefault(discovery.PROFILE, str(discovery.network_profile()))
 
 
-@contextmanager
-def graph_peer(domain: int | None) -> Iterator[Peer]:
-    """Join the graph with a node of this command.
+def graph_peer(domain: int | None) -> Peer:
+    """Join the graph; return a node of this command, a context manager.
 
     Raises:
-        OpenArmError: NOT_READY, when no node runs.
+        OpenArmError: NOT_READY, on entering, when no node runs.
     """
     join_graph(domain)
     from openarm_bringup.ros.peer import Peer
 
-    with Peer() as peer:
-        yield peer
+    return Peer()
 
 
 @contextmanager

@@ -80,7 +80,8 @@ def gather(graph: str) -> list[Finding]:
     domain = os.environ.get("ROS_DOMAIN_ID", "") or "0"
     findings.append(checks.check_domain(domain, _first_ephemeral_port()))
     if findings[-1].level != "error":
-        findings.append(checks.check_ports(_taken_ports(int(domain)), int(domain)))
+        port = 7400 + 250 * int(domain)
+        findings.append(checks.check_port(port, _can_share(port)))
     findings.append(_machine())
     return findings
 
@@ -161,21 +162,17 @@ def _first_ephemeral_port() -> int:
     return int(path.read_text(encoding="ascii").split()[0]) if path.exists() else 32768
 
 
-def _taken_ports(domain: int) -> list[int]:
-    """Return the discovery ports that cannot be opened although Fast DDS shares them (SO_REUSEADDR)."""
-    taken: list[int] = []
-    for port in (7400 + 250 * domain, 7410 + 250 * domain):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError as error:
-                if error.errno != errno.EADDRINUSE:
-                    raise
-                # A unicast port that another participant of this domain holds is no fault: the next one is taken.
-                if port == 7400 + 250 * domain:
-                    taken.append(port)
-    return taken
+def _can_share(port: int) -> bool:
+    """Return whether a UDP port can be opened as Fast DDS opens that of discovery: shared (SO_REUSEADDR)."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            return False
+    return True
 
 
 def _machine() -> Finding:

@@ -196,8 +196,7 @@ def call(name: str, *request: str, timeout: float = 30.0, domain: Domain = None)
         found, kind = peer.find("service", name)
         filled = fill(interface(kind).Request(), fields_of(request, found, kind))
         client = peer.node.create_client(interface(kind), found)
-        if not peer.spin_until(client.service_is_ready, 5.0):
-            raise OpenArmError(Code.NOT_READY, f"{found} does not answer")
+        peer.wait_for(client.service_is_ready, found)
         answer = peer.result(client.call_async(filled), timeout, found)
     return _answered(to_data(answer), {"service": found, "type": kind})
 
@@ -219,6 +218,8 @@ def send(name: str, *goal: str, feedback: bool = False, timeout: float = 300.0, 
         feedback: Print the feedback.
         timeout: Longest wait for the result, s.
     """
+    from rclpy.action import ActionClient
+
     from openarm_bringup.messages import fields_of, fill, interface, to_data, to_yaml
 
     def on_feedback(message: Any) -> None:
@@ -228,7 +229,8 @@ def send(name: str, *goal: str, feedback: bool = False, timeout: float = 300.0, 
     with graph_peer(domain) as peer:
         found, kind = peer.find("action", name)
         filled = fill(interface(kind).Goal(), fields_of(goal, found, kind))
-        client = peer.action_client(interface(kind), found)
+        client: Any = ActionClient(peer.node, interface(kind), found)
+        peer.wait_for(client.server_is_ready, found)
         handle = peer.result(client.send_goal_async(filled, feedback_callback=on_feedback), 10.0, found)
         if not handle.accepted:
             return Outcome(False, f"{found} refused the goal", Code.INVALID_ARGUMENT, {"action": found})

@@ -169,12 +169,12 @@ def check_domain(text: str, first_ephemeral_port: int) -> Finding:
     return ok("domain", f"ROS_DOMAIN_ID={text}, UDP ports {last_port - PORTS} to {last_port}")
 
 
-def check_ports(taken: Sequence[int], domain: int) -> Finding:
-    """Check that the domain's discovery ports can be used on this machine."""
-    if taken:
-        advice = "another program holds them without sharing; choose another ROS_DOMAIN_ID"
-        return error("ports", f"UDP {', '.join(map(str, taken))} of domain {domain} cannot be opened", advice)
-    return ok("ports", f"the UDP ports of domain {domain} can be opened")
+def check_port(port: int, free: bool) -> Finding:
+    """Check that the domain's discovery port can be used on this machine."""
+    if not free:
+        advice = "another program holds it without sharing; choose another ROS_DOMAIN_ID"
+        return error("ports", f"UDP {port}, for discovery, cannot be opened", advice)
+    return ok("ports", f"UDP {port}, for discovery, can be opened")
 
 
 def check_shm(total_mib: float, free_mib: float, need_mib: float, graph: str) -> Finding:

@@ -3,47 +3,41 @@
 
 from __future__ import annotations
 
-import queue
-import time
 from collections.abc import Sequence
 
 from vision_msgs.msg import Detection3DArray
 
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.client import BackgroundNode
+from openarm_common.ros.client import ContextNode
 from openarm_common.ros.detections import detections_from_msg
 from openarm_common.ros.node import reliable
 from openarm_perception.detection.attributes import parse, resolve
 
 
-class DetectionListener(BackgroundNode):
+class DetectionListener(ContextNode):
     """Receives detections; the detector works only while it has a subscriber."""
 
     def __init__(self) -> None:
-        self._received: queue.Queue[Detection3DArray] = queue.Queue()
         super().__init__("detection_listener")
-        self._node.create_subscription(Detection3DArray, "/detections_3d", self._received.put, reliable(5))
+        self._found: list[Detection] | None = None
+        self._node.create_subscription(Detection3DArray, "/detections_3d", self._receive, reliable(5))
 
     def next(self, timeout: float) -> list[Detection]:
-        """Return the measured objects of the next message that has any, or of the last one.
+        """Return the measured objects of the first message that has any, or of the last one.
 
         Raises:
             OpenArmError: TIMEOUT, when no message comes.
         """
-        deadline = time.monotonic() + timeout
-        found: list[Detection] | None = None
-        while not found and (left := deadline - time.monotonic()) > 0.0:
-            try:
-                message = self._received.get(timeout=left)
-            except queue.Empty:
-                break
-            found = [detection for detection in detections_from_msg(message) if detection.measured]
-        if found is None:
+        self.spin_until(lambda: self._found, timeout)
+        if self._found is None:
             raise OpenArmError(
                 Code.TIMEOUT, f"no answer of the detector within {timeout:g} s; is the graph up, and its camera?"
             )
-        return found
+        return self._found
+
+    def _receive(self, message: Detection3DArray) -> None:
+        self._found = [detection for detection in detections_from_msg(message) if detection.measured]
 
 
 def find(requests: Sequence[str], timeout: float = 20.0) -> list[Detection]:

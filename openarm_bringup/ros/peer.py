@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.action import ActionClient
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile
@@ -28,7 +27,7 @@ from openarm_common.ros.node import QOS_STATIC_TF, QOS_TF, offered_qos
 _QUIET_S = 0.6
 _DISCOVERY_S = 8.0
 #: Longest wait for a first node, where no supervisor of this machine has recorded a graph, s.
-_ANYBODY_S = 4.0
+_FIRST_NODE_S = 4.0
 #: Services that every node has.
 _OF_ALL_NODES = ("rcl_interfaces/srv/", "type_description_interfaces/srv/")
 _ANSWER_S = 5.0
@@ -50,7 +49,7 @@ class Peer(ContextNode):
         before: Any = None
         domain = self._context.get_domain_id()
         there = {f"/{name}" for run in runs.running() if run.domain == domain for name in run.ready_nodes}
-        while (now := time.monotonic()) - began < (_DISCOVERY_S if there else _ANYBODY_S):
+        while (now := time.monotonic()) - began < (_DISCOVERY_S if there else _FIRST_NODE_S):
             known = (self.nodes(), self.topics(), self.services())
             if known != before:
                 before, changed = known, now
@@ -108,16 +107,14 @@ class Peer(ContextNode):
         """The quality of service with which every publisher of a topic is received."""
         return offered_qos(self.node, topic, 100)
 
-    def action_client(self, kind: Any, name: str) -> Any:
-        """A client of an action whose server answers.
+    def wait_for(self, server_is_ready: Callable[[], bool], name: str) -> None:
+        """Wait for the server of a client.
 
         Raises:
-            OpenArmError: NOT_READY, when it does not.
+            OpenArmError: NOT_READY, when it does not answer.
         """
-        client: Any = ActionClient(self.node, kind, name)
-        if not self.spin_until(client.server_is_ready, _ANSWER_S):
+        if not self.spin_until(server_is_ready, _ANSWER_S):
             raise OpenArmError(Code.NOT_READY, f"{name} does not answer")
-        return client
 
     def parameters(self, node: str) -> ParametersOf:
         """The parameters of a node.
@@ -182,8 +179,7 @@ class ParametersOf:
         self.node = node
         self._peer = peer
         self._client = AsyncParameterClient(peer.node, node)
-        if not peer.spin_until(self._client.services_are_ready, _ANSWER_S):
-            raise OpenArmError(Code.NOT_READY, f"{node} does not answer for its parameters")
+        peer.wait_for(self._client.services_are_ready, f"the parameter service of {node}")
         self.names: list[str] = sorted(peer.result(self._client.list_parameters(), _ANSWER_S, node).result.names)
 
     def get(self, names: list[str]) -> dict[str, Any]:

@@ -41,7 +41,9 @@ class Proxy:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="proxy", daemon=True)
         self._thread.start()
-        self._runner = web.AppRunner(self._app(), access_log=None, shutdown_timeout=0.5)
+        app = web.Application()
+        app.router.add_get("/", self._connect)
+        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.5)
         try:
             self.port = asyncio.run_coroutine_threadsafe(self._open(port), self._loop).result(10.0)
         except OSError as error:
@@ -54,11 +56,6 @@ class Proxy:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(timeout=5.0)
         self._loop.close()
-
-    def _app(self) -> web.Application:
-        app = web.Application()
-        app.router.add_get("/", self._connect)
-        return app
 
     async def _open(self, port: int) -> int:
         await self._runner.setup()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import mimetypes
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -101,7 +100,7 @@ class ViewServer:
         self._pages: set[_Page] = set()
         self._kept: dict[str, Item] = {}
         self._picking: asyncio.Task[None] | None = None
-        self._files = {str(path.relative_to(PAGE)): path.read_bytes() for path in PAGE.rglob("*.*")}
+        self._files = {str(path.relative_to(PAGE)) for path in PAGE.rglob("*.*")} - {"index.html"}
 
     def app(self) -> web.Application:
         """The aiohttp application."""
@@ -146,19 +145,14 @@ class ViewServer:
         return response
 
     # --- layers
-    async def _page(self, _: web.Request) -> web.Response:
-        return self._response("index.html")
+    async def _page(self, _: web.Request) -> web.FileResponse:
+        return web.FileResponse(PAGE / "index.html")
 
-    async def _file(self, request: web.Request) -> web.Response:
+    async def _file(self, request: web.Request) -> web.FileResponse:
         name = request.match_info["name"]
-        if name not in self._files or name == "index.html":
+        if name not in self._files:
             raise web.HTTPNotFound(text=f"there is no {name!r} here")
-        return self._response(name)
-
-    def _response(self, name: str) -> web.Response:
-        kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
-        charset = "utf-8" if kind.startswith("text/") else None
-        return web.Response(body=self._files[name], content_type=kind, charset=charset)
+        return web.FileResponse(PAGE / name)
 
     async def _socket(self, request: web.Request) -> web.WebSocketResponse:
         if len(self._pages) >= _MAX_PAGES:

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -32,14 +34,8 @@ def listen(run: RunRecord) -> GraphStatus:
 
 def _listen(run: RunRecord) -> GraphStatus:
     os.environ.update(variables(run.domain, run.discovery))
-    counts: dict[str, int] = {}
+    counts = Counter[str]()
     diagnostics: dict[str, tuple[bool, str]] = {}
-
-    def count(topic: str) -> Any:
-        def take(_: bytes) -> None:
-            counts[topic] += 1
-
-        return take
 
     def note(message: DiagnosticArray) -> None:
         for status in message.status:
@@ -50,10 +46,14 @@ def _listen(run: RunRecord) -> GraphStatus:
         names = [name for name, _ in peer.node.get_node_names_and_namespaces() if not name.startswith("_")]
         for topic, kind in peer.topics().items():
             if topic in RATES:
-                counts[topic] = 0
-                peer.node.create_subscription(interface(kind), topic, count(topic), peer.offered(topic), raw=True)
+                count: Any = partial(_count, counts, topic)
+                peer.node.create_subscription(interface(kind), topic, count, peer.offered(topic), raw=True)
         peer.node.create_subscription(DiagnosticArray, "/diagnostics", note, QOS_COMMAND)
         began = peer.node.get_clock().now()
         peer.spin_until(lambda: False, _LISTEN_S)
         seconds = (peer.node.get_clock().now() - began).nanoseconds * 1e-9
     return GraphStatus({topic: n / seconds for topic, n in counts.items()}, diagnostics, names)
+
+
+def _count(counts: Counter[str], topic: str, _: bytes) -> None:
+    counts[topic] += 1

@@ -24,7 +24,7 @@ from openarm_bringup.bags.definitions import full_definition
 from openarm_bringup.messages import interface
 from openarm_bringup.view.guard import LOOPBACK, Guard
 from openarm_bringup.view.proxy import Proxy, hidden_address
-from openarm_bringup.view.ros.layers import Polled
+from openarm_bringup.view.ros.layers import Polled, Source
 from openarm_bringup.view.viz import TOKEN_VARIABLE
 from openarm_common.config import Config
 from openarm_common.errors import OpenArmError
@@ -91,7 +91,7 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
         self._ask = BackgroundNode("foxglove_services", timeout=5.0)
         # Polled, so in no executor: a subscription to 100 Hz would cost more than all else here.
         self._time_node = Node("foxglove_clock", context=self.context, start_parameter_services=False)
-        self._time = Polled(self._time_node, Clock, "/clock")
+        self._time = Polled(self._time_node, Source(Clock, "/clock"))
         self._time_ns: int | None = None
         self.create_timer(1.0, self._discover, clock=self.steady_clock)
         self.create_timer(0.05, self._follow_demand, clock=self.steady_clock)

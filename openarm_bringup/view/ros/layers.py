@@ -11,6 +11,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,21 +50,35 @@ Items = Iterator[tuple[str, str | bytes]]
 _SILENT_S = 4.0
 
 
+class Source(NamedTuple):
+    """A topic.
+
+    Attributes:
+        kind: Type of the messages.
+        topic: Absolute name.
+        qos: Quality of service.
+        silence: It is a fault when nothing has come for longer than this, s; 0: it may be silent.
+    """
+
+    kind: Any
+    topic: str
+    qos: QoSProfile = QOS_NEWEST
+    silence: float = 0.0
+
+
 class Polled:
     """A subscription that is polled; its node is not spun.
 
     Args:
         node: Owns it.
-        kind: Type of the messages.
-        topic: Absolute name.
-        qos: Quality of service.
+        source: What is subscribed to.
     """
 
-    def __init__(self, node: Node, kind: Any, topic: str, qos: QoSProfile = QOS_NEWEST) -> None:
-        self.topic = topic
-        self._node = node
-        self._subscription: Any = node.create_subscription(kind, topic, _unused, qos)
-        self.received_at = time.monotonic()
+    def __init__(self, node: Node, source: Source) -> None:
+        self._node, self._source = node, source
+        # The callback is never called.
+        self._subscription: Any = node.create_subscription(source.kind, source.topic, lambda _: None, source.qos)
+        self._received_at = time.monotonic()
 
     def take(self) -> list[Any]:
         """All messages that wait."""
@@ -73,7 +88,7 @@ class Polled:
             while (one := handle.take_message(kind, False)) is not None:
                 taken.append(one[0])
         if taken:
-            self.received_at = time.monotonic()
+            self._received_at = time.monotonic()
         return taken
 
     def newest(self) -> Any | None:
@@ -81,30 +96,15 @@ class Polled:
         taken = self.take()
         return taken[-1] if taken else None
 
-    def silence(self, limit: float) -> str:
-        """What to say when nothing has come for longer than a limit, s; else nothing."""
-        silent = time.monotonic() - self.received_at
-        return f"nothing on {self.topic} for {silent:.0f} s" if silent > limit else ""
+    @property
+    def fault(self) -> str:
+        """Says so when the source has been silent for too long, else empty."""
+        silent, limit = time.monotonic() - self._received_at, self._source.silence
+        return f"nothing on {self._source.topic} for {silent:.0f} s" if limit and silent > limit else ""
 
     def close(self) -> None:
         """Unsubscribe."""
         self._node.destroy_subscription(self._subscription)
-
-
-class Source(NamedTuple):
-    """A topic that a layer shows.
-
-    Args:
-        kind: Type of the messages.
-        topic: Absolute name.
-        qos: Quality of service.
-        silence: The layer can't be shown when nothing has come for longer than this, s; 0: it may be silent.
-    """
-
-    kind: Any
-    topic: str
-    qos: QoSProfile = QOS_NEWEST
-    silence: float = 0.0
 
 
 #: Given the messages that have come from each source since the last time, yields what is new.
@@ -130,18 +130,17 @@ class Layer:
         self.period = period
         self.due = 0.0
         self._show = show
-        self._polled = [(Polled(node, source.kind, source.topic, source.qos), source.silence) for source in sources]
+        self._polled = [Polled(node, source) for source in sources]
 
     def update(self) -> Items:
         """Yield what is new since the last update."""
-        taken = [polled.take() for polled, _ in self._polled]
-        silent = (polled.silence(limit) for polled, limit in self._polled if limit)
-        self.fault = next(filter(None, silent), "")
+        taken = [polled.take() for polled in self._polled]
+        self.fault = next(filter(None, (polled.fault for polled in self._polled)), "")
         yield from self._show(*taken)
 
     def close(self) -> None:
         """Unsubscribe."""
-        for polled, _ in self._polled:
+        for polled in self._polled:
             polled.close()
 
 
@@ -150,10 +149,10 @@ def _show_states() -> Show:
     steps: deque[dict[str, Any]] = deque(maxlen=40)
     nodes: dict[str, tuple[float, DiagnosticStatus]] = {}
     speed: float | None = None
-    told = 0.0
+    sent_at = 0.0
 
     def show(status: list[GraspStatus], diagnostics: list[DiagnosticArray], speeds: list[Float64]) -> Items:
-        nonlocal told, speed
+        nonlocal sent_at, speed
         steps.extend(_step(message) for message in status)
         if status:
             yield "grasp", _text("grasp", steps=list(steps))
@@ -161,10 +160,10 @@ def _show_states() -> Show:
         for message in diagnostics:
             nodes.update({status.name: (now, status) for status in message.status})
         speed = speeds[-1].data if speeds else speed
-        if now - told > 1.0:
-            told = now
+        if now - sent_at > 1.0:
+            sent_at = now
             health = [_health(status, now - at) for at, status in nodes.values()]
-            yield "health", _text("health", nodes=sorted(health, key=_by_name), speed=speed)
+            yield "health", _text("health", nodes=sorted(health, key=itemgetter("name")), speed=speed)
             speed = None
 
     return show
@@ -282,10 +281,6 @@ def makers(
     return fixed | {f"image:{name}": maker(lambda name=name: _show_image(name), images[name]) for name in images}
 
 
-def _unused(_: object) -> None:
-    """Never called: messages are polled."""
-
-
 def _text(kind: str, **values: Any) -> str:
     return json.dumps({"kind": kind, **values})
 
@@ -304,10 +299,6 @@ def _health(status: DiagnosticStatus, age: float) -> dict[str, Any]:
         "message": f"silent for {age:.0f} s" if age > _SILENT_S else status.message,
         "values": {value.key: value.value for value in status.values[:24]},
     }
-
-
-def _by_name(node: dict[str, Any]) -> str:
-    return node["name"]
 
 
 def _detection_box(detection: Any) -> dict[str, Any]:
