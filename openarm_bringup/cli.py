@@ -124,7 +124,7 @@ def _show(outcome: Outcome, sink: str | None) -> None:
         if outcome.message:
             _print(outcome.message)
     else:
-        _complain(f"{outcome.code}: {outcome.message}")
+        sys.stderr.write(f"openarm: {outcome.code}: {outcome.message}\n")
 
 
 def _refuse(message: str, code: Code, sink: str | None) -> int:
@@ -135,10 +135,6 @@ def _refuse(message: str, code: Code, sink: str | None) -> int:
 def _print(text: str) -> None:
     sys.stdout.write(text.rstrip("\n") + "\n")
     sys.stdout.flush()
-
-
-def _complain(text: str) -> None:
-    sys.stderr.write(f"openarm: {text}\n")
 
 
 def _version() -> str:

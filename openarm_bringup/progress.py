@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from openarm_bringup.outcome import console
 
 
 def progress() -> Progress:
     """Return bars with a count and the time that is left; a context manager."""
-    console = Console(stderr=True, highlight=False)
+    shown = console()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console, disable=not console.is_terminal)
+    return Progress(*columns, console=shown, disable=not shown.is_terminal)

@@ -23,14 +23,21 @@ class Config(BaseModel):
 ConfigT = TypeVar("ConfigT", bound=BaseModel)
 
 
-def load_yaml(path: Path, code: Code = Code.CONFIG_INVALID) -> dict[str, Any]:
+def load_yaml(
+    path: Path, code: Code = Code.CONFIG_INVALID, *, loader: type[yaml.SafeLoader] = yaml.SafeLoader
+) -> dict[str, Any]:
     """Read a YAML mapping.
+
+    Args:
+        path: File to read.
+        code: Of the error.
+        loader: Which YAML is accepted.
 
     Raises:
         OpenArmError: With `code`, when the file is missing, is not YAML, or is not a mapping.
     """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml.load(path.read_text(encoding="utf-8"), Loader=loader)
     except FileNotFoundError as error:
         raise OpenArmError(code, f"{path} does not exist") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:

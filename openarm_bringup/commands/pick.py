@@ -66,38 +66,24 @@ def pick(
     from openarm_grasp.ros.client import GraspClient
     from openarm_grasp.strategies.request import GraspRequest
 
-    wanted = [
-        GraspRequest(
-            name,
-            which or "auto",
-            where,
-            place_yaw=None if turn is None else math.radians(turn),
-            object_at=spot,
-        )
+    wanted: list[dict[str, Any]] = [
+        {
+            "label": name,
+            "arm": which or "auto",
+            "place": where,
+            "place_yaw": None if turn is None else math.radians(turn),
+            "object_at": spot,
+        }
         for name, which, where, turn, spot in zip(labels, arms, places, yaws, spots, strict=True)
     ]
-    show = _Steps(labels)
+    run: dict[str, Any] = {"dry_run": dry_run, "time_limit": time_limit, "timeout": timeout}
+    run["on_feedback"] = _Steps(labels)
     with requires_node("grasp", "sim"), GraspClient() as client:
         try:
             if second:
-                first, other = wanted
-                both = client.pick_two(
-                    first, other, dry_run=dry_run, time_limit=time_limit, timeout=timeout, on_feedback=show
-                )
-                return _of_two(both, dry_run=dry_run)
-            (one,) = wanted
-            result = client.pick(
-                one.label,
-                arm=one.arm,
-                object_at=one.object_at,
-                place=one.place,
-                place_yaw=one.place_yaw,
-                phase=phase,
-                dry_run=dry_run,
-                time_limit=time_limit,
-                timeout=timeout,
-                on_feedback=show,
-            )
+                first, other = (GraspRequest(**request) for request in wanted)
+                return _of_two(client.pick_two(first, other, **run), dry_run=dry_run)
+            result = client.pick(**wanted[0], phase=phase, **run)
         except KeyboardInterrupt:
             asked = {"labels": labels} if second else {"label": label}
             return Outcome(False, "cancelled by Ctrl-C; the robot holds where it is", Code.CANCELLED, asked)

@@ -102,7 +102,7 @@ def replay(
         clock: Publish /clock from the stamps of the bag, when it holds none.
         start: Begin this long after the first message, s; latched topics of before are published first.
         duration: End after this much of the bag, s; 0 plays all.
-        loop: Begin anew at the end, until Ctrl-C.
+        loop: Begin again at the end, until Ctrl-C.
         topics: Only these.
         remap: FROM:=TO of topic names; may be given several times.
         until_idle: At the end, wait until what the graph publishes has ceased for a second.

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from openarm_bringup.supervision.discovery import LAST_DOMAIN, Discovery
 from openarm_bringup.supervision.params import flatten, read_params, substitute
-from openarm_common.config import Config, ConfigT, validate
+from openarm_common.config import Config, ConfigT, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 
@@ -236,20 +236,17 @@ def _read(path: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
         raise OpenArmError(
             Code.CONFIG_INVALID, f"{path}:extends: {' → '.join(p.name for p in (*trail, path))} is a circle"
         )
-    try:
-        data: Any = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeys)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{path} is not a valid graph: {error}") from error
-    if not isinstance(data, dict):
-        raise OpenArmError(Code.CONFIG_INVALID, f"{path} holds no mapping of keys; a graph has at least name and nodes")
-    graph: dict[str, Any] = dict(data)  # pyright: ignore[reportUnknownArgumentType]
-    graph.setdefault("name", path.stem)
+    graph = {"name": path.stem, **load_yaml(path, loader=_UniqueKeys)}
     base_name, only = graph.pop("extends", None), graph.pop("only", None)
     if base_name is not None:
         sibling = path.parent / f"{base_name}.yaml"
         base = _read(sibling if sibling.is_file() else find_graph(str(base_name)), (*trail, path))
         if only is not None:
-            _keep(base, only, f"{path}:only")
+            unknown = [node for node in only if node not in base["nodes"]]
+            if unknown:
+                known = ", ".join(base["nodes"])
+                raise OpenArmError(Code.CONFIG_INVALID, f"{path}:only: unknown node {unknown[0]!r}; nodes are {known}")
+            base["nodes"] = {node: spec for node, spec in base["nodes"].items() if node in only}
         own = graph.pop("nodes", None) or {}
         for node, spec in own.items():
             base["nodes"][node] = {**base["nodes"].get(node, {}), **spec}
@@ -257,15 +254,6 @@ def _read(path: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
     elif only is not None:
         raise OpenArmError(Code.CONFIG_INVALID, f"{path}:only: needs `extends`")
     return graph
-
-
-def _keep(data: dict[str, Any], only: Sequence[str], where: str) -> None:
-    unknown = [node for node in only if node not in data["nodes"]]
-    if unknown:
-        raise OpenArmError(
-            Code.CONFIG_INVALID, f"{where}: unknown node {unknown[0]!r}; nodes are {', '.join(data['nodes'])}"
-        )
-    data["nodes"] = {node: spec for node, spec in data["nodes"].items() if node in only}
 
 
 def _check_needs(graph: Graph, where: str) -> None:

@@ -66,8 +66,8 @@ class Keeper:
     @property
     def pid(self) -> int | None:
         """Process id while it runs."""
-        running = self.process is not None and self.process.returncode is None
-        return self.process.pid if running and self.process else None
+        process = self.process
+        return process.pid if process and process.returncode is None else None
 
     @property
     def dispensable(self) -> bool:

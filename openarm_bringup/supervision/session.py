@@ -72,7 +72,7 @@ async def work_until_stopped(
     Raises:
         OpenArmError: Whatever the work raises; CANCELLED, at Ctrl-C; why a node was given up that the graph needs.
     """
-    job = in_thread(work, "work")
+    job = _in_thread(work)
     stopping = asyncio.create_task(supervisor.wait_stop_asked())
     try:
         await asyncio.wait([job, stopping], return_when=asyncio.FIRST_COMPLETED)
@@ -86,8 +86,8 @@ async def work_until_stopped(
         stopping.cancel()
 
 
-def in_thread(work: Callable[[], None], name: str) -> asyncio.Future[None]:
-    """Run in a daemon thread of that name: an abandoned wait inside it can't keep the process from ending."""
+def _in_thread(work: Callable[[], None]) -> asyncio.Future[None]:
+    """Run in a daemon thread: an abandoned wait inside it can't keep the process from ending."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[None] = loop.create_future()
 
@@ -104,5 +104,5 @@ def in_thread(work: Callable[[], None], name: str) -> asyncio.Future[None]:
         if not loop.is_closed():
             loop.call_soon_threadsafe(finish, error)
 
-    threading.Thread(target=run, name=name, daemon=True).start()
+    threading.Thread(target=run, name="work", daemon=True).start()
     return future

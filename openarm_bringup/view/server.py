@@ -105,6 +105,7 @@ class ViewServer:
     def app(self) -> web.Application:
         """The aiohttp application."""
         app = web.Application(client_max_size=_MAX_BYTES, middlewares=[self._check])
+        app.on_response_prepare.append(_add_headers)
         app.router.add_get("/", self._page)
         app.router.add_get("/socket", self._socket)
         app.router.add_post("/pick", self._pick)
@@ -125,24 +126,17 @@ class ViewServer:
     async def _check(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
-        host = request.headers.get("Host")
+        host, acts = request.headers.get("Host"), request.method not in ("GET", "HEAD")
         try:
             self.guard.check_host(host)
-            if request.path == "/socket" or request.method not in ("GET", "HEAD"):
+            if acts or request.path == "/socket":
                 self.guard.check_origin(request.headers.get("Origin"), host)
-            if request.path in ("/", "/socket") or request.method not in ("GET", "HEAD"):
+            if acts or request.path in ("/", "/socket"):
                 scheme, _, bearer = request.headers.get("Authorization", "").partition(" ")
                 self.guard.check_token(request.query.get("token") or (bearer if scheme == "Bearer" else None))
         except OpenArmError as error:
-            return web.json_response(_failed(error), status=403, headers=_HEADERS)
-        try:
-            response = await handler(request)
-        except web.HTTPException as error:
-            error.headers.update(_HEADERS)
-            raise
-        if not response.prepared:
-            response.headers.update(_HEADERS)
-        return response
+            return web.json_response(_failed(error), status=403)
+        return await handler(request)
 
     # --- layers
     async def _page(self, _: web.Request) -> web.FileResponse:
@@ -231,6 +225,10 @@ class ViewServer:
     async def _reset(self, request: web.Request) -> web.Response:
         order = await _body(request, Reset)
         return await _answer(lambda: self._view.reset(order))
+
+
+async def _add_headers(_: web.Request, response: web.StreamResponse) -> None:
+    response.headers.update(_HEADERS)
 
 
 async def _body(request: web.Request, model: type[Any]) -> Any:

@@ -11,6 +11,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -187,15 +188,19 @@ def _show_robot(description: RobotDescription) -> Show:
     return show
 
 
-def _show_image(camera: str) -> Show:
-    """The newest picture as JPEG."""
+def _newest(payload: Callable[[Any], str | bytes], key: str) -> Callable[[], Show]:
+    """How to show the newest message of one source alone."""
 
-    def show(images: list[Image]) -> Items:
-        if images:
-            head = {"kind": "image", "camera": camera}
-            yield f"image:{camera}", wire.frame(head, wire.jpeg(rgb_image(images[-1])))
+    def show(messages: list[Any]) -> Items:
+        if messages:
+            yield key, payload(messages[-1])
 
-    return show
+    return lambda: show
+
+
+def _image(camera: str, image: Image) -> bytes:
+    """A picture as JPEG."""
+    return wire.frame({"kind": "image", "camera": camera}, wire.jpeg(rgb_image(image)))
 
 
 def _show_cloud(description: RobotDescription, camera: CameraConfig) -> Show:
@@ -221,27 +226,22 @@ def _show_cloud(description: RobotDescription, camera: CameraConfig) -> Show:
     return show
 
 
-def _show_map(maps: list[Octomap]) -> Items:
-    """Occupied cells of the newest map."""
-    if maps:
-        leaves = decode(np.frombuffer(maps[-1].data, np.uint8), maps[-1].resolution, binary=maps[-1].binary)
-        cells = wire.occupied_cells(leaves)
-        yield "map", wire.frame({"kind": "map", "count": len(cells)}, cells)
+def _map(message: Octomap) -> bytes:
+    """Occupied cells of a map."""
+    leaves = decode(np.frombuffer(message.data, np.uint8), message.resolution, binary=message.binary)
+    cells = wire.occupied_cells(leaves)
+    return wire.frame({"kind": "map", "count": len(cells)}, cells)
 
 
-def _show_detections(messages: list[Detection3DArray]) -> Items:
+def _detections(message: Detection3DArray) -> str:
     """Objects as they are detected now."""
-    if messages:
-        boxes = [_detection_box(detection) for detection in messages[-1].detections if detection.results]
-        yield "detections", _text("detections", boxes=boxes)
+    return _text("detections", boxes=[_detection_box(item) for item in message.detections if item.results])
 
 
-def _show_plan(previews: list[MarkerArray]) -> Items:
-    """Paths of the tools on the newest plan."""
-    if previews:
-        lines = [marker for marker in previews[-1].markers if marker.type == Marker.LINE_STRIP]
-        paths = [np.round([xyz(p) for p in line.points], 4).tolist() for line in lines if line.points]
-        yield "plan", _text("plan", ways=paths)
+def _plan(preview: MarkerArray) -> str:
+    """Paths of the tools on a plan."""
+    lines = [marker for marker in preview.markers if marker.type == Marker.LINE_STRIP]
+    return _text("plan", ways=[np.round([xyz(p) for p in line.points], 4).tolist() for line in lines if line.points])
 
 
 def makers(
@@ -257,6 +257,7 @@ def makers(
     (eye,) = (camera for camera in cameras if camera.name == cloud)
     status = Source(GraspStatus, "/grasp/status", QoSProfile(depth=20, durability=QOS_LATCHED.durability))
     diagnostics = Source(DiagnosticArray, "/diagnostics", QoSProfile(depth=100))
+    detections = Source(Detection3DArray, "/detections_3d", silence=3.0)
     joints = Source(JointState, "/joint_states", silence=1.0)
     static = Source(TFMessage, "/tf_static", QOS_STATIC_TF)
     depth = Source(Image, f"/{cloud}/depth/image_raw", silence=3.0)
@@ -273,12 +274,16 @@ def makers(
             *(joints, Source(MarkerArray, "/motion/attached_objects", QOS_LATCHED)),
             period=0.04,
         ),
-        "detections": maker(lambda: _show_detections, Source(Detection3DArray, "/detections_3d", silence=3.0)),
-        "plan": maker(lambda: _show_plan, Source(MarkerArray, "/motion/preview", QOS_LATCHED)),
-        "map": maker(lambda: _show_map, Source(Octomap, "/octomap_binary", QOS_LATCHED, silence=5.0), period=0.5),
+        "detections": maker(_newest(_detections, "detections"), detections),
+        "plan": maker(_newest(_plan, "plan"), Source(MarkerArray, "/motion/preview", QOS_LATCHED)),
+        "map": maker(_newest(_map, "map"), Source(Octomap, "/octomap_binary", QOS_LATCHED, silence=5.0), period=0.5),
         "cloud": maker(lambda: _show_cloud(description, eye), *(static, depth, images[cloud], info), period=0.25),
     }
-    return fixed | {f"image:{name}": maker(lambda name=name: _show_image(name), images[name]) for name in images}
+    pictures = {
+        f"image:{name}": maker(_newest(partial(_image, name), f"image:{name}"), source)
+        for name, source in images.items()
+    }
+    return fixed | pictures
 
 
 def _text(kind: str, **values: Any) -> str:
