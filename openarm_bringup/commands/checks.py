@@ -20,7 +20,7 @@ from openarm_common.errors import Code, OpenArmError
 #: no worker idles while the other runs the last of them; graphs that need the machine for themselves follow anyway.
 LAST = ("graph", "nodes")
 
-#: All tests are shared out among so many processes, a file each; those marked `alone` have the machine for themselves.
+#: Number of processes that share the tests, file by file; tests marked `alone` run by themselves.
 WORKERS = 2
 #: What pytest can't do, or shows less of, when tests run in other processes.
 NEEDS_ONE_PROCESS = ("-s", "--capture=no", "--pdb", "--trace", "--collect-only", "--co", "no:xdist")

@@ -54,7 +54,7 @@ def echo(name: str, *, count: Count = 0, full: bool = False, timeout: float = 10
 
     Args:
         name: Of the topic.
-        count: End after so many; 0 goes on.
+        count: End after this many messages; 0: no limit.
         full: Print long arrays whole.
         timeout: Longest wait for the first message, s.
     """
@@ -218,8 +218,6 @@ def send(name: str, *goal: str, feedback: bool = False, timeout: float = 300.0, 
         feedback: Print the feedback.
         timeout: Longest wait for the result, s.
     """
-    from rclpy.action import ActionClient
-
     from openarm_bringup.messages import fields_of, fill, interface, to_data, to_yaml
 
     def on_feedback(message: Any) -> None:
@@ -229,8 +227,7 @@ def send(name: str, *goal: str, feedback: bool = False, timeout: float = 300.0, 
     with graph_peer(domain) as peer:
         found, kind = peer.find("action", name)
         filled = fill(interface(kind).Goal(), fields_of(goal, found, kind))
-        client: Any = ActionClient(peer.node, interface(kind), found)
-        peer.wait_for(client.server_is_ready, found)
+        client = peer.action_client(interface(kind), found)
         handle = peer.result(client.send_goal_async(filled, feedback_callback=on_feedback), 10.0, found)
         if not handle.accepted:
             return Outcome(False, f"{found} refused the goal", Code.INVALID_ARGUMENT, {"action": found})

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from rclpy.action import ActionClient
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile
@@ -106,6 +107,16 @@ class Peer(ContextNode):
     def offered(self, topic: str) -> QoSProfile:
         """The quality of service with which every publisher of a topic is received."""
         return offered_qos(self.node, topic, 100)
+
+    def action_client(self, kind: Any, name: str) -> Any:
+        """A client of an action whose server answers.
+
+        Raises:
+            OpenArmError: NOT_READY, when it does not.
+        """
+        client: Any = ActionClient(self.node, kind, name)
+        self.wait_for(client.server_is_ready, name)
+        return client
 
     def wait_for(self, server_is_ready: Callable[[], bool], name: str) -> None:
         """Wait for the server of a client.

@@ -60,7 +60,7 @@ def node_environment(graph: Graph, name: str, run_dir: Path, environ: Mapping[st
 def write_profile(spec: NodeSpec, path: Path) -> Path:
     """Write config/fastdds.xml with the segment size of one node, and return where.
 
-    No message may be larger than the segment: Fast DDS would leave shared memory aside for all of them.
+    No message may be larger than the segment: otherwise Fast DDS uses no shared memory for any of them.
     """
     file = config_dir() / "fastdds.xml"
     sized, largest = file.read_text(encoding="utf-8"), min(spec.segment_mib, _LARGEST_MIB)

@@ -20,7 +20,7 @@ SHM = Path("/dev/shm")
 #: MiB of /dev/shm that a participant takes in addition to its large segment, measured.
 _PLAIN_MIB = 0.65
 _LARGE_EXTRA_MIB = 2.2
-#: Segments grow up to so many times where a graph then still takes no more than this share of the free space.
+#: Largest factor by which segments grow, and the share of the free space that a graph may then take.
 _GROWTH, _SHARE = 4, 0.25
 
 _PORT = re.compile(r"fastrtps_port(\d+)")

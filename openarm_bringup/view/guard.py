@@ -66,7 +66,7 @@ class Guard:
         """
         if origin in self._origins or (host and origin in (f"http://{host}", f"https://{host}")):
             return
-        page = f"the page {origin!r}" if origin else "what says no origin"
+        page = f"the page {origin!r}" if origin else "a request without an origin"
         raise _refused(f"{page} may not ask; open the address that was printed")
 
     def check_token(self, token: str | None) -> None:

@@ -86,7 +86,7 @@ def thin_cloud(
         intrinsics: Of both.
         T_base_optical: Where the camera is.
         edge: One point is kept for each cell of this edge, m.
-        stride: Every so many-th pixel of a row and column is used.
+        stride: Step between the pixels that are used, along rows and columns.
 
     Raises:
         OpenArmError: BAD_IMAGE, when sizes differ or the depth has an unknown type.

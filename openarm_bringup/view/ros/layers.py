@@ -254,7 +254,7 @@ def makers(
         cameras: All that there are.
         cloud: Name of the camera whose cloud is shown.
     """
-    (eye,) = (camera for camera in cameras if camera.name == cloud)
+    (chosen,) = (camera for camera in cameras if camera.name == cloud)
     status = Source(GraspStatus, "/grasp/status", QoSProfile(depth=20, durability=QOS_LATCHED.durability))
     diagnostics = Source(DiagnosticArray, "/diagnostics", QoSProfile(depth=100))
     detections = Source(Detection3DArray, "/detections_3d", silence=3.0)
@@ -277,7 +277,7 @@ def makers(
         "detections": maker(_newest(_detections, "detections"), detections),
         "plan": maker(_newest(_plan, "plan"), Source(MarkerArray, "/motion/preview", QOS_LATCHED)),
         "map": maker(_newest(_map, "map"), Source(Octomap, "/octomap_binary", QOS_LATCHED, silence=5.0), period=0.5),
-        "cloud": maker(lambda: _show_cloud(description, eye), *(static, depth, images[cloud], info), period=0.25),
+        "cloud": maker(lambda: _show_cloud(description, chosen), *(static, depth, images[cloud], info), period=0.25),
     }
     pictures = {
         f"image:{name}": maker(_newest(partial(_image, name), f"image:{name}"), source)

@@ -86,7 +86,7 @@ class GraphView(ContextNode):
         return {name: getattr(result, name) for name in names}
 
     def cancel(self) -> tuple[bool, str]:
-        """Ask for the end of the grasp that runs, whoever has asked for it by the action.
+        """Cancel the grasp that runs, of whichever client of the action.
 
         Raises:
             OpenArmError: NOT_READY, when no grasp node answers.
