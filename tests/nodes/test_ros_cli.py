@@ -137,7 +137,7 @@ def test_without_nodes_every_command_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(peer_client, "_ANYBODY_S", 0.5)
+    monkeypatch.setattr(peer_client, "_FIRST_NODE_S", 0.5)
     domain = os.environ["ROS_DOMAIN_ID"]
     for command in (["topic", "list"], ["service", "call", "/grasp"], ["tf", "tree"], ["param", "dump", "grasp"]):
         assert cli.run([*command, "--json"]) == 1
