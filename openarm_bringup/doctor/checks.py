@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from openarm_bringup.supervision.discovery import LAST_DOMAIN
+
 Level = Literal["ok", "note", "error"]
 
 #: The one ROS distribution that the suite is built for, and the major version of its rclpy.
@@ -160,7 +162,7 @@ def check_rmw(environ: Mapping[str, str]) -> list[Finding]:
 
 def check_domain(text: str, first_ephemeral_port: int) -> Finding:
     """Check ROS_DOMAIN_ID: a number, and its ports below those that the system gives to other programs."""
-    if not text.isdecimal() or int(text) > 232:
+    if not text.isdecimal() or int(text) > LAST_DOMAIN:
         return error("domain", f"ROS_DOMAIN_ID={text!r}", "set a number from 0 to 101")
     last_port = 7400 + 250 * int(text) + PORTS
     if last_port >= first_ephemeral_port:

@@ -95,9 +95,8 @@ class FoxgloveNode(BaseNode[FoxgloveConfig]):
         self._time_ns: int | None = None
         self.create_timer(1.0, self._discover, clock=self.steady_clock)
         self.create_timer(0.05, self._follow_demand, clock=self.steady_clock)
-        known = TOKEN_VARIABLE in os.environ
-        shown = f"?token=${TOKEN_VARIABLE}" if known else f"?token={self.token}"
-        self.get_logger().info(f"ws://{LOOPBACK}:{self.port}/{shown}")
+        token = f"${TOKEN_VARIABLE}" if TOKEN_VARIABLE in os.environ else self.token
+        self.get_logger().info(f"ws://{LOOPBACK}:{self.port}/?token={token}")
 
     def close(self) -> None:
         """Close the websocket with all its clients, then the node."""
