@@ -236,7 +236,7 @@ def _read(path: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
         raise OpenArmError(
             Code.CONFIG_INVALID, f"{path}:extends: {' → '.join(p.name for p in (*trail, path))} is a circle"
         )
-    graph = {"name": path.stem, **load_yaml(path, loader=_UniqueKeys)}
+    graph: dict[str, Any] = {"name": path.stem, **load_yaml(path, loader=_UniqueKeys)}
     base_name, only = graph.pop("extends", None), graph.pop("only", None)
     if base_name is not None:
         sibling = path.parent / f"{base_name}.yaml"

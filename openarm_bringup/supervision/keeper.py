@@ -24,15 +24,19 @@ class Probe(Protocol):
 
     def known(self, conditions: Sequence[Ready]) -> frozenset[str]:
         """Return what fulfils the conditions before a start."""
+        ...
 
     def unmet(self, conditions: Sequence[Ready], old: frozenset[str]) -> tuple[str, ...]:
         """Return the conditions that do not hold yet."""
+        ...
 
     def parameters(self, node: str) -> frozenset[str]:
         """Return the names of a node's parameters."""
+        ...
 
     def close(self) -> None:
         """Leave the graph."""
+        ...
 
 
 class NodeState(StrEnum):

@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import psutil
 
@@ -111,7 +111,7 @@ class Supervisor:
         Raises:
             OpenArmError: what kept a node from it (with the end of its log); CANCELLED when asked to stop meanwhile.
         """
-        ready = asyncio.gather(*(keeper.ready.wait() for keeper in self._keepers.values()))
+        ready = asyncio.create_task(self._all_ready())
         try:
             await self.wait_stop_asked(ready)
             if not ready.done():
@@ -121,8 +121,8 @@ class Supervisor:
         self._record()
         return time.monotonic() - self._began
 
-    async def wait_stop_asked(self, *others: asyncio.Future[Any]) -> None:
-        """Wait for `ask_stop`, another future, or until a node was given up.
+    async def wait_stop_asked(self, *others: asyncio.Task[None]) -> None:
+        """Wait for `ask_stop`, the end of another task, or until a node was given up.
 
         Raises:
             OpenArmError: why a node was given up that the graph can't do without.
@@ -188,6 +188,10 @@ class Supervisor:
         if not goes_on and not self._trouble.done():
             self._trouble.set_exception(error)
             self._trouble.exception()  # marked as retrieved: it may not be awaited
+
+    async def _all_ready(self) -> None:
+        for keeper in self._keepers.values():
+            await keeper.ready.wait()
 
     async def ask(self, question: Callable[[Probe], T]) -> T:
         """Put a question to the probe, in its thread."""
