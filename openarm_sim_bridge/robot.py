@@ -83,4 +83,3 @@ class SimulatedRobot:
     def restart(self) -> None:
         """Forget goals and hold, because the world was reset or exchanged."""
         self.controller.reset(self.world.read_joints())
-        self.world.set_effort_limits(self.controller.effort_limits())

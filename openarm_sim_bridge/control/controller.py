@@ -136,9 +136,13 @@ class RobotController:
             )
         return self._targets
 
-    def effort_limits(self) -> dict[int, float]:
-        """Return the effort limits of the grippers by joint index, N."""
-        return {int(at[0]): f.effort_limit for f, at in self._followers if isinstance(f, GripperFollower)}
+    def effort_limits(self) -> Array:
+        """Return the effort limits (n,) of the joints, N; infinite but for those of the grippers."""
+        limits = np.full(len(self._names), np.inf)
+        for follower, at in self._followers:
+            if isinstance(follower, GripperFollower):
+                limits[at] = follower.effort_limit
+        return limits
 
     def _hold_where_commands_ceased(self) -> None:
         for follower, since_ns in list(self._commanded_ns.items()):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -70,10 +69,7 @@ class WorldFaults:
 
     def clear(self, name: str = "") -> None:
         """End one fault, or all."""
-        if name:
-            self._faults.pop(name, None)
-        else:
-            self._faults.clear()
+        self._faults = {key: fault for key, fault in self._faults.items() if name not in ("", key)}
         self._renew()
 
     def _renew(self) -> None:
@@ -118,12 +114,14 @@ class WorldFaults:
                     out[i] = self._stuck.setdefault(i, float(out[i]))
         return out
 
-    def effort_limits(self, limits: Mapping[int, float]) -> Mapping[int, float]:
-        """Return the effort limits by joint index that take effect."""
+    def effort_limits(self, limits: Array) -> Array:
+        """Return the effort limits (n,) that take effect; `limits` are infinite but for those of the grippers."""
         weak = self._of(GripperWeak)
         if weak is None:
             return limits
-        return {i: limit * (weak.share if weak.hits(_side(self._names[i])) else 1.0) for i, limit in limits.items()}
+        out = limits.copy()
+        out[[i for i, name in enumerate(self._names) if "finger" in name and weak.hits(_side(name))]] *= weak.share
+        return out
 
     def publishes_joints(self, t_ns: int) -> bool:
         """Whether the joint state of a tick is published."""
@@ -155,7 +153,7 @@ def nudge(world: World, parameters: ObjectNudged, seed: int) -> None:
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the objects there are; SCENE_INVALID, when it would overlap something.
     """
-    T_world_object = world.objects()[world.object_index(parameters.object)].T_world_object
+    T_world_object = world.object(parameters.object).T_world_object
     heading = np.random.default_rng(seed).uniform(-math.pi, math.pi)
     shift = 1e-3 * parameters.mm * np.array([math.cos(heading), math.sin(heading), 0.0])
     world.move_object(parameters.object, se3.make(None, shift) @ T_world_object)

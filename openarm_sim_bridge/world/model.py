@@ -25,6 +25,7 @@ from openarm_common.robot.description import SIDES, RobotDescription, Side
 from openarm_common.scene.scene import Scene
 from openarm_sim_bridge.world import scenery
 from openarm_sim_bridge.world.touch import add_wrist_sensor, hand_link
+from openarm_sim_bridge.world.world import compiled_model
 
 Positive = Annotated[float, Field(gt=0.0)]
 Seven = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive]
@@ -130,11 +131,7 @@ def compile_model(
     physics: PhysicsConfig | None = None,
 ) -> mujoco.MjModel:
     """Compose and compile the world; arguments and errors as `build_spec`."""
-    spec = build_spec(description, scene, cameras, mount_seed, physics)
-    try:
-        return spec.compile()
-    except ValueError as error:
-        raise OpenArmError(Code.CONFIG_INVALID, f"MuJoCo refuses the model: {error}") from error
+    return compiled_model(build_spec(description, scene, cameras, mount_seed, physics))
 
 
 def robot_spec(description: RobotDescription, physics: PhysicsConfig) -> mujoco.MjSpec:

@@ -12,8 +12,10 @@ address is looked up by name, never assumed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -48,9 +50,7 @@ class CompiledWorld:
     actuator: Index  # (n,) index in ctrl
     effort_limit: Array  # (n,) N m or N, infinite where there is none
     start_qpos: Array  # (nq,) home posture, objects at their start
-    objects: tuple[SceneObject, ...]
-    object_qpos: tuple[int, ...]
-    object_dof: tuple[int, ...]
+    objects: Mapping[str, SceneObject]  # by their names, which their free joints have too
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class World:
         joint_names: Actuated joints, in the order of every joint vector. Each needs one actuator.
         home: Start position of joints by name; others start at the model's reference position. Joints that an
             equality couples to another follow it.
-        objects: Free bodies to report, by their body names.
+        objects: Free bodies to report, by the names of their free joints.
         period_ns: Length of a control tick.
 
     Raises:
@@ -110,8 +110,8 @@ class World:
         self.period_ns = period_ns
         self.t_ns = 0
         self._home = dict(home)
-        self._effort_limits: dict[int, float] = {}
-        self.exchange(self.compile(spec, objects))
+        self._use(self.compile(spec, objects))
+        self.reset()
 
     # --- time
     @property
@@ -145,11 +145,11 @@ class World:
         """Set the position targets (n,) of all actuated joints; the actuators clamp them to their ranges."""
         self.data.ctrl[self._compiled.actuator] = targets
 
-    def set_effort_limits(self, limits: Mapping[int, float]) -> None:
-        """Limit the effort of actuators by joint index, N m or N; the limit of the model is never exceeded."""
-        if limits != self._effort_limits:
-            self._effort_limits = dict(limits)
-            self._apply_effort_limits()
+    def set_effort_limits(self, limits: Array) -> None:
+        """Limit the effort (n,) of the actuators, N m or N; the limit of the model is never exceeded."""
+        c = self._compiled
+        limits = np.minimum(limits, c.effort_limit)
+        self.model.actuator_forcerange[c.actuator] = np.stack([-limits, limits], axis=1)
 
     # --- readings
     def read_joints(self) -> JointReadout:
@@ -170,14 +170,19 @@ class World:
 
     def objects(self) -> tuple[ObjectReadout, ...]:
         """Return pose and twist of every tracked object: ground truth, for judges alone, not for controllers."""
-        c, d = self._compiled, self.data
-        out: list[ObjectReadout] = []
-        for tracked, q, v in zip(c.objects, c.object_qpos, c.object_dof, strict=True):
-            w, x, y, z = d.qpos[q + 3 : q + 7]
-            T = se3.make(se3.matrix_from_quat_xyzw((x, y, z, w)), d.qpos[q : q + 3])
-            # A free joint's linear velocity is in the world frame, its angular velocity in the body frame.
-            out.append(ObjectReadout(tracked, T, d.qvel[v : v + 3].copy(), T[:3, :3] @ d.qvel[v + 3 : v + 6]))
-        return tuple(out)
+        return tuple(self.object(name) for name in self._compiled.objects)
+
+    def object(self, name: str) -> ObjectReadout:
+        """Return pose and twist of a tracked object.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, naming the objects that exist.
+        """
+        state = self.data.joint(self._free_joint(name).id)
+        w, x, y, z = state.qpos[3:]
+        T = se3.make(se3.matrix_from_quat_xyzw((x, y, z, w)), state.qpos[:3])
+        # A free joint's linear velocity is in the world frame, its angular velocity in the body frame.
+        return ObjectReadout(self._compiled.objects[name], T, state.qvel[:3].copy(), T[:3, :3] @ state.qvel[3:])
 
     def wrist_wrench(self, body: str) -> tuple[Array, Array]:
         """Return the force and torque (3,) of the wrist sensor of a body, in its frame; as `touch.wrist_wrench`."""
@@ -203,20 +208,15 @@ class World:
             OpenArmError: INVALID_ARGUMENT, naming the objects that exist; SCENE_INVALID, when something would overlap
                 (checked where something starts elsewhere). The world is then as before.
         """
-        c, d = self._compiled, self.data
+        c = self._compiled
         start = start_qpos(self.model, self._home | dict(joints or {}))
         for name, T in (objects or {}).items():
-            self._set_free_pose(start, c.object_qpos[self.object_index(name)], T)
+            self._set_pose(start, name, T)
         ctrl = np.zeros(self.model.nu)
         ctrl[c.actuator] = start[c.qpos]
-        before = d.qpos.copy(), d.qvel.copy(), d.ctrl.copy()
-        self._place(start, np.zeros(self.model.nv), ctrl)
-        overlap = self._overlap(set(range(self.model.nbody))) if joints or objects else ""
-        if overlap:
-            self._place(*before)
-            raise OpenArmError(Code.SCENE_INVALID, overlap)
-        self._effort_limits.clear()
-        self._apply_effort_limits()
+        bodies = set(range(self.model.nbody)) if joints or objects else set[int]()
+        self._place_apart(start, np.zeros(self.model.nv), ctrl, bodies)
+        self.set_effort_limits(c.effort_limit)
 
     def compile(self, spec: mujoco.MjSpec, objects: Sequence[SceneObject]) -> CompiledWorld:
         """Compile a world for `exchange` or `extend`. Slow (tens of ms), changes nothing, may run in any thread.
@@ -224,24 +224,25 @@ class World:
         Args:
             spec: The model. Its automatic reset is switched off: a diverged simulation that silently restarts would be
                 a teleport; the world reports it instead.
-            objects: Free bodies to report, by their body names.
+            objects: Free bodies to report, by the names of their free joints.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when MuJoCo refuses the model, the tick is not a whole number of time steps,
-                or a joint, actuator or body is missing.
+                or a joint or actuator is missing.
         """
         spec.option.disableflags = int(spec.option.disableflags) | int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        try:
-            model = spec.compile()
-        except ValueError as error:
-            raise OpenArmError(Code.CONFIG_INVALID, f"MuJoCo refuses the model: {error}") from error
+        model = compiled_model(spec)
         try:
             joints = [model.joint(name).id for name in self.joint_names]
-            free = [_free_joint(model, item.name) for item in objects]
+            tracked = {model.joint(item.name).name: item for item in objects}
             start = start_qpos(model, self._home)
         except KeyError as error:  # MuJoCo's message lists the valid names
-            raise OpenArmError(Code.CONFIG_INVALID, f"the model lacks a joint or body: {error.args[0]}") from error
-        actuator = _actuators(model, self.joint_names, joints)
+            raise OpenArmError(Code.CONFIG_INVALID, f"the model lacks a joint: {error.args[0]}") from error
+        driven = model.actuator_trnid[:, 0].tolist()
+        idle = [name for name, joint in zip(self.joint_names, joints, strict=True) if joint not in driven]
+        if idle:
+            raise OpenArmError(Code.CONFIG_INVALID, f"the model has no actuator for the joints {', '.join(idle)}")
+        actuator = np.array([driven.index(joint) for joint in joints], dtype=np.intp)
         limited = model.actuator_forcelimited[actuator].astype(bool)
         return CompiledWorld(
             model=model,
@@ -251,9 +252,7 @@ class World:
             actuator=actuator,
             effort_limit=np.where(limited, model.actuator_forcerange[actuator, 1], np.inf),
             start_qpos=start,
-            objects=tuple(objects),
-            object_qpos=tuple(int(model.jnt_qposadr[j]) for j in free),
-            object_dof=tuple(int(model.jnt_dofadr[j]) for j in free),
+            objects=tracked,
         )
 
     def exchange(
@@ -263,14 +262,8 @@ class World:
         objects: Mapping[str, Array] | None = None,
     ) -> None:
         """Take another world, at its start; fast. Arguments and errors as `reset`."""
-        before = (self._compiled, self.model, self.data) if hasattr(self, "_compiled") else None
-        self._use(compiled)
-        try:
+        with self._exchanged(compiled):
             self.reset(joints, objects)
-        except OpenArmError:
-            if before is not None:
-                self._compiled, self.model, self.data = before
-            raise
 
     def extend(self, compiled: CompiledWorld) -> None:
         """Take a world that holds more or less, and keep the state of joints and targets that both have; fast.
@@ -279,26 +272,21 @@ class World:
             OpenArmError: SCENE_INVALID, when something new overlaps something that is there; the world is then as
                 before.
         """
-        before, old, old_model = self._compiled, self.data, self.model
-        self._use(compiled)
-        qpos, qvel, ctrl = compiled.start_qpos.copy(), np.zeros(self.model.nv), np.zeros(self.model.nu)
-        known: set[int] = set()
-        for joint in range(self.model.njnt):
-            old_joint = mujoco.mj_name2id(old_model, mujoco.mjtObj.mjOBJ_JOINT, self.model.joint(joint).name)
-            if old_joint < 0:
-                continue
-            known.add(int(self.model.jnt_bodyid[joint]))
-            q, v, state = self.model.jnt_qposadr[joint], self.model.jnt_dofadr[joint], old.joint(old_joint)
-            qpos[q : q + len(state.qpos)] = state.qpos
-            qvel[v : v + len(state.qvel)] = state.qvel
-        ctrl[compiled.actuator] = old.ctrl[before.actuator]
-        self._apply_effort_limits()
-        self._place(qpos, qvel, ctrl)
-        new = {body for body in range(self.model.nbody) if self.model.body_dofnum[body] == 6} - known
-        overlap = self._overlap(new)
-        if overlap:
-            self._compiled, self.model, self.data = before, old_model, old
-            raise OpenArmError(Code.SCENE_INVALID, overlap)
+        old, old_data = self._compiled, self.data
+        with self._exchanged(compiled):
+            model = self.model
+            qpos, qvel, ctrl = compiled.start_qpos.copy(), np.zeros(model.nv), np.zeros(model.nu)
+            new: set[int] = set()
+            for joint in map(model.joint, range(model.njnt)):
+                if mujoco.mj_name2id(old.model, mujoco.mjtObj.mjOBJ_JOINT, joint.name) < 0:
+                    new.add(int(joint.bodyid[0]))
+                    continue
+                q, v, state = joint.qposadr[0], joint.dofadr[0], old_data.joint(joint.name)
+                qpos[q : q + len(state.qpos)] = state.qpos
+                qvel[v : v + len(state.qvel)] = state.qvel
+            ctrl[compiled.actuator] = old_data.ctrl[old.actuator]
+            model.actuator_forcerange[compiled.actuator] = old.model.actuator_forcerange[old.actuator]
+            self._place_apart(qpos, qvel, ctrl, new)
 
     def move_object(self, name: str, T_world_object: Array) -> None:
         """Put a tracked object elsewhere, at rest, as a person would; everything else continues.
@@ -307,34 +295,24 @@ class World:
             OpenArmError: INVALID_ARGUMENT, naming the objects that exist; SCENE_INVALID, when something else is there
                 (the object then stays where it was).
         """
-        c, d = self._compiled, self.data
-        at = self.object_index(name)
-        q, v = c.object_qpos[at], c.object_dof[at]
-        before = d.qpos.copy(), d.qvel.copy(), d.ctrl.copy()
-        qpos, qvel, ctrl = (part.copy() for part in before)
-        self._set_free_pose(qpos, q, T_world_object)
+        qpos, qvel, ctrl = self._state()
+        self._set_pose(qpos, name, T_world_object)
+        joint = self._free_joint(name)
+        v = joint.dofadr[0]
         qvel[v : v + 6] = 0.0
-        self._place(qpos, qvel, ctrl)
-        overlap = self._overlap({int(self.model.dof_bodyid[v])})
-        if overlap:
-            self._place(*before)
-            raise OpenArmError(Code.SCENE_INVALID, overlap)
+        self._place_apart(qpos, qvel, ctrl, {int(joint.bodyid[0])})
 
-    def object_index(self, name: str) -> int:
-        """Return the place of a tracked object in `objects`.
-
-        Raises:
-            OpenArmError: INVALID_ARGUMENT, naming the objects that exist.
-        """
-        names = [item.name for item in self._compiled.objects]
+    def _free_joint(self, name: str) -> Any:
+        """Return MuJoCo's view of the free joint of a tracked object."""
+        names = self._compiled.objects
         if name not in names:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no object {name!r}; objects: {', '.join(names) or 'none'}")
-        return names.index(name)
+        return self.model.joint(name)
 
-    @staticmethod
-    def _set_free_pose(qpos: Array, address: int, T_world_object: Array) -> None:
-        qpos[address : address + 3] = T_world_object[:3, 3]
-        qpos[address + 3 : address + 7] = np.roll(se3.quat_xyzw_from_matrix(T_world_object[:3, :3]), 1)
+    def _set_pose(self, qpos: Array, name: str, T_world_object: Array) -> None:
+        q = self._free_joint(name).qposadr[0]
+        qpos[q : q + 3] = T_world_object[:3, 3]
+        qpos[q + 3 : q + 7] = np.roll(se3.quat_xyzw_from_matrix(T_world_object[:3, :3]), 1)
 
     def _overlap(self, of: set[int]) -> str:
         """Return a sentence about bodies that overlap others; empty when they only touch."""
@@ -351,6 +329,19 @@ class World:
                 )
         return ""
 
+    def _state(self) -> tuple[Array, Array, Array]:
+        """Return copies of `qpos`, `qvel` and `ctrl`."""
+        return self.data.qpos.copy(), self.data.qvel.copy(), self.data.ctrl.copy()
+
+    def _place_apart(self, qpos: Array, qvel: Array, ctrl: Array, bodies: set[int]) -> None:
+        """Write a whole state; where one of `bodies` would overlap another body, restore the present one and raise."""
+        before = self._state()
+        self._place(qpos, qvel, ctrl)
+        overlap = self._overlap(bodies)
+        if overlap:
+            self._place(*before)
+            raise OpenArmError(Code.SCENE_INVALID, overlap)
+
     def _place(self, qpos: Array, qvel: Array, ctrl: Array) -> None:
         """Write a whole state; the only place where `qpos` is written: a running world moves by forces alone."""
         mujoco.mj_resetData(self.model, self.data)
@@ -364,11 +355,28 @@ class World:
         self.model: mujoco.MjModel = compiled.model
         self.data = mujoco.MjData(compiled.model)
 
-    def _apply_effort_limits(self) -> None:
-        for joint, actuator in enumerate(self._compiled.actuator):
-            limit = min(self._effort_limits.get(joint, np.inf), float(self._compiled.effort_limit[joint]))
-            if np.isfinite(limit):
-                self.model.actuator_forcerange[actuator] = (-limit, limit)
+    @contextmanager
+    def _exchanged(self, compiled: CompiledWorld) -> Iterator[None]:
+        """Use another world, and go back to the present one when the block raises an OpenArmError."""
+        before = self._compiled, self.model, self.data
+        self._use(compiled)
+        try:
+            yield
+        except OpenArmError:
+            self._compiled, self.model, self.data = before
+            raise
+
+
+def compiled_model(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile a model.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, with MuJoCo's reason.
+    """
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise OpenArmError(Code.CONFIG_INVALID, f"MuJoCo refuses the model: {error}") from error
 
 
 def _timestep_ns(timestep: float, period_ns: int) -> int:
@@ -380,25 +388,6 @@ def _timestep_ns(timestep: float, period_ns: int) -> int:
             " choose a time step that divides it, for example 2 or 1 ms",
         )
     return timestep_ns
-
-
-def _actuators(model: mujoco.MjModel, names: Sequence[str], joints: Sequence[int]) -> Index:
-    by_joint = {
-        int(model.actuator_trnid[i, 0]): i
-        for i in range(model.nu)
-        if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
-    }
-    idle = [name for name, joint in zip(names, joints, strict=True) if joint not in by_joint]
-    if idle:
-        raise OpenArmError(Code.CONFIG_INVALID, f"the model has no actuator for the joints {', '.join(idle)}")
-    return np.array([by_joint[joint] for joint in joints], dtype=np.intp)
-
-
-def _free_joint(model: mujoco.MjModel, body_name: str) -> int:
-    joint = int(model.body(body_name).jntadr[0])
-    if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
-        raise OpenArmError(Code.CONFIG_INVALID, f"object {body_name!r} is not a body with a free joint in the model")
-    return joint
 
 
 def start_qpos(model: mujoco.MjModel, home: Mapping[str, float]) -> Array:

@@ -133,10 +133,10 @@ def test_effort_is_what_the_actuator_pushes() -> None:
     world.set_targets(np.array([-0.3, 0.8, 0.04]))
     world.step(1)
     assert world.read_joints().effort[2] == pytest.approx(30.0)  # 2000 N/m x 0.02 m, limited
-    world.set_effort_limits({2: 5.0})
+    world.set_effort_limits(np.array([np.inf, np.inf, 5.0]))
     world.step(1)
     assert abs(world.read_joints().effort[2]) == pytest.approx(5.0)
-    world.set_effort_limits({2: 500.0})
+    world.set_effort_limits(np.array([np.inf, np.inf, 500.0]))
     world.step(1)
     assert abs(world.read_joints().effort[2]) <= 30.0 + 1e-9  # never more than the model allows
 
@@ -272,11 +272,11 @@ def test_a_diverged_simulation_is_reported_and_a_reset_mends_it(
     [
         (
             {"joint_names": ("shoulder", "wrist")},
-            "lacks a joint or body: Invalid name 'wrist'. Valid names: .*ball",
+            "lacks a joint: Invalid name 'wrist'. Valid names: .*ball",
         ),
         ({"joint_names": ("mimic",)}, "no actuator for the joints mimic"),
-        ({"objects": (UPPER_OBJECT,)}, "'upper' is not a body with a free joint"),
-        ({"home": {"knee": 0.0}}, "lacks a joint or body: Invalid name 'knee'"),
+        ({"objects": (UPPER_OBJECT,)}, "lacks a joint: Invalid name 'upper'"),
+        ({"home": {"knee": 0.0}}, "lacks a joint: Invalid name 'knee'"),
     ],
 )
 def test_what_the_model_lacks_is_named(kwargs: dict, message: str) -> None:
