@@ -222,17 +222,13 @@ class Simulation:
     def _dump(self) -> str:
         """Write the last second to a file; return a sentence that names it."""
         path = self._dump_folder / f"openarm_diverged_{os.getpid()}_{self.world.t_ns}.npz"
-        states, targets = [state for state, _ in self._history], [target for _, target in self._history]
+        states, targets = zip(*self._history, strict=True)
+        columns: dict[str, Any] = {
+            key: np.array([getattr(state, key) for state in states])
+            for key in ("t_ns", "position", "velocity", "effort")
+        }
         try:
-            np.savez(
-                path,
-                joint_names=np.array(self.world.joint_names),
-                t_ns=np.array([state.t_ns for state in states]),
-                position=np.array([state.position for state in states]),
-                velocity=np.array([state.velocity for state in states]),
-                effort=np.array([state.effort for state in states]),
-                target=np.array(targets),
-            )
+            np.savez(path, joint_names=np.array(self.world.joint_names), target=np.array(targets), **columns)
         except OSError as error:
             return f"The last second could not be written to {path}: {error}."
         return f"The last second is in {path}."

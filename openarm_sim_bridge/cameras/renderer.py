@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -105,7 +104,7 @@ class SnapshotRenderer:
         if self._drawn is None or self._drawn.model is not snapshot.model:
             if self._drawn is not None:
                 self._drawn.context.free()
-            self._drawn = _Drawn.of(snapshot.model, self._cameras)
+            self._drawn = _Drawn(snapshot.model, self._cameras)
         drawn = self._drawn
         drawn.data.qpos[:] = snapshot.qpos
         mujoco.mj_kinematics(drawn.model, drawn.data)
@@ -168,50 +167,36 @@ def millimetres(z: Floats) -> NDArray[np.uint16]:
     return np.nan_to_num(z, copy=False, nan=0.0).astype(np.uint16)
 
 
-@dataclass(frozen=True)
 class _Drawn:
     """What belongs to one model: it is made again when the world is exchanged."""
 
-    model: mujoco.MjModel
-    data: mujoco.MjData
-    scene: mujoco.MjvScene
-    context: mujoco.MjrContext
-    cameras: dict[str, mujoco.MjvCamera]
-    rects: dict[str, mujoco.MjrRect]
-    near: float  # clipping planes, m
-    far: float
-
-    @classmethod
-    def of(cls, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> _Drawn:
-        views: dict[str, mujoco.MjvCamera] = {}
-        for name, camera in cameras.items():
-            identity = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name)
-            buffer = model.vis.global_
-            if identity < 0 or camera.width > buffer.offwidth or camera.height > buffer.offheight:
-                raise OpenArmError(
-                    Code.CONFIG_INVALID,
-                    f"camera {name!r} of {camera.width}×{camera.height} pixels: the model has"
-                    f" {', '.join(model.camera(i).name for i in range(model.ncam)) or 'no cameras'} and an off-screen"
-                    f" buffer of {buffer.offwidth}×{buffer.offheight}",
-                )
-            views[name] = mujoco.MjvCamera()
-            views[name].type = mujoco.mjtCamera.mjCAMERA_FIXED
-            views[name].fixedcamid = identity
-        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, context)
-        context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
-        scene = mujoco.MjvScene(model, _MAX_GEOMS)
+    def __init__(self, model: mujoco.MjModel, cameras: Mapping[str, CameraConfig]) -> None:
+        self.model = model
+        self.data = mujoco.MjData(model)
+        self.cameras = {name: _fixed_camera(model, name, camera) for name, camera in cameras.items()}
+        self.rects = {name: mujoco.MjrRect(0, 0, camera.width, camera.height) for name, camera in cameras.items()}
+        self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self.context)
+        self.context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        self.scene = mujoco.MjvScene(model, _MAX_GEOMS)
         # Shadows double the cost of software rendering, reflections too; neither says anything about depth.
-        scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
-        scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        extent = model.stat.extent
-        return cls(
-            model=model,
-            data=mujoco.MjData(model),
-            scene=scene,
-            context=context,
-            cameras=views,
-            rects={name: mujoco.MjrRect(0, 0, camera.width, camera.height) for name, camera in cameras.items()},
-            near=float(model.vis.map.znear * extent),
-            far=float(model.vis.map.zfar * extent),
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self.near = float(model.vis.map.znear * model.stat.extent)  # clipping planes, m
+        self.far = float(model.vis.map.zfar * model.stat.extent)
+
+
+def _fixed_camera(model: mujoco.MjModel, name: str, camera: CameraConfig) -> mujoco.MjvCamera:
+    identity = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name)
+    buffer = model.vis.global_
+    if identity < 0 or camera.width > buffer.offwidth or camera.height > buffer.offheight:
+        raise OpenArmError(
+            Code.CONFIG_INVALID,
+            f"camera {name!r} of {camera.width}×{camera.height} pixels: the model has"
+            f" {', '.join(model.camera(i).name for i in range(model.ncam)) or 'no cameras'} and an off-screen"
+            f" buffer of {buffer.offwidth}×{buffer.offheight}",
         )
+    view = mujoco.MjvCamera()
+    view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+    view.fixedcamid = identity
+    return view

@@ -147,10 +147,7 @@ def add_fixture(spec: mujoco.MjSpec, item: Fixture) -> None:
     Raises:
         OpenArmError: CONFIG_INVALID, when the link or the file does not exist, or the file is no MJCF of one body.
     """
-    parent = spec.body(item.link) if item.link else spec.worldbody
-    if parent is None:
-        names = ", ".join(body.name for body in spec.bodies)
-        raise OpenArmError(Code.CONFIG_INVALID, f"fixture {item.name!r}: no link {item.link!r}; links: {names}")
+    parent = _parent(spec, item.link or "world", f"fixture {item.name!r}")
     path = models_dir() / item.model
     if not path.is_file():
         raise OpenArmError(Code.CONFIG_INVALID, f"fixture {item.name!r}: there is no file {path}")
@@ -163,9 +160,7 @@ def add_fixture(spec: mujoco.MjSpec, item: Fixture) -> None:
     body = child.worldbody.first_body()
     if body is None:
         raise OpenArmError(Code.CONFIG_INVALID, f"fixture {item.name!r}: {path} has no body")
-    T_link_fixture = item.T_link_fixture
-    frame = parent.add_frame(pos=T_link_fixture[:3, 3], quat=_quat_wxyz(T_link_fixture))
-    frame.attach_body(body, f"{item.name}_", "")
+    parent.add_frame(**_pose(item.T_link_fixture)).attach_body(body, f"{item.name}_", "")
 
 
 def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig], mount_seed: int | None) -> None:
@@ -181,18 +176,11 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig], mount_seed
     """
     offscreen = spec.visual.global_
     for camera in cameras:
-        parent = spec.body(camera.parent) if camera.parent != "world" else spec.worldbody
-        if parent is None:
-            names = ", ".join(body.name for body in spec.bodies)
-            raise OpenArmError(
-                Code.CONFIG_INVALID, f"camera {camera.name!r}: no link {camera.parent!r} to mount it on; links: {names}"
-            )
+        parent = _parent(spec, camera.parent, f"camera {camera.name!r}")
         T_parent_link = true_mount(camera, mount_seed)
-        T_parent_camera = T_parent_link @ T_LINK_OPTICAL @ _T_OPTICAL_MUJOCO
         parent.add_camera(
             name=camera.name,
-            pos=T_parent_camera[:3, 3],
-            quat=_quat_wxyz(T_parent_camera),
+            **_pose(T_parent_link @ T_LINK_OPTICAL @ _T_OPTICAL_MUJOCO),
             fovy=camera.fovy_deg,
             resolution=(camera.width, camera.height),
         )
@@ -207,12 +195,10 @@ def _add_housing(
 ) -> None:
     """Add a box with its front face just behind the lens; it collides like a part of the link that carries it."""
     depth, width, height = housing
-    T_parent_housing = T_parent_link @ T_link_housing
     parent.add_geom(
         name=f"{name}_housing",
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=T_parent_housing[:3, 3],
-        quat=_quat_wxyz(T_parent_housing),
+        **_pose(T_parent_link @ T_link_housing),
         size=(depth / 2.0, width / 2.0, height / 2.0),
         rgba=_HOUSING_RGBA,
         mass=0.0,
@@ -222,8 +208,7 @@ def _add_housing(
     parent.add_geom(
         name=f"{name}_lens",
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        pos=T_parent_lens[:3, 3],
-        quat=_quat_wxyz(T_parent_lens),
+        **_pose(T_parent_lens),
         size=(min(width, height) * 0.35, 0.001, 0.0),
         rgba=_LENS_RGBA,
         mass=0.0,
@@ -233,5 +218,15 @@ def _add_housing(
     )
 
 
-def _quat_wxyz(T: se3.Array) -> se3.Array:
-    return np.roll(se3.quat_xyzw_from_matrix(T[:3, :3]), 1)
+def _parent(spec: mujoco.MjSpec, link: str, what: str) -> Any:
+    """Return the body of a link; `what` begins the error when there is none."""
+    body = spec.body(link)
+    if body is None:
+        names = ", ".join(body.name for body in spec.bodies)
+        raise OpenArmError(Code.CONFIG_INVALID, f"{what}: no link {link!r}; links: {names}")
+    return body
+
+
+def _pose(T: se3.Array) -> dict[str, se3.Array]:
+    """Return position and quaternion as MuJoCo's elements take them."""
+    return {"pos": T[:3, 3], "quat": np.roll(se3.quat_xyzw_from_matrix(T[:3, :3]), 1)}
