@@ -7,12 +7,10 @@ import copy
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CameraInfo, Image
@@ -26,39 +24,29 @@ from openarm_sim_bridge.cameras.renderer import Colour, Depth, SnapshotRenderer
 from openarm_sim_bridge.faults.faults import Fault
 
 _STREAMS = ("color", "depth")
+_KINDS = ("image_raw", "camera_info")
 
 
 def topic_names(camera: CameraConfig) -> tuple[str, ...]:
     """Return the topics of a camera before any remapping."""
-    kinds = ("image_raw", "camera_info")
-    return tuple(f"/{camera.name}/{stream}/{kind}" for stream in _STREAMS[: 1 + camera.depth] for kind in kinds)
+    return tuple(f"/{camera.name}/{stream}/{kind}" for stream in _STREAMS[: 1 + camera.depth] for kind in _KINDS)
 
 
-@dataclass
 class _Stream:
     """One image topic with its info; the pixels are written into the message."""
 
-    image: Publisher
-    info: Publisher
-    message: Image
-    info_message: CameraInfo
-    pixels: NDArray[np.generic]
-    wants_image: bool = False
-    wants_info: bool = False
-
-    @classmethod
-    def make(cls, node: Node, setup: CameraSetup, camera: CameraConfig, stream: str, encoding: str) -> _Stream:
+    def __init__(self, node: Node, setup: CameraSetup, camera: CameraConfig, stream: str, encoding: str) -> None:
         dtype, channels = ENCODINGS[encoding]
         shape = (camera.height, camera.width, channels) if channels > 1 else (camera.height, camera.width)
-        message = array_to_image(np.zeros(shape, dtype), encoding, camera.optical_frame, 0)
-        image, info = (setup.topics[f"/{camera.name}/{stream}/{kind}"] for kind in ("image_raw", "camera_info"))
-        return cls(
-            image=node.create_publisher(Image, image, QOS_SENSOR),
-            info=node.create_publisher(CameraInfo, info, QOS_SENSOR),
-            message=message,
-            info_message=info_from_intrinsics(camera.intrinsics, camera.optical_frame, 0),
-            pixels=image_to_array(message),
+        topics = (setup.topics[f"/{camera.name}/{stream}/{kind}"] for kind in _KINDS)
+        self.image, self.info = (
+            node.create_publisher(message, topic, QOS_SENSOR)
+            for message, topic in zip((Image, CameraInfo), topics, strict=True)
         )
+        self.message = array_to_image(np.zeros(shape, dtype), encoding, camera.optical_frame, 0)
+        self.info_message = info_from_intrinsics(camera.intrinsics, camera.optical_frame, 0)
+        self.pixels = image_to_array(self.message)
+        self.wants_image = self.wants_info = False
 
     def poll(self) -> bool:
         self.wants_image = self.image.get_subscription_count() > 0
@@ -96,9 +84,7 @@ class CameraPublisher:
         self._late: list[tuple[float, Publisher, Image | CameraInfo]] = []
         encodings = {"color": "rgb8", "depth": setup.depth_encoding}
         self._streams = {
-            camera.name: [
-                _Stream.make(node, setup, camera, kind, encodings[kind]) for kind in _STREAMS[: 1 + camera.depth]
-            ]
+            camera.name: [_Stream(node, setup, camera, kind, encodings[kind]) for kind in _STREAMS[: 1 + camera.depth]]
             for camera in setup.cameras
         }
 
@@ -150,10 +136,7 @@ class CameraPublisher:
     def publish_late(self) -> float:
         """Publish what was delayed until now; return in how many seconds the next is due."""
         now = time.monotonic()
-        waiting, self._late = self._late, []
-        for item in waiting:
-            if item[0] <= now:
-                item[1].publish(item[2])
-            else:
-                self._late.append(item)
+        for _, publisher, message in (item for item in self._late if item[0] <= now):
+            publisher.publish(message)
+        self._late = [item for item in self._late if item[0] > now]
         return min((due - now for due, _, _ in self._late), default=math.inf)

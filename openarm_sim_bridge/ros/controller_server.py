@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import BaseNode
 from openarm_sim_bridge.control.arm import End
 from openarm_sim_bridge.simulation import Simulation
@@ -62,33 +63,24 @@ class ControllerServer(ABC, Generic[OutcomeT]):
         self._simulation.call(self._cancel)
         return CancelResponse.ACCEPT
 
-    async def _follow(
-        self, handle: ServerGoalHandle, start: Callable[[Callable[[OutcomeT], None]], None]
-    ) -> OutcomeT | None:
+    async def _follow(self, handle: ServerGoalHandle, start: Callable[[Callable[[OutcomeT], None]], None]) -> OutcomeT:
         """Start a goal between two ticks and wait for its end.
 
         Args:
             handle: Of the goal.
             start: Starts it; is given the function that takes the outcome.
 
-        Returns:
-            The outcome; None when the simulation shuts down.
-
         Raises:
-            OpenArmError: What `start` raised.
+            OpenArmError: What `start` raised; CANCELLED, when the simulation shuts down.
         """
         ended: ThreadFuture[OutcomeT] = ThreadFuture()
-
-        def started(call: ThreadFuture[None]) -> None:
-            if call.cancelled():
-                ended.cancel()
-            elif (error := call.exception()) is not None:
-                ended.set_exception(error)
-
-        self._simulation.call(lambda: start(ended.set_result)).add_done_callback(started)
+        started = self._simulation.call(lambda: start(ended.set_result))
         if handle.is_cancel_requested:
             self._simulation.call(self._cancel)
-        outcome: OutcomeT | None = await self._node.awaitable(ended)
+        await self._node.awaitable(started)
+        if started.cancelled():
+            raise OpenArmError(Code.CANCELLED, "the simulation is shutting down")
+        outcome: OutcomeT = await self._node.awaitable(ended)
         return outcome
 
     def _end(self, handle: ServerGoalHandle, end: End, text: str) -> None:

@@ -64,10 +64,7 @@ class FaultServer:
         if name and name not in FAULTS:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no fault {name!r}; faults: {', '.join(FAULTS)}")
         was = [active for active in self.active if name in ("", active)]
-        if name:
-            self._of_cameras.pop(name, None)
-        else:
-            self._of_cameras.clear()
+        self._of_cameras = {key: fault for key, fault in self._of_cameras.items() if name not in ("", key)}
         self._set_camera_faults(tuple(self._of_cameras.values()))
         between_ticks(self._simulation, lambda: self._simulation.faults.clear(name))
         return f"cleared: {', '.join(was) or 'nothing'}"

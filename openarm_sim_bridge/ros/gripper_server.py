@@ -68,9 +68,6 @@ class GripperServer(ControllerServer[GripperOutcome]):
     async def _execute(self, handle: ServerGoalHandle) -> Any:
         goal = self._gripper.check(self._type.goal_of(handle.request, self._joint))
         outcome = await self._follow(handle, lambda done: self._start(goal, done))
-        if outcome is None:
-            handle.abort()
-            return self._type.action.Result()
         self._end(handle, outcome.end, outcome.text)
         return self._type.result_of(outcome, self._joint)
 

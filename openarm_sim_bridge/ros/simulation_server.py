@@ -175,15 +175,11 @@ def _pose_of(name: str, pose: PoseStamped, scene: Scene) -> Array:
     Raises:
         OpenArmError: INVALID_ARGUMENT, naming the objects that exist; as `_pose_in_world`.
     """
-    item = scene.object(name)
-    T, on_table = _pose_in_world(pose, scene.table.top_z)
-    if on_table:
-        T[2, 3] += 0.5 * item.size[2]
-    return T
+    return _pose_in_world(pose, scene.table.top_z, scene.object(name).size[2])
 
 
-def _pose_in_world(pose: PoseStamped, table_top_z: float) -> tuple[Array, bool]:
-    """Return T_world_object, and whether z = 0 on the table was given, where the object is put on its bottom.
+def _pose_in_world(pose: PoseStamped, table_top_z: float, height: float) -> Array:
+    """Return T_world_object of an object of some height; z = 0 on the table puts it on its bottom.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for a frame that is neither table nor world, or a tilted object.
@@ -196,10 +192,9 @@ def _pose_in_world(pose: PoseStamped, table_top_z: float) -> tuple[Array, bool]:
     T = pose_to_matrix(pose.pose)
     if T[2, 2] < 1.0 - _UPRIGHT:
         raise OpenArmError(Code.INVALID_ARGUMENT, "the pose is tilted, expected a turn about z only")
-    on_table = frame == "table" and T[2, 3] == 0.0
     if frame == "table":
-        T[2, 3] += table_top_z
-    return T, on_table
+        T[2, 3] = table_top_z + (T[2, 3] or 0.5 * height)
+    return T
 
 
 def _object_of(request: SpawnObject.Request, table_top_z: float) -> dict[str, Any]:
@@ -208,14 +203,13 @@ def _object_of(request: SpawnObject.Request, table_top_z: float) -> dict[str, An
     Raises:
         OpenArmError: INVALID_ARGUMENT, as `_pose_in_world`.
     """
-    T, on_table = _pose_in_world(request.pose, table_top_z)
-    x, y, z = (float(v) for v in T[:3, 3])
+    T = _pose_in_world(request.pose, table_top_z, request.size.z)
     return {
         "name": request.name,
         "shape": request.shape,
         "size": tuple(xyz(request.size).tolist()),
         "color": request.color,
         "mass": request.mass,
-        "position": (x, y) if on_table else (x, y, z),
+        "position": tuple(T[:3, 3].tolist()),
         "yaw": math.atan2(T[1, 0], T[0, 0]),
     }

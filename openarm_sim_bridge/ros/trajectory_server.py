@@ -8,7 +8,6 @@ result can carry the reason to the client: `error_code` INVALID_GOAL or INVALID_
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future as ThreadFuture
 from typing import Any
 
 from control_msgs.action import FollowJointTrajectory
@@ -19,6 +18,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from openarm_common.errors import OpenArmError
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
+from openarm_common.types import Array
 from openarm_sim_bridge.control.arm import End, FollowerState, TrajectoryFollower, TrajectoryOutcome
 from openarm_sim_bridge.control.trajectory import Trajectory, TrajectoryError, TrajectoryResult
 from openarm_sim_bridge.ros.controller_server import ControllerServer
@@ -56,23 +56,16 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         )
         self._states = node.create_publisher(JointTrajectoryControllerState, f"{controller}/controller_state", 10)
         node.create_timer(STATE_PERIOD_S, self._publish_state, clock=node.steady_clock)
-        node.create_subscription(JointTrajectory, f"{controller}/joint_trajectory", self._on_trajectory, QOS_COMMAND)
+        on_trajectory: Any = self._on_trajectory  # rclpy awaits coroutines; its type hints do not allow them
+        node.create_subscription(JointTrajectory, f"{controller}/joint_trajectory", on_trajectory, QOS_COMMAND)
 
-    def _on_trajectory(self, message: JointTrajectory) -> None:
+    async def _on_trajectory(self, message: JointTrajectory) -> None:
         """Follow a trajectory that comes as a message; a refusal goes to the log."""
         try:
             trajectory = self._arm.check(_trajectory_of(FollowJointTrajectory.Goal(trajectory=message)))
+            await self._node.awaitable(self._simulation.call(lambda: self._start(trajectory, self._on_end)))
         except OpenArmError as error:
-            self._log_refusal(error)
-            return
-        self._simulation.call(lambda: self._start(trajectory, self._on_end)).add_done_callback(self._on_started)
-
-    def _on_started(self, start: ThreadFuture[None]) -> None:
-        if not start.cancelled() and (error := start.exception()) is not None:
-            self._log_refusal(error)
-
-    def _log_refusal(self, error: BaseException) -> None:
-        self._node.get_logger().error(f"{self._label}: joint_trajectory refused: {error}")
+            self._node.get_logger().error(f"{self._label}: joint_trajectory refused: {error}")
 
     def _on_end(self, outcome: TrajectoryOutcome) -> None:
         if outcome.end is not End.SUCCEEDED:
@@ -90,8 +83,6 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         if self._running is handle:
             self._running = None
             self._feedback_timer.cancel()
-        if outcome is None:
-            outcome = TrajectoryOutcome(End.ABORTED, TrajectoryResult.INVALID_GOAL, "the simulation is shutting down")
         self._end(handle, outcome.end, outcome.text)
         return FollowJointTrajectory.Result(error_code=int(outcome.result), error_string=outcome.text)
 
@@ -134,12 +125,11 @@ def _trajectory_of(goal: FollowJointTrajectory.Goal) -> Trajectory:
 def _feedback(names: tuple[str, ...], state: FollowerState) -> FollowJointTrajectory.Feedback:
     feedback = FollowJointTrajectory.Feedback(joint_names=list(names))
     feedback.header.stamp = ns_to_stamp(state.t_ns)
-    feedback.desired = JointTrajectoryPoint(
-        positions=state.desired.tolist(), velocities=state.desired_velocity.tolist()
-    )
-    feedback.actual = JointTrajectoryPoint(positions=state.actual.tolist(), velocities=state.actual_velocity.tolist())
-    feedback.error = JointTrajectoryPoint(
-        positions=(state.desired - state.actual).tolist(),
-        velocities=(state.desired_velocity - state.actual_velocity).tolist(),
-    )
+    feedback.desired = _point(state.desired, state.desired_velocity)
+    feedback.actual = _point(state.actual, state.actual_velocity)
+    feedback.error = _point(state.desired - state.actual, state.desired_velocity - state.actual_velocity)
     return feedback
+
+
+def _point(position: Array, velocity: Array) -> JointTrajectoryPoint:
+    return JointTrajectoryPoint(positions=position.tolist(), velocities=velocity.tolist())
