@@ -161,15 +161,8 @@ class GraspClient(BackgroundNode):
             request.label, request.arm = asked.label, asked.arm
             _where(request, asked.place, asked.place_yaw, asked.object_at)
         answer: PickTwo.Result = self._ask(PickTwo, "/grasp/pick_two", goal, timeout, on_feedback)
-        return PairResult(
-            success=answer.success,
-            outcome=answer.outcome,
-            code=Code.OK if answer.success else code_from_text(answer.code, Code.INTERNAL),
-            message=answer.message,
-            simultaneous=answer.simultaneous,
-            results=tuple(_result(one) for one in answer.results),
-            duration=answer.duration,
-        )
+        results = tuple(_result(one) for one in answer.results)
+        return PairResult(**_same(answer, "simultaneous"), results=results)
 
     def cancel(self) -> None:
         """Ask what runs to stop; it returns with CANCELLED, the arms holding where they are."""
@@ -188,7 +181,7 @@ def _where(
     place_yaw: float | None,
     object_at: Sequence[float] | None,
 ) -> None:
-    """Fill in where an object stands and where it shall stand."""
+    """Fill in where an object stands and where it should be placed."""
     if place_yaw is not None:
         request.has_place_yaw, request.place_yaw = True, place_yaw
     if place is not None:
@@ -202,16 +195,13 @@ def _where(
 
 def _result(message: Pick.Result | PickResult) -> GraspResult:
     x, y, z = (float(v) for v in xyz(message.place_position))
-    return GraspResult(
-        success=message.success,
-        outcome=message.outcome,
-        code=Code.OK if message.success else code_from_text(message.code, Code.INTERNAL),
-        message=message.message,
-        label=message.label,
-        arm=message.arm,
-        attempts=message.attempts,
-        place_position=(x, y, z),
-        duration=message.duration,
-        route=message.route,
-        options=() if isinstance(message, PickResult) else tuple(map(option_from_msg, message.options)),
-    )
+    options = () if isinstance(message, PickResult) else tuple(map(option_from_msg, message.options))
+    same = _same(message, "label", "arm", "attempts", "route")
+    return GraspResult(**same, place_position=(x, y, z), options=options)
+
+
+def _same(message: Pick.Result | PickResult | PickTwo.Result, *names: str) -> dict[str, Any]:
+    """The code, and the fields that a result has by the same name as its message."""
+    code = Code.OK if message.success else code_from_text(message.code, Code.INTERNAL)
+    fields = ("success", "outcome", "message", "duration", *names)
+    return {"code": code} | {name: getattr(message, name) for name in fields}

@@ -39,7 +39,7 @@ _GONE = 60
 
 
 class GraphClients:
-    """Hears the robot and the detector, and sends goals.
+    """Subscribes to the robot and the detector, and sends goals.
 
     Args:
         node: The node that owns subscriptions, clients and the timer.
@@ -107,7 +107,7 @@ class GraphClients:
         return self.robot.age_s() < float("inf")
 
     def sees(self, topic: str) -> bool:
-        """Whether somebody publishes detections there."""
+        """Whether a node publishes detections there."""
         return self._node.count_publishers(self._node.resolve_topic_name(topic)) > 0
 
     # --- waiting
@@ -117,11 +117,11 @@ class GraphClients:
         done.set_result(None)
 
     async def tick(self) -> None:
-        """Sleep until the next look."""
+        """Sleep until the next check."""
         await self._next_tick
 
     def check(self) -> None:
-        """Raise when the grasp shall not go on.
+        """Raise when the grasp may not go on.
 
         Raises:
             OpenArmError: CANCELLED or ROBOT_LOST.
@@ -139,7 +139,7 @@ class GraphClients:
             done: The condition.
             limit: s of wall clock.
             what: What is waited for, for the error.
-            guard: Called at each look; may raise.
+            guard: Called at each check; may raise.
 
         Raises:
             OpenArmError: TIMEOUT, CANCELLED, ROBOT_LOST, or from `guard`.
@@ -223,7 +223,7 @@ class GraphClients:
         return Frames(tuple(self._frames[-count:]), self._frame_id)
 
     def _on_detections(self, message: Detection3DArray) -> None:
-        # What the camera took before this look began shows another state of the world.
+        # What the camera took before this observation began shows another state of the world.
         t_ns = stamp_to_ns(message.header.stamp)
         if t_ns < self._observing_since_ns:
             return

@@ -123,7 +123,7 @@ class GraphRobot:
         return self._nodes.pads.of(arm)
 
     def check(self) -> None:
-        """Raise when the grasp shall not go on."""
+        """Raise when the grasp may not go on."""
         self._nodes.check()
         check_deadline(self.now_ns, self.deadline_ns)
 
@@ -139,12 +139,12 @@ class GraphRobot:
         await self._nodes.until(done, limit, what, self._watched(guard))
 
     def _watched(self, guard: Callable[[], None] | None) -> Callable[[], None]:
-        def look() -> None:
+        def check() -> None:
             check_deadline(self.now_ns, self.deadline_ns)
             if guard is not None:
                 guard()
 
-        return look
+        return check
 
     async def together(self, parts: Sequence[Callable[[], Awaitable[None]]]) -> None:
         """Carry out several coroutines at once."""
@@ -173,7 +173,7 @@ class GraphRobot:
             return await self._nodes.observe(count, DETECTIONS, self._config.detect.frame_timeout)
         config = self._config.near
         if not self._nodes.sees(config.topic):
-            raise OpenArmError(Code.NOT_READY, f"nobody publishes {config.topic}")
+            raise OpenArmError(Code.NOT_READY, f"no node publishes {config.topic}")
         return await self._nodes.observe(count, config.topic, config.timeout)
 
     def stop_observing(self) -> None:

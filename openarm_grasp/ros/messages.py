@@ -14,7 +14,7 @@ from openarm_interfaces.action import MoveArm, Pick, PickTwo, PlanApproach
 from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspOption, GraspStatus, PickRequest, PickResult
 from openarm_interfaces.srv import ComputeIK, Grasp
 from sensor_msgs.msg import JointState
-from std_msgs.msg import ColorRGBA
+from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
@@ -65,22 +65,16 @@ def _request(message: Grasp.Request | Pick.Goal | PickRequest) -> GraspRequest:
 
 def fill_answer(answer: Grasp.Response | Pick.Result | PickResult, outcome: GraspOutcome) -> None:
     """Write an outcome into a service response, an action result, or one of its answers."""
-    answer.success = outcome.success
-    answer.outcome = outcome.kind
-    answer.code = outcome.code.value
-    answer.message = outcome.message
-    answer.label = outcome.label
-    answer.arm = outcome.arm
-    answer.attempts = outcome.attempts
+    for name in ("success", "message", "label", "arm", "attempts", "duration", "route"):
+        setattr(answer, name, getattr(outcome, name))
+    answer.outcome, answer.code = outcome.kind, outcome.code.value
     answer.place_position = point(outcome.place_position)
-    answer.duration = outcome.duration
-    answer.route = outcome.route
     if not isinstance(answer, PickResult):
         answer.options = [option_to_msg(option) for option in outcome.options]
 
 
 def option_to_msg(option: Option) -> GraspOption:
-    """How one grasp fared."""
+    """The result of one grasp that was weighed."""
     return GraspOption(
         id=option.id,
         arm=option.arm,
@@ -125,7 +119,8 @@ def pair_result(outcome: PairOutcome) -> PickTwo.Result:
 
 def status_msg(status: Status, t_ns: int) -> GraspStatus:
     """A state that was entered."""
-    message = GraspStatus(
+    return GraspStatus(
+        header=Header(stamp=ns_to_stamp(t_ns), frame_id=BASE_FRAME),
         state=status.state.value,
         previous_state=status.previous.value,
         reason=status.reason,
@@ -133,9 +128,6 @@ def status_msg(status: Status, t_ns: int) -> GraspStatus:
         label=status.label,
         arm=status.arm,
     )
-    message.header.stamp = ns_to_stamp(t_ns)
-    message.header.frame_id = BASE_FRAME
-    return message
 
 
 # --- pictures
@@ -155,8 +147,7 @@ def candidate_markers(
         bar.scale.x = 0.003
         markers += [arrow, bar]
     for marker in markers:
-        marker.header.frame_id = BASE_FRAME
-        marker.header.stamp = ns_to_stamp(t_ns)
+        marker.header = Header(stamp=ns_to_stamp(t_ns), frame_id=BASE_FRAME)
         marker.pose.orientation.w = 1.0
     return MarkerArray(markers=markers)
 
