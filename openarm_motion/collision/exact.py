@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -142,6 +142,10 @@ class LineChecks(ABC):
     @abstractmethod
     def collides(self, q: ArrayLike) -> bool:
         """Whether some pair is nearer than it may be at a configuration (n,)."""
+
+    @abstractmethod
+    def lenient(self, share: float, arms: float | None = None) -> AbstractContextManager[None]:
+        """Ask for only a share of each positive distance meanwhile, `arms` of that between the arms."""
 
     def edge_free(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.04) -> bool:
         """Whether the straight joint line between two configurations is free, the ends included.

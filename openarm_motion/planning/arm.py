@@ -127,7 +127,7 @@ class PlanningGroup(ABC):
         now: StartState,
         goals: Array,
         time_limit: float,
-        validate: Callable[[Any, Trajectory], object] = validate_trajectory,
+        validate: Callable[[Any, Trajectory], object] | None = None,
     ) -> ValidatedPlan:
         """Free path to one of several configurations, timed, and validated on the exact layer.
 
@@ -138,7 +138,7 @@ class PlanningGroup(ABC):
             now: Where it starts.
             goals: (k, n) rad.
             time_limit: s.
-            validate: Raises `PlanFailedError` for a trajectory in a scene.
+            validate: Raises `PlanFailedError` for a trajectory in a scene; None is `validate_trajectory`.
 
         Raises:
             OpenArmError: as `plan`; IN_COLLISION, when the finest search did not help.
@@ -149,7 +149,7 @@ class PlanningGroup(ABC):
             path = self.plan(scene, now, goals, max(end - time.monotonic(), 0.1), fineness)
             for trajectory in self.timings(path, now.scale):
                 try:
-                    validate(scene, trajectory)
+                    (validate or validate_trajectory)(scene, trajectory)
                     return ValidatedPlan(path, trajectory)
                 except PlanFailedError as error:
                     fault, contact = error.message, error.contact

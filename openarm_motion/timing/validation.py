@@ -18,8 +18,7 @@ from openarm_motion.planning.failure import PlanFailedError
 from openarm_motion.timing.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from openarm_motion.collision.exact import CollisionScene
-    from openarm_motion.planning.dual_arm import DualArmScene
+    from openarm_motion.collision.exact import LineChecks
 
 #: Share of the clearance that must be left between the checks of the search.
 _SHARE = 0.5
@@ -29,7 +28,7 @@ _ARMS = 0.9
 _TRAVEL = 0.004
 
 
-def validate_trajectory(scene: CollisionScene | DualArmScene, trajectory: Trajectory, travel: float = _TRAVEL) -> None:
+def validate_trajectory(scene: LineChecks, trajectory: Trajectory, travel: float = _TRAVEL) -> None:
     """Check a trajectory densely.
 
     Args:
