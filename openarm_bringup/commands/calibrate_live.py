@@ -103,14 +103,14 @@ def sample(*, remove: str | None = None, session: str = "", advice: bool = False
 
 
 def _running(options: CalibrationOptions, show: _Show) -> Outcome:
-    if len(options.cameras) > 1:
+    camera, *others = options.cameras
+    if others:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, "--running needs --camera NAME: the board has to be moved between the cameras"
         )
     join_graph(options.domain)
     from openarm_calibration.ros.client import CalibrationClient
 
-    camera = options.cameras[0]
     show.camera(camera)
     stop = threading.Event()
     with requires_node("calibration", "calibrate"), CalibrationClient() as client:

@@ -110,7 +110,6 @@ class Bench:
             mount_seed=seed,
         )
         self.samples = SampleSet(head, self._description)
-        self._optics = np.array(numbers[2:])
 
     def fill(self, rng: np.random.Generator, count: int = _SAMPLES) -> None:
         """Take `count` samples.
@@ -160,7 +159,7 @@ class Bench:
         else:
             T = se3.inverse(hand @ self._camera.T_parent_optical) @ self._T_carrier_board
         # a board farther from the fixed camera is below the table
-        return bool(T[2, 3] < 0.62) and visible(self._board, T, self._optics, (self._camera.width, self._camera.height))
+        return bool(T[2, 3] < 0.62) and visible(self._board, T, self._camera.intrinsics, 0.0)
 
     def _joints(self, q: Array) -> dict[str, float]:
         return {**self._home, **dict(zip(self.samples.joint_names, q.tolist(), strict=True))}

@@ -279,16 +279,13 @@ class CollisionScene(LineChecks):
         found = [self._contact(k) for k in self._colliding(q)]
         return sorted(found, key=lambda contact: contact.distance - contact.required)
 
-    def relax(
-        self, q: ArrayLike, allowance: float, estimates: float | None = None, passing: float = 0.0
-    ) -> Contact | None:
+    def relax(self, q: ArrayLike, allowance: float, estimates: float | None = None) -> Contact | None:
         """Let pairs that are too near at `q` stay as near as they are: an arm must be able to leave where it is.
 
         Args:
             q: (n,) where a motion starts.
             allowance: Overlap that is taken for an error of measurement, m.
             estimates: The same for pairs with boxes that are only estimated (all but `fixed`), m.
-            passing: What starts next to cells of the map may come nearer to them by this, but not touch them, m.
 
         Returns:
             A pair that overlaps deeper than that (nothing is relaxed then), or None.
@@ -305,22 +302,31 @@ class CollisionScene(LineChecks):
             # where the robot is there is nothing else: such cells are errors of the map
             cells = self._cells_at(q, [k for k in colliding if self._names[self._pair_index[k][1]] == MAP])
             self._build(replace(self._around, map=seen.minus(cells)))
-            return self.relax(q, allowance, estimates, passing)
+            return self.relax(q, allowance, estimates)
         for k, contact in zip(colliding, contacts, strict=True):
             self._required[k] = contact.distance - _LESS
-        for k, (_, j) in enumerate(self._pair_index):
-            if passing and self._names[j] == MAP:
-                self._required[k] = min(self._required[k], max(self._contact(k).distance - passing, 0.0))
-        if colliding or passing:
+        if colliding:
             self._set_margins()
         return None
 
-    @contextmanager
-    def lenient(self, share: float, arms: float | None = None) -> Iterator[None]:
+    def passing(self, q: ArrayLike, nearer: float) -> AbstractContextManager[None]:
+        """Let what is next to cells of the map at `q` come nearer to them by `nearer` meanwhile, without contact, m."""
+        self._colliding(q)
+        asked = self._required.copy()
+        for k, (_, j) in enumerate(self._pair_index):
+            if self._names[j] == MAP:
+                asked[k] = min(asked[k], max(self._contact(k).distance - nearer, 0.0))
+        return self._asking(asked)
+
+    def lenient(self, share: float, arms: float | None = None) -> AbstractContextManager[None]:
         """Ask for only a share of each positive distance meanwhile, `arms` of that to the other arm."""
-        asked = self._required
         shares = np.where(self._arms, share if arms is None else arms, share)
-        self._required = np.where(asked > 0.0, shares * asked, asked)
+        return self._asking(np.where(self._required > 0.0, shares * self._required, self._required))
+
+    @contextmanager
+    def _asking(self, required: Array) -> Iterator[None]:
+        asked = self._required
+        self._required = required
         self._set_margins()
         try:
             yield

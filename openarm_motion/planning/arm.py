@@ -311,19 +311,18 @@ class Arm(PlanningGroup):
         """The state with the arm's finger joints at another position, m."""
         return {**state, **dict.fromkeys(self.robot.arm.gripper_joints, position)}
 
-    def relax(self, scene: CollisionScene, start: Array, passing: float = 0.0) -> None:
+    def relax(self, scene: CollisionScene, start: Array) -> None:
         """Let the arm leave its start: where it overlaps an estimated box, the box is wrong, not the arm.
 
         Args:
             scene: Where it starts.
             start: (n,) rad.
-            passing: See `CollisionScene.relax`.
 
         Raises:
             OpenArmError: IN_COLLISION, when it is stuck deeper than an error of measurement explains.
         """
         planning = self.config.planning
-        contact = scene.relax(start, planning.start_overlap, planning.estimate_overlap, passing)
+        contact = scene.relax(start, planning.start_overlap, planning.estimate_overlap)
         if contact is not None:
             text = f"the {self.name} arm starts in collision: {contact}; free it by hand or correct the obstacle"
             raise PlanFailedError(Code.IN_COLLISION, text, "start", contact)

@@ -24,7 +24,8 @@ _ROUNDING = 1e-3
 _GOALS = 24
 #: How far the elbow may swivel along a line when it can't keep its angle, rad; the smallest that works is taken.
 _DRIFTS = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5, 0.8, -0.8)
-#: A hand that leaves an object moves along the cells of its map, whose steps come nearer than the start by this, m.
+#: A hand that leaves an object moves along the cells of its map, whose steps come nearer than the start by this, m;
+#: the end of the line keeps what is asked, so that no series of lines comes nearer and nearer.
 _PASSING = 0.003
 
 
@@ -88,7 +89,7 @@ def to_pose_on_line(arm: Arm, now: StartState, pose: Array, around: RequestBoxes
     # a start nearer to a limit than the margin may go on as near
     margin = max(0.0, min(arm.config.planning.joint_margin, arm.kinematics.margin(now.start)))
     scene = arm.scene(now.state, around.obstacles, around.attached, straight=True, environment=now.environment)
-    arm.relax(scene, now.start, _PASSING)
+    arm.relax(scene, now.start)
     faults: list[PlanFailedError] = []
     for drift in _DRIFTS if not np.isnan(start.swivel) else (0.0,):
         try:
@@ -96,16 +97,18 @@ def to_pose_on_line(arm: Arm, now: StartState, pose: Array, around: RequestBoxes
         except OpenArmError as error:
             faults.append(PlanFailedError(error.code, error.message, "line"))
             continue
-        contact = line_contact(scene, line)
-        if contact is not None:
-            faults.append(PlanFailedError(Code.IN_COLLISION, f"on the straight line {contact}", "line", contact))
-            continue
-        trajectory = arm.time_line(line, now.scale)
-        try:
-            validate_trajectory(scene, trajectory)
-        except PlanFailedError as error:
-            faults.append(error)
-            continue
+        contact = next(iter(scene.contacts(line.q[-1])), None)
+        with scene.passing(now.start, _PASSING):
+            contact = contact or line_contact(scene, line)
+            if contact is not None:
+                faults.append(PlanFailedError(Code.IN_COLLISION, f"on the straight line {contact}", "line", contact))
+                continue
+            trajectory = arm.time_line(line, now.scale)
+            try:
+                validate_trajectory(scene, trajectory)
+            except PlanFailedError as error:
+                faults.append(error)
+                continue
         return trajectory
     worst = next((fault for fault in faults if fault.code == Code.IN_COLLISION), faults[0])
     raise PlanFailedError(worst.code, f"{arm.name} arm: {worst.message}", "line", worst.contact)

@@ -180,13 +180,16 @@ class ArmCoordination:
         for head in _HEAD_STARTS:
             now_ns, state = latest()
             begin_ns, stops = now_ns + round(head * 1e9), dict(self.stops)
-            if not self.under_way(arm) and max_delay == 0.0:
+            at_rest = not self.under_way(arm)
+            if at_rest and max_delay == 0.0:
                 check_against_others(arm, motion, state)
                 return 0, 0.0
             opened = self._hands_open(state)
             others = self._others(arm, begin_ns, opened)
             search = lambda o=others, s=opened: least_delay(mine, o, s, max_delay, cancelled)  # noqa: E731
             delay = await self._robot.compute(search, _NOMINAL)
+            if at_rest and delay == 0.0:
+                return 0, 0.0  # no other arm starts meanwhile
             begin_ns += round(delay * 1e9)
             if stops == self.stops and latest()[0] + round(_SEND * 1e9) <= begin_ns:
                 return begin_ns, delay

@@ -19,6 +19,7 @@ from sensor_msgs.msg import JointState
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import BaseNode
+from openarm_sim_bridge.control.arm import End
 from openarm_sim_bridge.control.gripper import GripperFollower, GripperGoal, GripperOutcome
 from openarm_sim_bridge.ros.controller_server import ControllerServer
 from openarm_sim_bridge.simulation import Simulation
@@ -67,7 +68,11 @@ class GripperServer(ControllerServer[GripperOutcome]):
 
     async def _execute(self, handle: ServerGoalHandle) -> Any:
         goal = self._gripper.check(self._type.goal_of(handle.request, self._joint))
-        outcome = await self._follow(handle, lambda done: self._start(goal, done))
+        try:
+            outcome = await self._follow(handle, lambda done: self._start(goal, done))
+        except OpenArmError as error:
+            self._end(handle, End.ABORTED, f"{error.code}: {error.message}")
+            return self._type.action.Result()
         self._end(handle, outcome.end, outcome.text)
         return self._type.result_of(outcome, self._joint)
 

@@ -122,6 +122,9 @@ def test_a_hand_may_back_off_along_cells_next_to_it_but_not_into_them(right: Arm
     assert 0.001 < contact.distance < 0.003
     now = right.start_state(opened, q, environment=known)
     assert moves.to_pose_on_line(right, now, back, moves.RequestBoxes()).duration > 0.1
+    nearest = max(line.q, key=lambda at: -min((c.distance for c in scene.contacts(at)), default=1.0))
+    with pytest.raises(OpenArmError, match="of the map"):
+        moves.to_pose_on_line(right, now, right.kinematics.fk(nearest), moves.RequestBoxes())
     into[0, 3] -= 0.02
     with pytest.raises(OpenArmError, match="finger would hit the map"):
         moves.to_pose_on_line(right, now, into, moves.RequestBoxes())
