@@ -16,12 +16,12 @@ from cyclopts import Parameter
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
-#: Tests that start processes come last: a fault in a core shows in seconds. Long files come before short ones, so that
-#: no worker idles while the other runs the last of them; graphs that need the machine for themselves follow anyway.
-LAST = ("graph", "nodes")
+#: Folders of tests that mostly wait, for messages and processes: they run while those of the others compute.
+WAITING = ("graph", "nodes")
 
-#: Number of processes that share the tests, file by file; tests marked `alone` run by themselves.
-WORKERS = 2
+#: Number of processes that share the tests, file by file, and of processors that they keep busy; tests marked `alone`
+#: run by themselves.
+WORKERS, PROCESSORS = 3, 2
 #: What pytest can't do, or shows less of, when tests run in other processes.
 NEEDS_ONE_PROCESS = ("-s", "--capture=no", "--pdb", "--trace", "--collect-only", "--co", "no:xdist")
 
@@ -29,10 +29,10 @@ Rest = Annotated[str, Parameter(allow_leading_hyphen=True)]
 
 
 def test(*args: Rest) -> Outcome:
-    """Run the tests: the cores first, then nodes, then whole graphs.
+    """Run the tests of cores, nodes and whole graphs.
 
     Args:
-        args: Passed to pytest; without a path, all tests run, in two processes (-n 0: in one).
+        args: Passed to pytest; without a path, all tests run, in three processes (-n 0: in one).
     """
     root = _checkout()
     given_paths = [arg for arg in args if not arg.startswith("-") and (root / arg.partition("::")[0]).exists()]
@@ -92,19 +92,16 @@ def completion(shell: Literal["bash", "zsh", "fish"] = "bash", *, install: bool 
 
 
 def _in_order(tests: Path) -> list[str]:
-    """Return what is in tests/, files and quick folders first."""
-    entries = [path for path in tests.iterdir() if path.is_dir() or path.name.startswith("test_")]
-    entries = [path for path in entries if path.is_file() or any(path.rglob("test_*.py"))]
-
-    def rank(path: Path) -> tuple[int, str]:
-        return (1 + LAST.index(path.name) if path.name in LAST else 0, path.name)
-
-    return [str(path.relative_to(tests.parent)) for path in sorted(entries, key=rank)]
+    """Return the test files: those that wait evenly among those that compute, of each kind the largest first."""
+    files = sorted(tests.rglob("test_*.py"), key=lambda path: (-path.stat().st_size, path))
+    kinds = [path.relative_to(tests).parts[0] in WAITING for path in files]
+    ranks = [kinds[:k].count(kind) / kinds.count(kind) for k, kind in enumerate(kinds)]
+    return [str(path.relative_to(tests.parent)) for _, path in sorted(zip(ranks, files, strict=True))]
 
 
 def _shared_out() -> list[str]:
     """Return options that run tests in several processes, where there are processors for them."""
-    if len(os.sched_getaffinity(0)) < WORKERS:
+    if len(os.sched_getaffinity(0)) < PROCESSORS:
         return []
     return ["-n", str(WORKERS), "--dist", "loadfile", "--no-loadscope-reorder"]
 
