@@ -164,6 +164,18 @@ def test_the_workflow_runs_lint_and_the_tests_of_ci_without_gpu_or_display() -> 
     assert os.access(ROOT / ".ci" / "run", os.X_OK)
 
 
+@pytest.mark.requirement("R-32")
+def test_ci_runs_the_tests_once_and_repeats_nothing() -> None:
+    lines = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
+    commands = [line for line in lines if line and not line.startswith("#")]
+    assert commands == ["set -eu", 'exec "$(dirname -- "$0")/../openarm" test "$@"']
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert not [
+        name for name in project["project"]["optional-dependencies"]["test"] if "rerun" in name or "flaky" in name
+    ]
+    assert "reruns" not in project["tool"]["pytest"]["ini_options"]["addopts"]
+
+
 def test_pre_commit_hooks_use_the_tools_of_the_environment() -> None:
     (local,) = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"]
     assert local["repo"] == "local"
