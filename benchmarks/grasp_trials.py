@@ -177,7 +177,7 @@ class Trial:
         self.body = self.model.body(item.name).id
         self.shape = self.model.geom(item.name).id
         prefix = f"openarm_{side}_"
-        self.pads = {self.model.geom(f"{prefix}{f}_finger_pad_collision").id for f in ("left", "right")}
+        self.pads = [self.model.geom(f"{prefix}{f}_finger_pad_collision").id for f in ("left", "right")]
         self.home = description.group_state("both_arms", "home")
         self.penetration = self.speed = 0.0
         self.grasp = self._choose(item, error)
@@ -220,10 +220,9 @@ class Trial:
         for i in range(ticks):
             command((i + 1) / ticks)
             mujoco.mj_step(self.model, self.data, self.steps)
-            for contact in self.data.contact:
-                pair = {int(contact.geom1), int(contact.geom2)}
-                if self.shape in pair and pair & self.pads:
-                    self.penetration = max(self.penetration, -contact.dist)
+            contact = self.data.contact
+            held = (contact.geom == self.shape).any(axis=1) & np.isin(contact.geom, self.pads).any(axis=1)
+            self.penetration = max(self.penetration, -contact.dist[held].min(initial=0.0))
             address = self.model.jnt_dofadr[self.model.body_jntadr[self.body]]
             self.speed = max(self.speed, float(np.linalg.norm(self.data.qvel[address : address + 3])))
 

@@ -56,7 +56,9 @@ def versions() -> dict[str, str]:
 def write_report(rows: list[Row], path: Path | None) -> None:
     """Print the metrics, and write them as JSON where a path is given."""
     for row in rows:
-        peer = f"  ({row.peer}: {row.peer_value:.4g})" if row.peer_value is not None else ""
+        ratio = row.as_json()["ratio"]
+        times = f", ratio {ratio:.3g}" if ratio is not None else ""
+        peer = f"  ({row.peer}: {row.peer_value:.4g}{times})" if row.peer_value is not None else ""
         target = f"  target {row.target:g}" if row.target is not None else ""
         print(f"{row.metric:32s} {row.value:10.4g} {row.unit:4s}{target}{peer}  n={row.n}")
     if path is not None:

@@ -7,17 +7,24 @@ code. Modules of commands import heavy libraries inside their functions, so that
 
 from __future__ import annotations
 
+import ast
 import json
 import os
+import shutil
 import sys
+import textwrap
+import threading
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import cyclopts
-from cyclopts import App, Group, Parameter
-
+from openarm_bringup.daemon.client import ask
 from openarm_bringup.outcome import FOR_PEOPLE, Outcome, failure
 from openarm_common.errors import Code, OpenArmError
+
+if TYPE_CHECKING:
+    from cyclopts import App
 
 #: Commands of the package that evaluates. It imports this one, which therefore knows it by name only.
 EVALUATION = "openarm_evaluation.commands"
@@ -31,7 +38,7 @@ Exit code 0: what was asked happened. 1: it did not; a code and a sentence say w
 
 #: Commands by group of the help: a module and its function or App. They are imported when they are needed.
 COMMANDS = {
-    "Run": (f"{EVALUATION}.demo:demo", "up:up", "view:view", "calibrate:calibrate"),
+    "Run": (f"{EVALUATION}.demo:demo", "up:up", "view:view", "stop:stop", "calibrate:calibrate"),
     "Grasp": ("pick:pick", "pick:order", f"{EVALUATION}.campaign:campaign"),
     "Inspect": ("processes:ps", "processes:logs", "doctor:doctor", "tf:tf"),
     "Messages": ("ros2:topic", "ros2:service", "ros2:action", "ros2:node", "ros2:param"),
@@ -41,8 +48,14 @@ COMMANDS = {
 }
 
 
+#: Held while a call is read: the groups of commands are shared by all requests to a daemon.
+_READING = threading.Lock()
+
+
 def build_app() -> App:
     """Return the application with all its commands."""
+    from cyclopts import App, Group, Parameter
+
     app = App(
         name="openarm",
         help=HELP,
@@ -54,11 +67,15 @@ def build_app() -> App:
     for number, (title, commands) in enumerate(COMMANDS.items()):
         group = Group(title, sort_key=number)
         for command in commands:
-            app.command(command if "." in command else f"openarm_bringup.commands.{command}", group=group)
+            app.command(_path(command), group=group)
     options = Group("Options", sort_key=len(COMMANDS))
     for flag in ("--help", "--version"):
         app[flag].group = options
     return app
+
+
+def _path(command: str) -> str:
+    return command if "." in command else f"openarm_bringup.commands.{command}"
 
 
 def run(argv: Sequence[str]) -> int:
@@ -72,13 +89,16 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _run(tokens: Sequence[str], sink: str | None) -> int:
-    app = build_app()
     if not tokens or tokens[0] in ("--help", "-h"):
-        for name in list(app):
-            _ = app[name]  # imported, so that its summary is listed
+        _print(_help())
+        return 0
+    from cyclopts import CycloptsError
+
     try:
-        result = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
-    except cyclopts.CycloptsError as error:
+        with _READING:
+            command, bound, _ = build_app().parse_args(tokens, exit_on_error=False, print_error=False)
+        result = command(*bound.args, **bound.kwargs)
+    except CycloptsError as error:
         return _refuse(str(error), Code.INVALID_ARGUMENT, sink)
     except OpenArmError as error:
         if error.code == Code.INVALID_ARGUMENT:
@@ -90,6 +110,32 @@ def _run(tokens: Sequence[str], sink: str | None) -> int:
         return 0
     _show(result, sink)
     return result.exit_code
+
+
+def _help() -> str:
+    """Return the list of all commands, by what their files say: to import them would take longer than to read it."""
+    lines = ["Usage: openarm COMMAND", "", HELP, ""]
+    width = min(shutil.get_terminal_size().columns, 120)
+    for title, commands in COMMANDS.items():
+        lines.append(f"{title}:")
+        for name, summary in sorted(map(_summary, commands)):
+            lines += textwrap.wrap(f"  {name:<11}{summary}", width, subsequent_indent=" " * 13)
+        lines.append("")
+    lines.append("`openarm COMMAND --help` says more; `openarm --version` prints the version.")
+    return "\n".join([*lines, *textwrap.wrap(EPILOGUE, width)])
+
+
+def _summary(command: str) -> tuple[str, str]:
+    """Return the name of a command, and the first sentence of its docstring, or the help of a group."""
+    module, _, target = _path(command).partition(":")
+    spec = find_spec(module)
+    for node in ast.parse(Path(str(spec and spec.origin)).read_bytes()).body:
+        if isinstance(node, ast.FunctionDef) and node.name == target:
+            return target, " ".join((ast.get_docstring(node) or "").partition("\n\n")[0].split())
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Call) and ast.unparse(node.targets[0]) == target:
+            words = {word.arg: ast.literal_eval(word.value) for word in node.value.keywords if word.arg == "help"}
+            return target, words["help"]
+    raise AttributeError(f"{module} has no {target}")
 
 
 def take_json(argv: Sequence[str]) -> tuple[list[str], str | None]:
@@ -143,10 +189,21 @@ def _version() -> str:
     return versions(("openarm-vision",))["openarm-vision"]
 
 
+def _ask(argv: Sequence[str]) -> int | None:
+    try:
+        return ask(argv)
+    except OpenArmError as error:
+        _show(failure(error), take_json(argv)[1])
+        return 1
+
+
 def main() -> None:
     """Run the command line of this process."""
+    argv = sys.argv[1:]
     try:
-        code = run(sys.argv[1:])
+        code = _ask(argv)
+        if code is None:
+            code = run(argv)
         sys.stdout.flush()
     except BrokenPipeError:  # as in `openarm topic echo ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from openarm_bringup.suggest import unknown
+from openarm_common.config import brief, parse_yaml
 from openarm_common.errors import Code, OpenArmError
 
 _KINDS = ("msg", "srv", "action")
@@ -152,7 +153,4 @@ def type_and_fields(words: tuple[str, ...]) -> tuple[str, Any]:
 
 
 def _parse(text: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{text!r} is not YAML: {error}") from error
+    return parse_yaml(text, brief(text), Code.INVALID_ARGUMENT)

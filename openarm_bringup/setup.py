@@ -16,5 +16,10 @@ setup(
         (f"share/{NAME}/launch", ["launch/openarm.launch.py"]),
     ],
     install_requires=["setuptools"],
-    entry_points={"console_scripts": ["openarm = openarm_bringup.cli:main"]},
+    entry_points={
+        "console_scripts": [
+            "openarm = openarm_bringup.cli:main",
+            "flight_recorder = openarm_bringup.bags.ros.flight_recorder:main",
+        ]
+    },
 )

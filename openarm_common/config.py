@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configuration as frozen models, read from YAML with errors that name the file and the key."""
+"""Configuration as frozen models, read from YAML with errors that name the file and the key.
+
+Files come from others, too: their size and depth are bounded, aliases and keys that are given twice are refused, and
+no error repeats more than a few words of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,29 +27,100 @@ class Config(BaseModel):
 ConfigT = TypeVar("ConfigT", bound=BaseModel)
 
 
-def load_yaml(
-    path: Path, code: Code = Code.CONFIG_INVALID, *, loader: type[yaml.SafeLoader] = yaml.SafeLoader
-) -> dict[str, Any]:
+#: Longest file or text, bytes, and deepest nesting.
+MAX_YAML_BYTES, MAX_YAML_DEPTH = 4 * 2**20, 32
+
+#: Longest representation of a value in an error, characters.
+_BRIEF = 80
+
+
+def brief(value: object) -> str:
+    """Return the representation of a value, cut where it is long."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of more than 4300 digits
+        return f"a {type(value).__name__}"
+    return text if len(text) <= _BRIEF else f"{text[: _BRIEF - 1]}…"
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses aliases, deep nesting, and a key given twice, which YAML would let the last one win."""
+
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        event = self.peek_event()  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.MarkedYAMLError(None, None, "aliases are not accepted: write the value out", event.start_mark)
+        if self.depth == MAX_YAML_DEPTH:
+            raise yaml.MarkedYAMLError(
+                None,
+                None,
+                f"nested deeper than {MAX_YAML_DEPTH} levels",
+                event.start_mark,  # pyright: ignore
+            )
+        self.depth += 1
+        node: Any = super().compose_node(parent, index)  # pyright: ignore[reportUnknownMemberType]
+        self.depth -= 1
+        return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[Hashable] = set()
+        for key_node, _ in node.value:
+            key: Any = self.construct_object(key_node, deep=True)  # pyright: ignore[reportUnknownMemberType]
+            if not isinstance(key, Hashable) or key in seen:
+                what = f"{brief(key)} is given twice" if isinstance(key, Hashable) else f"{brief(key)} is no key"
+                raise yaml.MarkedYAMLError(None, None, what, key_node.start_mark)
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def parse_yaml(text: str, where: str, code: Code = Code.CONFIG_INVALID) -> Any:
+    """Parse YAML without aliases.
+
+    Args:
+        text: At most 4 MiB.
+        where: Begins the error, such as the path of a file.
+        code: Of the error.
+
+    Raises:
+        OpenArmError: With `code`, when it is not YAML, too long, or nested too deeply.
+    """
+    if len(text) > MAX_YAML_BYTES:
+        raise OpenArmError(code, f"{where} is longer than {MAX_YAML_BYTES // 2**20} MiB, expected a configuration")
+    try:
+        return yaml.load(text, Loader=_Loader)
+    # a date or a number that is none ends in errors of datetime and int
+    except (yaml.YAMLError, ValueError, TypeError, OverflowError) as error:
+        raise OpenArmError(code, f"{where} is not valid YAML: {error}") from error
+
+
+def load_yaml(path: Path, code: Code = Code.CONFIG_INVALID) -> dict[str, Any]:
     """Read a YAML mapping.
 
     Args:
         path: File to read.
         code: Of the error.
-        loader: Which YAML is accepted.
 
     Raises:
-        OpenArmError: With `code`, when the file is missing, is not YAML, or is not a mapping.
+        OpenArmError: With `code`, when the file is missing, is not YAML, or is not a mapping; see `parse_yaml`.
     """
     try:
-        data = yaml.load(path.read_text(encoding="utf-8"), Loader=loader)
+        with path.open("rb") as file:
+            text = file.read(MAX_YAML_BYTES + 1).decode()
     except FileNotFoundError as error:
         raise OpenArmError(code, f"{path} does not exist") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise OpenArmError(code, f"can't read {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
         raise OpenArmError(code, f"{path} is not valid YAML: {error}") from error
+    data = parse_yaml(text, str(path), code)
     if data is None:
         return {}
     if not isinstance(data, dict):
         raise OpenArmError(code, f"{path} holds a {type(data).__name__}, expected a mapping of keys")
+    if unnamed := [key for key in data if not isinstance(key, str)]:  # pyright: ignore[reportUnknownVariableType]
+        raise OpenArmError(code, f"{path} has the key {brief(unnamed[0])}, expected names")  # pyright: ignore
     return data  # pyright: ignore[reportUnknownVariableType]
 
 
@@ -113,7 +188,7 @@ def describe_faults(error: ValidationError, where: str, model: type[BaseModel]) 
         if item["type"] == "extra_forbidden":
             text = "unknown key" + (f"; valid keys: {', '.join(model.model_fields)}" if len(item["loc"]) == 1 else "")
         elif item["type"] != "missing":
-            text += f", got {item['input']!r}"
+            text += f", got {brief(item['input'])}"
         faults.append(f"{where}:{key}: {text}")
     return "; ".join(faults)
 

@@ -10,36 +10,66 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openarm_common.errors import Code
 from openarm_common.types import Array
 
 #: A cube is a box whose edges differ by less; a can is a cylinder at least this many times as tall as wide.
 CUBE_RATIO, CAN_RATIO = 1.15, 1.5
-#: The wider kind that a kind belongs to.
+#: The wider shape that a shape belongs to.
 WIDER = {"cube": "box", "can": "cylinder"}
+#: Names of shapes. A network's class of such a name says what shape an object has, not what it is.
+KINDS = frozenset({"box", "cylinder", "sphere", *WIDER})
+
+
+class Described:
+    """What is known of an object besides where it is.
+
+    Attributes:
+        name: What it is: a class of a network, a tag; empty when nothing says so.
+        color: A colour of the palette; empty when it has none.
+        kind: Shape: box, cube, cylinder, can, sphere; empty when it is not known.
+    """
+
+    name: str
+    color: str
+    kind: str
+
+    @property
+    def label(self) -> str:
+        """What tells it from others: its name, else its colour, else its wider shape."""
+        return self.name or self.color or WIDER.get(self.kind, self.kind) or "object"
+
+    @property
+    def attributes(self) -> tuple[str, ...]:
+        """All that it may be called: its label, then colour, shape and wider shape, those that are known."""
+        every = (self.label, self.color, self.kind, WIDER.get(self.kind, ""))
+        return tuple(dict.fromkeys(attribute for attribute in every if attribute))
 
 
 @dataclass(frozen=True, eq=False)
-class Detection:
+class Detection(Described):
     """One object in one image.
 
     Attributes:
-        label: Its class: a colour, or a class of a network.
+        name: As `Described`; so are `color` and `kind`.
         score: Confidence, 0 to 1.
         T_base_object: (4, 4) pose of the centre of the box, yaw only, m.
         size: (3,) full edges, m.
         round: Whether it is a circle seen from above: its yaw means nothing, and a hand may approach from any side.
-        kind: Shape: box, cube, cylinder, can, sphere; empty when it is not known.
         measured: Whether the box is that of the object. If not, it encloses what is visible of the object: an obstacle,
             but no target.
+        code: Why it was not measured: NOTHING_DETECTED (hidden, or cut by the border of the image), or a mismatch.
     """
 
-    label: str
+    name: str
     score: float
     T_base_object: Array
     size: Array
     round: bool = False
     kind: str = ""
     measured: bool = True
+    code: Code = Code.NOTHING_DETECTED
+    color: str = ""
 
     @property
     def p_base(self) -> Array:

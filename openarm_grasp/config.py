@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -26,7 +26,9 @@ class ApproachConfig(Config):
     pregrasp_distance: float = Field(
         default=0.08, ge=0.05, le=0.08, description="straight approach before the grasp, m"
     )
-    path_tolerance: float = Field(default=0.02, gt=0.0, le=0.04, description="how far the TCP may be off its path, m")
+    path_tolerance: float = Field(
+        default=0.02, gt=0.0, le=0.04, description="a hand this far off its straight approach is stopped, m"
+    )
     lift_height: float = Field(default=0.12, ge=0.03, le=0.25, description="straight lift after the grasp, m")
     tilts_deg: tuple[float, ...] = Field(
         default=(0.0, 15.0, 30.0, 45.0), description="leans of the hand from vertical, deg"
@@ -112,6 +114,9 @@ class HeldConfig(Config):
     slip: float = Field(
         default=0.003, gt=0.0, le=0.02, description="change of the gap on the way that counts as slipping, m"
     )
+    slip_along: float = Field(
+        default=0.01, gt=0.0, le=0.05, description="an object seen so far below the hold at the lift has slipped, m"
+    )
     rise: float = Field(default=0.03, gt=0.0, le=0.2, description="an object seen this much higher has risen, m")
     askew: float = Field(
         default=0.015, gt=0.0, le=0.1, description="a lifted object that sticks out farther is held elsewhere, m"
@@ -151,6 +156,20 @@ class NearLookConfig(Config):
     least: float = Field(default=0.001, ge=0.0, le=0.01, description="smaller corrections are not made, m")
     largest: float = Field(default=0.03, gt=0.0, le=0.1, description="what is seen farther off is another object, m")
     timeout: float = Field(default=2.0, gt=0.0, le=20.0, description="wait for its frames, wall clock, s")
+
+
+class ConfirmConfig(Config):
+    """When a plan that a person has confirmed is still that plan."""
+
+    joints: float = Field(
+        default=0.02, gt=0.0, le=0.1, description="joints farther from where it begins than this end it, rad"
+    )
+    correction: float = Field(
+        default=0.005,
+        ge=0.0,
+        le=0.01,
+        description="smaller corrections of the second observation are left out, larger ones are asked about, m",
+    )
 
 
 class PlaceConfig(Config):
@@ -227,6 +246,24 @@ class LimitsConfig(Config):
     gripper_timeout: float = Field(default=20.0, gt=0.0, le=120.0, description="one gripper motion, wall clock, s")
 
 
+def _budget(seconds: float, what: str) -> Any:
+    return Field(default=seconds, ge=0.0, le=600.0, description=f"{what}, s of robot time; 0: no budget")
+
+
+class BudgetConfig(Config):
+    """How long a state is expected to take; one that takes longer is reported, and goes on."""
+
+    detect: float = _budget(5.0, "clear the view and observe")
+    transform: float = _budget(1.0, "express what was detected in the base frame")
+    plan: float = _budget(5.0, "plan grasp and place, the time to confirm left out")
+    move_to_pregrasp: float = _budget(4.0, "transfer and second observation")
+    move_to_grasp: float = _budget(3.0, "last observation and straight approach")
+    close_gripper: float = _budget(3.0, "close and judge the grip")
+    lift: float = _budget(4.0, "lift and judge it")
+    place: float = _budget(9.0, "plan, carry, put down and leave")
+    reset: float = _budget(6.0, "go home and observe the place")
+
+
 class DriftConfig(Config):
     """When residuals of grasps raise an alarm."""
 
@@ -257,8 +294,10 @@ class GraspConfig(Config):
     held: HeldConfig = HeldConfig()
     detect: DetectConfig = DetectConfig()
     near: NearLookConfig = NearLookConfig()
+    confirm: ConfirmConfig = ConfirmConfig()
     place: PlaceConfig = PlaceConfig()
     hand_over: HandOverConfig = HandOverConfig()
     push: PushConfig = PushConfig()
     limits: LimitsConfig = LimitsConfig()
+    budget: BudgetConfig = BudgetConfig()
     drift: DriftConfig = DriftConfig()

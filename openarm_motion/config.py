@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from openarm_common.config import Config
+from openarm_common.config import Config, RunTimeField
 from openarm_motion.collision.exact import Clearance
 
 _SEVEN_V = (2.0, 2.0, 2.5, 2.5, 3.0, 3.0, 3.0)
@@ -127,6 +127,14 @@ class MapConfig(Config):
         return "off" if value is False else value  # as YAML reads it without quotes
 
 
+class FaultsConfig(Config):
+    """Fault injection: approach plans that fail with NO_PLAN; counted from the last change of these."""
+
+    no_plan_share: float = RunTimeField(default=0.0, ge=0.0, le=1.0, description="share of approach plans that fail")
+    no_plan_limit: int = RunTimeField(default=0, ge=0, description="no more than so many fail; 0: without limit")
+    seed: int = RunTimeField(default=0, ge=0, description="of which fail")
+
+
 class MotionConfig(Config):
     """Parameters of the motion node."""
 
@@ -145,3 +153,4 @@ class MotionConfig(Config):
     straight: StraightClearance = Field(default_factory=StraightClearance, description="clearance on straight parts")
     planning: PlanningConfig = Field(default_factory=PlanningConfig, description="search")
     execution: ExecutionConfig = Field(default_factory=ExecutionConfig, description="monitoring of execution")
+    faults: FaultsConfig = Field(default_factory=FaultsConfig, description="fault injection")

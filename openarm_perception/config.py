@@ -8,11 +8,14 @@ from pydantic import Field, model_validator
 from openarm_common.config import Config, RunTimeField
 from openarm_common.scene.scene import load_scene
 from openarm_perception.detection.detector import Policy
+from openarm_perception.detection.faults import DetectionFaults
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import LocalizerConfig
 from openarm_perception.detection.network import NetworkConfig
 from openarm_perception.detection.robot import CloudRobotConfig, RobotConfig
+from openarm_perception.detection.tags import TagConfig
 from openarm_perception.geometry.filters import FilterConfig
+from openarm_perception.geometry.watch import WatchConfig
 
 
 class DetectNodeConfig(Config):
@@ -28,26 +31,36 @@ class DetectNodeConfig(Config):
         default="/{camera}/depth/camera_info", description="CameraInfo of both; {camera} is filled in"
     )
     colors: str = Field(default="", description="YAML of the colours; empty is config/params/detector.yaml")
-    scene: str = Field(default="demo", description="scene whose table the objects are on: a name or a path")
+    scene: str = Field(default="demo", description="scene whose table it is until the frame `table` is known")
     table_height: float | None = Field(
-        default=None, ge=-1.0, le=2.0, description="of the table in the base frame, m; without one, the scene's"
+        default=None, ge=-1.0, le=2.0, description="of the table in the base frame, m; without one, the frame `table`'s"
     )
     detector: DetectorKind = RunTimeField(
         default="color",
-        description="what finds objects: their colour, a network, both checking each other, or depth alone (anything)",
+        description="what finds objects: their colour, a network, both checking each other, a tag on them, or depth"
+        " alone (anything)",
     )
     network: NetworkConfig = NetworkConfig()
+    tag: TagConfig = TagConfig()
     policy: Policy = RunTimeField(
         default="score", description="which detection comes first: most certain, or nearest to the centre"
     )
-    label: str = RunTimeField(default="", description="only objects of this name; empty takes all")
+    label: str = RunTimeField(
+        default="", description="only objects that these words fit, such as `red` or `red can`; empty takes all"
+    )
     max_rate: float = Field(
         default=10.0, gt=0.0, le=60.0, description="most frames processed a second of the stamps, Hz"
     )
     transform_wait: float = Field(default=0.5, ge=0.0, le=5.0, description="longest wait for the camera's pose, s")
     held_topic: str = Field(default="/motion/attached_objects", description="what the hands hold, as markers on links")
+    calibrated_topic: str = Field(
+        default="/calibration/{camera}/camera_info",
+        description="intrinsics that the mount was calibrated with; {camera} is filled in",
+    )
     localizer: LocalizerConfig = Field(default_factory=LocalizerConfig)
     self_filter: RobotConfig = RobotConfig()
+    watch: WatchConfig = WatchConfig()
+    faults: DetectionFaults = DetectionFaults()
 
     def table_top_z(self) -> float:
         """Return the height of the table in the base frame, m.
@@ -65,14 +78,22 @@ class CloudNodeConfig(Config):
     depth_topic: str = Field(default="/{camera}/depth/image_raw", description="depth image; {camera} is filled in")
     info_topic: str = Field(default="/{camera}/depth/camera_info", description="CameraInfo; {camera} is filled in")
     points_topic: str = Field(default="/{camera}/depth/points", description="the cloud; {camera} is filled in")
+    merged_topic: str = Field(default="/points", description="one cloud of all cameras, in the base frame")
+    merged_rate: float = Field(default=10.0, gt=0.0, le=60.0, description="most merged clouds a second, Hz")
+    merged_age: float = Field(
+        default=0.5, ge=0.0, le=10.0, description="a camera whose cloud is older by this is left out of it, s"
+    )
     organised: bool = Field(
-        default=True, description="a point for every pixel, NaN where invalid; false: valid points only"
+        default=True, description="clouds of cameras: a point for every pixel, NaN where invalid; false: valid ones"
     )
     color: bool = Field(default=False, description="a field `rgb` next to x, y, z; organised clouds only")
     color_topic: str = Field(default="/{camera}/color/image_raw", description="aligned colour; {camera} is filled in")
     held_topic: str = Field(default="/motion/attached_objects", description="what the hands hold, as markers on links")
     transform_wait: float = Field(
-        default=0.2, ge=0.0, le=5.0, description="longest wait for the robot's posture at a stamp, with self_filter, s"
+        default=0.2,
+        ge=0.0,
+        le=5.0,
+        description="longest wait for the robot's posture at a stamp, where it is needed, s",
     )
     filter: FilterConfig = FilterConfig()
     self_filter: CloudRobotConfig = CloudRobotConfig()
@@ -80,7 +101,10 @@ class CloudNodeConfig(Config):
     @model_validator(mode="after")
     def _fits(self) -> CloudNodeConfig:
         if self.organised and (self.filter.voxel > 0.0 or self.filter.outliers):
-            raise ValueError("filter.voxel and filter.outliers take points away; they need organised: false")
+            raise ValueError(
+                "filter.voxel and filter.outliers take points away, so that clouds are no longer organised:"
+                " set organised to false as well (--set cloud.organised=false)"
+            )
         if self.color and not self.organised:
-            raise ValueError("color needs organised: true")
+            raise ValueError("color needs organised clouds: set organised to true, or color to false")
         return self

@@ -54,7 +54,7 @@ class RateDivider:
     """Which control ticks to use, so that the mean rate is exact though it does not divide that of the ticks.
 
     Args:
-        rate: Uses per second of simulated time.
+        rate: Uses per second of the clock that it is asked with.
     """
 
     def __init__(self, rate: float) -> None:

@@ -7,7 +7,6 @@ runs between two ticks; they never wait for physics, and physics never waits for
 
 from __future__ import annotations
 
-import os
 import tempfile
 import threading
 import time
@@ -21,11 +20,13 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_sim_bridge.pacing import Pacer, PeriodMeter, RealTimeFactor
+from openarm_sim_bridge.pacing import Pacer, PeriodMeter, RateDivider, RealTimeFactor
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.world import JointReadout
 
 T = TypeVar("T")
+
+_STOPPED = "the emergency stop is latched; when it is safe to move, call /mujoco_bridge/reset (`openarm stop --reset`)"
 
 
 class Simulation:
@@ -62,14 +63,16 @@ class Simulation:
         self.real_time_factor = RealTimeFactor()
         self.periods = PeriodMeter()
         self.fault = ""
+        #: Whether the emergency stop is latched.
+        self.stopped = False
         self._observe = observe
         self._dump_folder = dump_folder or Path(tempfile.gettempdir())
         self._history: deque[tuple[JointReadout, Array]] = deque(maxlen=max(1, 1_000_000_000 // world.period_ns))
         self._crashed = crashed
         self._clock = clock
         self._pacer = Pacer(world.period_ns, speed)
-        self._throttled = speed == 0.0 or speed > 1.0
-        self._observed_ns = 0
+        #: Faster than the wall clock, one tick in each of its periods is observed.
+        self._slots = RateDivider(1e9 / world.period_ns) if speed == 0.0 or speed > 1.0 else None
         self._paused = False
         self._steps_left = 0
         self._stepped: Future[int] | None = None
@@ -200,8 +203,7 @@ class Simulation:
         self._history.append((self.robot.state, self.robot.targets))
         self.real_time_factor.add(now_ns, world.t_ns)
         last = self._paused and steps == self._steps_left
-        if last or not self._throttled or now_ns - self._observed_ns >= 0.9 * world.period_ns:
-            self._observed_ns = now_ns
+        if self._slots is None or self._slots.due(now_ns) or last:
             self.periods.add(self._clock())
             self._observe(world.read_joints())
         if self._paused:
@@ -210,28 +212,37 @@ class Simulation:
                 stepped, self._stepped = self._stepped, None
                 stepped.set_result(world.t_ns)
 
+    def stop_motion(self) -> None:
+        """Latch the emergency stop: all joints hold, and no goal and no command is taken. For `call`."""
+        self.stopped = True
+        self.controller.stop(_STOPPED)
+
     def check_able(self) -> None:
-        """Refuse commands after a divergence.
+        """Refuse commands after an emergency stop or a divergence.
 
         Raises:
-            OpenArmError: NOT_READY, with the fault.
+            OpenArmError: STOPPED; NOT_READY, with the fault.
         """
+        if self.stopped:
+            raise OpenArmError(Code.STOPPED, _STOPPED)
         if self.fault:
             raise OpenArmError(Code.NOT_READY, f"no command is taken until the world is reset: {self.fault}")
 
     def _dump(self) -> str:
         """Write the last second to a file; return a sentence that names it."""
-        path = self._dump_folder / f"openarm_diverged_{os.getpid()}_{self.world.t_ns}.npz"
         states, targets = zip(*self._history, strict=True)
         columns: dict[str, Any] = {
             key: np.array([getattr(state, key) for state in states])
             for key in ("t_ns", "position", "velocity", "effort")
         }
         try:
-            np.savez(path, joint_names=np.array(self.world.joint_names), target=np.array(targets), **columns)
+            with tempfile.NamedTemporaryFile(
+                dir=self._dump_folder, prefix="openarm_diverged_", suffix=".npz", delete=False
+            ) as file:
+                np.savez(file, joint_names=np.array(self.world.joint_names), target=np.array(targets), **columns)
         except OSError as error:
-            return f"The last second could not be written to {path}: {error}."
-        return f"The last second is in {path}."
+            return f"The last second could not be written to {self._dump_folder}: {error}."
+        return f"The last second is in {file.name}."
 
     def _end_stepping(self, why: str) -> None:
         self._steps_left = 0

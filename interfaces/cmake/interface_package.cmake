@@ -51,11 +51,23 @@ macro(interface_package)
   if(SKBUILD)
     # Python over rmw_fastrtps needs the C side only: leave out what only C++ nodes use (half of the build time).
     list(FILTER AMENT_EXTENSIONS_rosidl_generate_idl_interfaces EXCLUDE REGEX "_cpp:")
+    set(CMAKE_C_FLAGS_RELEASE -O1)
+    set(CMAKE_CXX_FLAGS_RELEASE -O1)
   endif()
 
   file(GLOB PACKAGE_FILES RELATIVE "${CMAKE_CURRENT_SOURCE_DIR}" CONFIGURE_DEPENDS msg/*.msg srv/*.srv action/*.action)
   rosidl_generate_interfaces(${PROJECT_NAME} ${PACKAGE_FILES} DEPENDENCIES ${PACKAGE_DEPENDENCIES})
   drop_missing_include_folders()
+  if(SKBUILD)
+    # Headers (Fast CDR, Python, NumPy) take longer to compile than what is generated: one translation unit a library.
+    # Descriptions of types stay apart, because their static names repeat.
+    foreach(library generator_c generator_py typesupport_c typesupport_fastrtps_c typesupport_introspection_c)
+      set_target_properties(${PROJECT_NAME}__rosidl_${library} PROPERTIES UNITY_BUILD ON UNITY_BUILD_BATCH_SIZE 0)
+    endforeach()
+    get_target_property(sources ${PROJECT_NAME}__rosidl_generator_c SOURCES)
+    list(FILTER sources INCLUDE REGEX "__description\\.c$")
+    set_source_files_properties(${sources} PROPERTIES SKIP_UNITY_BUILD_INCLUSION ON)
+  endif()
 
   ament_export_dependencies(rosidl_default_runtime)
   ament_package()

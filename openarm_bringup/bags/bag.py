@@ -7,24 +7,62 @@ the installed Python class, so that every installed type can be recorded, also a
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
+import yaml
 from rosbags.interfaces import Connection, Qos
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
-from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.rosbag2.errors import ReaderError
+from rosbags.rosbag2.storage_mcap import McapWriter, zstd
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from openarm_bringup.bags.definitions import definition, nested_types
-from openarm_bringup.bags.mcap import DAMAGE, is_closed, mend
+from openarm_bringup.bags.mcap import DAMAGE, is_closed, mend, unpack
 from openarm_bringup.messages import interface
+from openarm_common.config import MAX_YAML_BYTES, load_yaml
 from openarm_common.errors import Code, OpenArmError
 
+#: This much of the disk is left free, so that the bag can still be closed.
+SPARE_BYTES = 200 * 2**20
 #: Of zstd. Clouds come out smaller at 1 than at its default of 3, in half the time.
 _LEVEL = 1
+#: By which a file of messages may have been compressed.
+_LARGEST_RATIO = 200
+
+
+def check_room(folder: Path) -> int:
+    """Refuse to fill a disk to the end; return how many bytes may be written until it is checked again.
+
+    Raises:
+        OSError: When less than `SPARE_BYTES` are free.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < SPARE_BYTES:
+        raise OSError(f"the disk has only {free // 2**20} MiB left")
+    return SPARE_BYTES // 8
+
+
+class Topic(NamedTuple):
+    """A topic that is recorded, with the quality of service that its publishers offer."""
+
+    name: str
+    type: str
+    qos: Qos
+
+
+class Message(NamedTuple):
+    """As it was received: `data` is CDR, the stamp that of the middleware, ns of the system clock."""
+
+    topic: str
+    t_ns: int
+    data: bytes
 
 
 @dataclass(frozen=True)
@@ -139,6 +177,10 @@ class Bag:
         self.path = path
         self.mended = mended
         self._reader = reader
+        # Messages that are compressed one by one are unpacked here, where their size is bounded.
+        storage = reader.storage
+        self._packed = storage.metadata.compression_mode == "message"
+        storage.metadata = storage.metadata._replace(compression_mode=None)
         self.topics: dict[str, tuple[str, Qos | None]] = {}
         self.counts: dict[str, int] = {}
         for connection in reader.connections:
@@ -162,9 +204,10 @@ class Bag:
         start = self.start_ns + round(start_s * 1e9) if start_s else None
         try:
             for connection, t_ns, data in self._reader.messages(chosen, start=start):
-                yield Record(connection.topic, connection.msgtype, t_ns, bytes(data))
+                content = unpack(data) if self._packed else bytes(data)
+                yield Record(connection.topic, connection.msgtype, t_ns, content)
         except DAMAGE as error:
-            raise _damaged(self.path, error) from error
+            raise damaged(self.path, error) from error
 
 
 @contextmanager
@@ -200,16 +243,49 @@ def open_bag(path: Path) -> Iterator[Bag]:
         mended = mend(source)
     elif source.is_file():
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} is not a bag: expected a folder of rosbag2 or an .mcap file")
-    reader = Reader(source)
-    try:
-        reader.open()
-    except (*DAMAGE, OSError) as error:
-        raise _damaged(path, error) from error
-    try:
-        yield Bag(path, reader, mended)
-    finally:
-        reader.close()
+    with ExitStack() as stack:
+        try:
+            if source.is_dir():
+                source = _unpacked(source, stack)
+            reader = Reader(source)
+            reader.open()
+            stack.callback(reader.close)
+            bag = Bag(path, reader, mended)
+        except (*DAMAGE, OSError) as error:
+            raise damaged(path, error) from error
+        yield bag
 
 
-def _damaged(path: Path, error: Exception) -> OpenArmError:
-    return OpenArmError(Code.INVALID_ARGUMENT, f"{path} can't be read as a bag: {error}")
+def _unpacked(path: Path, stack: ExitStack) -> Path:
+    """Return the folder of a bag whose files are not compressed as a whole; one that is gets unpacked, within bounds.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID, for metadata that is no YAML.
+        ReaderError: When a file unpacks to much more than a recording does.
+    """
+    size = (path / "metadata.yaml").stat().st_size
+    if size > MAX_YAML_BYTES:
+        raise ReaderError(f"metadata.yaml has {size} bytes, expected at most {MAX_YAML_BYTES}")
+    packed = sorted(path.glob("*.zst"))
+    if not packed:
+        return path
+    folder = Path(stack.enter_context(TemporaryDirectory()))
+    document = load_yaml(path / "metadata.yaml")
+    about = document["rosbag2_bagfile_information"]
+    about |= {"compression_format": "", "compression_mode": ""}
+    about["relative_file_paths"] = [name.removesuffix(".zst") for name in about["relative_file_paths"]]
+    (folder / "metadata.yaml").write_text(yaml.safe_dump(document), encoding="utf-8")
+    for file in packed:
+        most = _LARGEST_RATIO * file.stat().st_size + 2**20
+        with zstd.open(file, "rb") as source, (folder / file.stem).open("wb") as target:
+            while block := source.read(2**20):
+                target.write(block)
+                if target.tell() > most:
+                    raise ReaderError(f"{file.name} unpacks to more than {_LARGEST_RATIO} times its size")
+    return folder
+
+
+def damaged(path: Path, error: Exception) -> OpenArmError:
+    """Return the error of a bag whose content is not what its format says, in one sentence."""
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return OpenArmError(Code.INVALID_ARGUMENT, f"{path} can't be read as a bag: {text[:300]}")

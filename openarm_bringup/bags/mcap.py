@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The end of an MCAP file that was cut short is restored (https://mcap.dev/spec).
+"""The end of an MCAP file that was cut short is restored (https://mcap.dev/spec), and no file fills the memory.
 
 A file is a magic, records (one byte of kind, eight of length, content), a summary, a footer record and the magic again.
 Without the end no reader opens it, and without the summary's index of chunks none gives the messages of several topics
@@ -10,17 +10,23 @@ from __future__ import annotations
 
 import os
 import struct
+from collections import defaultdict
+from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag2.errors import ReaderError
-from rosbags.rosbag2.storage_mcap import decompress, zstd
+from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, decompress, zstd
 
 from openarm_common.errors import Code, OpenArmError
 
 #: What is raised where the content of a file is not what its format says.
-DAMAGE = (ReaderError, zstd.ZstdError, RuntimeError, EOFError, ValueError, TypeError)
+DAMAGE = (
+    ReaderError, zstd.ZstdError, struct.error, ArithmeticError, AssertionError, AttributeError, EOFError, LookupError,
+    MemoryError, RuntimeError, TypeError, ValueError,
+)  # fmt: skip
 MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = range(1, 8)
 _CHUNK_INDEX, _STATISTICS, _DATA_END = 0x08, 0x0B, 0x0F
@@ -31,6 +37,34 @@ _HEAD = struct.Struct("<BQ")
 _OF_CHUNK = struct.Struct("<QQQII")
 #: Of a message: channel, number, stamp.
 _OF_MESSAGE = struct.Struct("<HIQ")
+
+
+#: Largest chunk or message, unpacked, bytes.
+MAX_UNPACKED = 256 * 2**20
+
+
+def unpack(data: bytes, size: int = MAX_UNPACKED, *, kind: str = "zstd") -> bytes:
+    """Decompress a chunk or a message, and never more than it may hold.
+
+    Args:
+        data: Compressed.
+        size: That it may have, bytes.
+        kind: `zstd` or `lz4`.
+
+    Raises:
+        ReaderError: When it is larger than `size` or `MAX_UNPACKED`, or truncated.
+    """
+    most = min(size, MAX_UNPACKED)
+    unpacker: Any = zstd.ZstdDecompressor() if kind == "zstd" else LZ4FrameDecompressor()
+    content: bytes = unpacker.decompress(data, max_length=most + 1)
+    if len(content) > most or not unpacker.eof:
+        raise ReaderError(f"{len(data)} bytes of {kind} are truncated, or unpack to more than {most} bytes")
+    return content
+
+
+# The reader's own unpack whatever the data says, before they compare its size.
+DECOMPRESSORS["zstd"] = unpack
+DECOMPRESSORS["lz4"] = partial(unpack, kind="lz4")
 
 
 def is_closed(path: Path) -> bool:
@@ -63,6 +97,13 @@ def mend(path: Path) -> int | None:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"{path} was cut short, and can't be written to give it an end; copy it first"
         )
+    try:
+        return _give_end(path, size)
+    except DAMAGE as error:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} was cut short and is damaged: {error}") from error
+
+
+def _give_end(path: Path, size: int) -> int:
     with path.open("r+b") as file:
         chunks, end = whole_chunks(file, size)
         # Whether all indexes of the last chunk were written only its content shows: they are made again.
@@ -111,24 +152,24 @@ def _until(chunks: list[tuple[int, int]], end: int) -> list[tuple[tuple[int, int
 
 def _indexes(file: BinaryIO, start: int) -> list[bytes] | None:
     """Contents of the index records of a chunk: of each channel, stamp and place of its messages; None if damaged."""
-    file.seek(start + _HEAD.size)
-    _, _, unpacked, crc, name = _OF_CHUNK.unpack(file.read(_OF_CHUNK.size))
-    compression = file.read(name).decode()
-    (packed,) = struct.unpack("<Q", file.read(8))
+    found: dict[int, bytearray] = defaultdict(bytearray)
     try:
+        file.seek(start + _HEAD.size)
+        _, _, unpacked, crc, name = _OF_CHUNK.unpack(file.read(_OF_CHUNK.size))
+        compression = file.read(name).decode()
+        (packed,) = struct.unpack("<Q", file.read(8))
         content = BytesIO(decompress(file.read(packed), compression, unpacked, crc))
+        while len(head := content.read(_HEAD.size)) == _HEAD.size:
+            place = content.tell() - _HEAD.size
+            kind, length = _HEAD.unpack(head)
+            if kind not in (_SCHEMA, _CHANNEL, _MESSAGE):
+                return None
+            if kind == _MESSAGE:
+                channel, _, stamp = _OF_MESSAGE.unpack(content.read(_OF_MESSAGE.size))
+                found[channel] += struct.pack("<QQ", stamp, place)
+            content.seek(place + _HEAD.size + length)
     except DAMAGE:
         return None
-    found: dict[int, bytes] = {}
-    while len(head := content.read(_HEAD.size)) == _HEAD.size:
-        place = content.tell() - _HEAD.size
-        kind, length = _HEAD.unpack(head)
-        if kind not in (_SCHEMA, _CHANNEL, _MESSAGE):
-            return None
-        if kind == _MESSAGE:
-            channel, _, stamp = _OF_MESSAGE.unpack(content.read(_OF_MESSAGE.size))
-            found[channel] = found.get(channel, b"") + struct.pack("<QQ", stamp, place)
-        content.seek(place + _HEAD.size + length)
     return [struct.pack("<HI", channel, len(entries)) + entries for channel, entries in found.items()]
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from openarm_calibration.handeye.offline import Result
     from openarm_calibration.sampling.samples import SampleSet
     from openarm_calibration.store.store import CalibrationStore
+    from openarm_calibration.store.table import TableStore
 
 
 @Parameter(name="*")
@@ -81,7 +82,7 @@ def with_solved(
     """
     from openarm_calibration.handeye.offline import REFINED, calibrate, checked_algorithm, without_named
     from openarm_calibration.handeye.solve import SolveConfig
-    from openarm_calibration.store.store import now
+    from openarm_calibration.store.records import now
 
     name = checked_algorithm(algorithm)
     if free_intrinsics and name != REFINED:
@@ -144,13 +145,21 @@ def _board(text: str) -> Board:
         raise OpenArmError(Code.INVALID_ARGUMENT, error.message) from error
 
 
+def tables_in(folder: Path | None) -> TableStore:
+    """Return the stored height of the table in a folder; errors as `store_in`."""
+    from openarm_calibration.store.table import TableStore
+
+    return TableStore(store_in(folder).folder)
+
+
 def store_in(folder: Path | None) -> CalibrationStore:
     """Return the store of a folder; without one, the default.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, when it is a file.
     """
-    from openarm_calibration.store.store import CalibrationStore, default_folder
+    from openarm_calibration.store.records import default_folder
+    from openarm_calibration.store.store import CalibrationStore
 
     if folder is not None and folder.exists() and not folder.is_dir():
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--store {folder} is a file, expected a folder")

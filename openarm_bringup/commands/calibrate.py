@@ -8,18 +8,20 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from cyclopts import App
 
-from openarm_bringup.calibration.source import ALL_SAMPLES, Solved, Source, store_in, with_solved
+from openarm_bringup.calibration.source import ALL_SAMPLES, Solved, Source, store_in, tables_in, with_solved
 from openarm_bringup.commands import calibrate_live
 from openarm_bringup.outcome import Outcome
 from openarm_common.errors import Code, OpenArmError
 
 if TYPE_CHECKING:
     from openarm_calibration.store.store import CalibrationStore, StoredCalibration
+    from openarm_calibration.store.table import StoredTable
 
 calibrate = App(name="calibrate", help="Hand-eye calibration: boards, sampling, solving, checking and storing.")
 
 calibrate.command(calibrate_live.auto)
 calibrate.command(calibrate_live.sample)
+calibrate.command(calibrate_live.table)
 
 
 @calibrate.command
@@ -117,7 +119,7 @@ def together(*sessions: Path, save: bool = False, store: Path | None = None) -> 
     from openarm_calibration.handeye.offline import calibrate_together
     from openarm_calibration.report.report import summary
     from openarm_calibration.sampling.samples import load_session
-    from openarm_calibration.store.store import now
+    from openarm_calibration.store.records import now
     from openarm_common.robot.description import RobotDescription
 
     if len(sessions) < 2:
@@ -169,16 +171,18 @@ def report(samples: Path, out: Path, *, source: Source = ALL_SAMPLES) -> Outcome
 
 @calibrate.command(name="list")
 def list_(*, store: Path | None = None) -> Outcome:
-    """Name the stored calibrations, with their history.
+    """Name the stored calibrations and the measured table, with their history.
 
     Args:
         store: Folder of stored calibrations.
     """
+    from openarm_calibration.store.table import TABLE
+
     opened = store_in(store)
     data: dict[str, Any] = {"store": str(opened.folder), "cameras": {}}
     lines: list[str] = []
     faults: list[str] = []
-    for camera in opened.cameras():
+    for camera in opened.names():
         history = [item.model_dump(mode="json") for item in opened.history(camera)]
         data["cameras"][camera] = {"history": history}
         try:
@@ -186,6 +190,14 @@ def list_(*, store: Path | None = None) -> Outcome:
         except OpenArmError as error:
             faults.append(error.message)
             lines.append(f"{camera}: {error.message}")
+    tables = tables_in(store)
+    if tables.names():
+        try:
+            kept = tables.load(TABLE)
+            data["table"] = kept.model_dump(mode="json")
+            lines.append(f"table: {_height(kept)}  ({len(tables.history(TABLE))} in its history)")
+        except OpenArmError as error:
+            faults.append(error.message)
     if faults:
         return Outcome(False, "; ".join(faults), Code.CONFIG_INVALID, data, "\n".join(lines))
     return Outcome(True, f"{len(lines)} stored in {opened.folder}", data=data, text="\n".join(lines))
@@ -193,12 +205,17 @@ def list_(*, store: Path | None = None) -> Outcome:
 
 @calibrate.command
 def rollback(camera: str, *, store: Path | None = None) -> Outcome:
-    """Go back to the calibration of a camera before the present one.
+    """Go back to the calibration of a camera, or the height of the table, before the present one.
 
     Args:
-        camera: Its name.
+        camera: Its name; or "table".
         store: Folder of stored calibrations.
     """
+    from openarm_calibration.store.table import TABLE
+
+    if camera == TABLE:
+        height = tables_in(store).rollback(TABLE)
+        return Outcome(True, f"now in use: table: {_height(height)}", data=height.model_dump(mode="json"))
     now = store_in(store).rollback(camera)
     return Outcome(True, f"now in use: {_line(now)}", data=now.model_dump(mode="json"))
 
@@ -221,6 +238,11 @@ def _outcome(done: Solved, store: CalibrationStore | None, *, force: bool = Fals
     if store is not None:
         message += "; not stored (--force of `openarm calibrate save` stores it all the same)"
     return Outcome(not failed, message, Code.DEGENERATE if failed else Code.OK, data, text)
+
+
+def _height(item: StoredTable) -> str:
+    seed = "none" if item.mount_seed is None else str(item.mount_seed)
+    return f"{item.height * 1e3:.1f} mm by {item.method or 'hand'}, mount seed {seed}, {item.created or 'undated'}"
 
 
 def _line(item: StoredCalibration) -> str:

@@ -102,6 +102,42 @@ def sample(*, remove: str | None = None, session: str = "", advice: bool = False
     return Outcome(done.success, done.message, done.code or Code.OK, data, f"next: {now.advice}")
 
 
+def table(
+    *,
+    camera: str = "overhead",
+    block_height: float = 0.0,
+    label: str = "",
+    dry_run: bool = False,
+    domain: Domain = None,
+) -> Outcome:
+    """Measure the height of the table in the running graph and store it; every node takes it over at once.
+
+    Args:
+        camera: Whose depth is used: overhead or wrist.
+        block_height: Of a block that stands on the table, m, whose top is measured instead of the table's surface.
+        label: Of that block, when several objects are in view.
+        dry_run: Measure, and store nothing.
+    """
+    join_graph(domain)
+    from openarm_calibration.ros.client import DETECTORS, CalibrationClient
+
+    if camera not in DETECTORS:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--camera {camera}: unknown; cameras: {', '.join(DETECTORS)}")
+    with requires_node(DETECTORS[camera], "sim"), CalibrationClient() as client:
+        measured = client.measure_table(camera, block_height, label)
+        data: dict[str, Any] = {name: getattr(measured, name) for name in ("height", "std", "tilt", "points")}
+        if not measured.success:
+            return Outcome(False, measured.message, Code(measured.code))
+        text = (
+            f"height {measured.height * 1e3:.1f} mm, std {measured.std * 1e3:.2f} mm,"
+            f" tilt {math.degrees(measured.tilt):.2f}°, {measured.points} points"
+        )
+        if dry_run:
+            return Outcome(True, f"{measured.message}; nothing is stored", data=data, text=text)
+        saved = client.save_table(measured, f"{camera}: {'block' if block_height else 'surface'}")
+    return Outcome(saved.success, saved.message, Code(saved.code), data | {"stored": saved.path}, text)
+
+
 def _running(options: CalibrationOptions, show: _Show) -> Outcome:
     camera, *others = options.cameras
     if others:

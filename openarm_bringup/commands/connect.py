@@ -6,8 +6,9 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -25,6 +26,10 @@ Sets = Annotated[
     tuple[str, ...], Parameter(name="--set", help="A parameter, as node.param=value; may be given several times.")
 ]
 Count = Annotated[int, Parameter(name=["--count", "-n"])]
+
+
+#: Makes the node of a command in the daemon of a graph, which has joined it.
+PEER: ContextVar[Callable[[], Peer] | None] = ContextVar("PEER", default=None)
 
 
 def join_graph(domain: int | None) -> None:
@@ -60,6 +65,8 @@ def graph_peer(domain: int | None) -> Peer:
     Raises:
         OpenArmError: NOT_READY, on entering, when no node runs.
     """
+    if make := PEER.get():
+        return make()
     join_graph(domain)
     from openarm_bringup.ros.peer import Peer
 

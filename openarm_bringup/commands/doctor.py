@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
 
@@ -62,27 +63,33 @@ def doctor(*, graph: str = "sim") -> Outcome:
 
 
 def gather(graph: str) -> list[Finding]:
-    """Make all checks, the simulator's version first."""
-    installed = {
-        dist.metadata["Name"].lower(): dist.version for dist in metadata.distributions() if dist.metadata["Name"]
-    }
-    version = (sys.version_info.major, sys.version_info.minor)
-    findings = checks.check_versions(installed)
-    findings.append(checks.check_python(version, platform.system(), platform.machine()))
-    findings.append(checks.check_opencv(installed, _opencv_links_gl()))
-    rclpy = importlib.util.find_spec("rclpy")
-    rclpy_version = installed.get("ros-rclpy") or installed.get("rclpy") or "unknown"
-    findings += checks.check_ros(os.environ, rclpy.origin if rclpy else None, rclpy_version, sys.prefix)
-    findings += checks.check_rmw(os.environ)
-    findings += [checks.check_imports(_failed_imports(names), purpose, names) for purpose, names in GROUPS.items()]
-    findings.append(checks.check_gl(_render_times(), os.environ.get("MUJOCO_GL", "egl")))
-    findings += _graph_findings(graph)
-    domain = os.environ.get("ROS_DOMAIN_ID", "") or "0"
-    findings.append(checks.check_domain(domain, _first_ephemeral_port()))
-    if findings[-1].level != "error":
-        port = 7400 + 250 * int(domain)
-        findings.append(checks.check_port(port, _can_share(port)))
-    findings.append(_machine())
+    """Make all checks, the simulator's version first; those that wait, at the same time."""
+    environ = dict(os.environ)  # as it is before a graph is joined
+    with ThreadPoolExecutor() as threads:
+        of_graph = threads.submit(_graph_findings, graph)
+        opencv, render = threads.submit(_opencv_links_gl), threads.submit(_render_times)
+        failed = {purpose: _failed_imports(names) for purpose, names in GROUPS.items()}
+        installed = {
+            dist.metadata["Name"].lower(): dist.version for dist in metadata.distributions() if dist.metadata["Name"]
+        }
+        version = (sys.version_info.major, sys.version_info.minor)
+        findings = checks.check_versions(installed)
+        findings.append(checks.check_system(_os_release(), platform.libc_ver()))
+        findings.append(checks.check_python(version, platform.system(), platform.machine()))
+        findings.append(checks.check_opencv(installed, opencv.result()))
+        rclpy = importlib.util.find_spec("rclpy")
+        rclpy_version = installed.get("ros-rclpy") or installed.get("rclpy") or "unknown"
+        findings += checks.check_ros(environ, rclpy.origin if rclpy else None, rclpy_version, sys.prefix)
+        findings += checks.check_rmw(environ)
+        findings += [checks.check_imports(failed[purpose], purpose, names) for purpose, names in GROUPS.items()]
+        findings.append(checks.check_gl(render.result(), environ.get("MUJOCO_GL", "egl")))
+        findings += of_graph.result()
+        domain = environ.get("ROS_DOMAIN_ID", "") or "0"
+        findings.append(checks.check_domain(domain, _first_ephemeral_port()))
+        if findings[-1].level != "error":
+            port = 7400 + 250 * int(domain)
+            findings.append(checks.check_port(port, _can_share(port)))
+        findings.append(_machine())
     return findings
 
 
@@ -111,6 +118,9 @@ def _graph_findings(name: str) -> list[Finding]:
     running = runs.running()
     observed = "; ".join(f"{run.graph} in domain {run.domain}: {run.health} (pid {run.pid})" for run in running)
     findings.append(Finding("graphs", "ok", observed or "none is running"))
+    latest = [] if running else [runs.runs_root() / "latest"]  # the last that has ended
+    folders = [*(Path(run.run_dir) for run in running), *(path.resolve() for path in latest if path.exists())]
+    findings += [graph.check_recordings(folder) for folder in folders]
     for run in running:
         findings += graph.check_nodes(run)
         if run.ready_nodes:
@@ -138,23 +148,32 @@ def _opencv_links_gl() -> bool:
 
 
 def _render_times() -> dict[str, float | str]:
-    results: dict[str, float | str] = {}
-    for backend in ("egl", "osmesa"):
-        env = {**os.environ, "MUJOCO_GL": backend}
-        env.pop("PYOPENGL_PLATFORM", None)
-        try:
-            done = subprocess.run(
-                [sys.executable, "-c", _RENDER], env=env, capture_output=True, text=True, timeout=60, check=False
-            )
-        except subprocess.TimeoutExpired:
-            results[backend] = "no picture within 60 s"
-            continue
-        words = (done.stdout.strip() or done.stderr.strip()).splitlines()
-        try:
-            results[backend] = float(words[-1]) if words else "no answer"
-        except ValueError:
-            results[backend] = f"failed ({words[-1][:80]})"
-    return results
+    backends = ("egl", "osmesa")
+    with ThreadPoolExecutor() as threads:
+        return dict(zip(backends, threads.map(_render_time, backends), strict=True))
+
+
+def _render_time(backend: str) -> float | str:
+    """Return the time of a picture, ms, or why there is none."""
+    env = {**os.environ, "MUJOCO_GL": backend}
+    env.pop("PYOPENGL_PLATFORM", None)
+    command = [sys.executable, "-c", _RENDER]
+    try:
+        done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=60, check=False)
+    except subprocess.TimeoutExpired:
+        return "no picture within 60 s"
+    words = (done.stdout.strip() or done.stderr.strip()).splitlines()
+    try:
+        return float(words[-1]) if words else "no answer"
+    except ValueError:
+        return f"failed ({words[-1][:80]})"
+
+
+def _os_release() -> Mapping[str, str]:
+    try:
+        return platform.freedesktop_os_release()
+    except OSError:  # there is none
+        return {}
 
 
 def _first_ephemeral_port() -> int:

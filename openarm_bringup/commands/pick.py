@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from openarm_grasp.planning.options import Option
     from openarm_grasp.ros.client import GraspResult, PairResult
+    from openarm_grasp.strategies.state_times import StateTime
 
 
 Arm = Literal["auto", "left", "right"]
@@ -35,6 +37,7 @@ def pick(
     phase: Literal["all", "pick", "place"] = "all",
     time_limit: float = 0.0,
     dry_run: bool = False,
+    confirm: bool = False,
     domain: Domain = None,
     timeout: float = 300.0,
 ) -> Outcome:
@@ -44,8 +47,8 @@ def pick(
     come too near to each other. Options of two objects are given once for each: `--arm left --arm right`.
 
     Args:
-        label: What to pick: a label such as red, or words such as "red cube left of the can"; without one, the object
-            that is detected best.
+        label: What to pick: its class, colour or shape, such as cola, red or can, or several words such as "red cube
+            left of the can"; without one, the first object that is detected.
         second: Another object, picked in parallel.
         arm: Which arm: auto when not given.
         at: x y near the object, base frame, m: selects one of several alike.
@@ -54,6 +57,7 @@ def pick(
         phase: pick ends with the object in the hand, place puts down what the hand holds; all does both.
         time_limit: Of the robot, s; then it holds, and the hand keeps what it holds. 0 is none.
         dry_run: Plan and report, do not move.
+        confirm: Show each plan and ask before it is executed; without a terminal, /grasp/confirm is to answer.
         timeout: Longest wait, s.
     """
     labels = (label, second) if second else (label,)
@@ -61,8 +65,9 @@ def pick(
     places, yaws = _each("place", place, labels), _each("yaw", yaw, labels)
     if second and phase != "all":
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--phase {phase} is of one object; two are picked and placed")
+    if second and confirm:
+        raise OpenArmError(Code.INVALID_ARGUMENT, "--confirm is of one object; use --dry-run to see the plan of two")
     join_graph(domain)
-    labels, spots = _resolve(labels, spots)
     from openarm_grasp.ros.client import GraspClient
     from openarm_grasp.strategies.request import GraspRequest
 
@@ -83,31 +88,21 @@ def pick(
             if second:
                 first, other = (GraspRequest(**request) for request in wanted)
                 return _of_two(client.pick_two(first, other, **run), dry_run=dry_run)
-            result = client.pick(**wanted[0], phase=phase, **run)
+            ask = confirm and (_runs if sys.stdin.isatty() else True)
+            result = client.pick(**wanted[0], phase=phase, confirm=ask, **run)
         except KeyboardInterrupt:
             asked = {"labels": labels} if second else {"label": label}
             return Outcome(False, "cancelled by Ctrl-C; the robot holds where it is", Code.CANCELLED, asked)
+    times = _times_line(result.state_times)
     data, options = {**_result_row(result), "dry_run": dry_run}, result.options if dry_run else ()
     if dry_run:
         data["options"] = [_option_row(option) for option in options]
-    return Outcome(result.success, result.message, result.code, data, _options_table(options))
+    text = _options_table(options) + times + _kept(result.recording)
+    return Outcome(result.success, result.message, result.code, data, text)
 
 
-def _resolve(
-    labels: Sequence[str], spots: Sequence[tuple[float, float] | None]
-) -> tuple[Sequence[str], Sequence[tuple[float, float] | None]]:
-    """Return labels and positions; a request of several words is resolved to one of the detected objects."""
-    worded = [i for i, label in enumerate(labels) if " " in label.strip()]
-    if not worded:
-        return labels, spots
-    from openarm_bringup.ros import object_client
-
-    names, places = list(labels), list(spots)
-    for i, item in zip(worded, object_client.find([labels[i] for i in worded]), strict=True):
-        if places[i] is not None:
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"{labels[i]!r} says where it is; leave --at out")
-        names[i], places[i] = item.label, (float(item.p_base[0]), float(item.p_base[1]))
-    return names, places
+def _kept(recording: str) -> str:
+    return f"recording: {recording} (openarm check, openarm replay)\n" if recording else ""
 
 
 def _each(name: str, given: list[T] | None, labels: Sequence[str]) -> Sequence[T | None]:
@@ -121,6 +116,15 @@ def _each(name: str, given: list[T] | None, labels: Sequence[str]) -> Sequence[T
             f"--{name} is given {len(given)} times, expected {len(labels)}: once for each of {of}",
         )
     return given
+
+
+def _runs(plan: GraspStatus) -> bool:
+    """Show a plan on the terminal, and return whether it is to be executed."""
+    shown = console()
+    for line in (f"plan {plan.plan_id}:", *(f"  {part}" for part in plan.reason.split("; ")[:-1])):
+        shown.print(line, markup=False)
+    shown.print("run this plan? [y/N] ", end="", markup=False)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 class _Steps:
@@ -138,6 +142,9 @@ class _Steps:
         line = f"{stamp - self._first_s:7.2f} s  {label}[cyan]{status.state:<18}[/cyan]"
         self._console.print(line, end=" ")
         self._console.print(status.reason, markup=False)
+        if status.plan_id and not sys.stdin.isatty():
+            call = f'openarm service call /grasp/confirm "{{plan_id: {status.plan_id}, accept: true}}"'
+            self._console.print(f"confirm it by: {call}", markup=False, soft_wrap=True)
 
 
 def _option_row(option: Option) -> dict[str, Any]:
@@ -169,10 +176,20 @@ def _options_table(options: Sequence[Option]) -> str:
     return "\n".join(lines) + "\n(margin: to the nearest joint limit, on the approach and the retreat)\n"
 
 
+def _times_line(times: Sequence[StateTime]) -> str:
+    """Return a line of the time in each state; visits that took longer than expected say so."""
+    parts = [
+        f"{one.state} {one.duration:.1f}" + (f" (a visit of {one.longest:.1f} over {one.budget:g})" * one.exceeded)
+        for one in times
+    ]
+    return f"time in states, s: {', '.join(parts)}\n" if parts else ""
+
+
 def _result_row(result: GraspResult) -> dict[str, Any]:
-    names = ("outcome", "label", "arm", "route", "attempts", "duration")
+    names = ("outcome", "label", "arm", "route", "attempts", "duration", "recording")
     row = {name: getattr(result, name) for name in names}
-    return {**row, "place_position": list(result.place_position)}
+    times = [asdict(one) for one in result.state_times]
+    return {**row, "place_position": list(result.place_position), "state_times": times}
 
 
 def _of_two(result: PairResult, *, dry_run: bool) -> Outcome:
@@ -180,9 +197,10 @@ def _of_two(result: PairResult, *, dry_run: bool) -> Outcome:
         {"success": one.success, "code": str(one.code), "message": one.message, **_result_row(one)}
         for one in result.results
     ]
-    data = {name: getattr(result, name) for name in ("outcome", "simultaneous", "duration")}
+    data = {name: getattr(result, name) for name in ("outcome", "simultaneous", "duration", "recording")}
     data |= {"answers": answers, "dry_run": dry_run}
-    return Outcome(result.success, result.message, result.code, data)
+    text = "".join(f"{one.label}: {_times_line(one.state_times)}" for one in result.results)
+    return Outcome(result.success, result.message, result.code, data, text + _kept(result.recording))
 
 
 def order(
@@ -193,9 +211,9 @@ def order(
     `openarm order red --each 9` takes all that is red; with --bins, each class goes into its bin.
 
     Args:
-        labels: What to pick, in this order.
+        labels: What to pick, in this order: each words as for `pick`.
         bins: YAML with `bins` (rectangles x, y on the table, m), `classes` (bin of a label) and `rest` (bin of others).
-        each: Most objects of one label.
+        each: Most objects of each.
         timeout: Longest wait for one object, s.
     """
     from openarm_grasp.strategies.orders import Order, load_bins

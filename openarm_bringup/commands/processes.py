@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import psutil
 
 
-def ps(*, seconds: float = 0.5) -> Outcome:
+def ps(*, seconds: float = 0.3) -> Outcome:
     """List the running graphs and their nodes, with the CPU and memory of each (and of what it has started).
 
     Args:

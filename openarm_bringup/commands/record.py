@@ -14,9 +14,6 @@ from openarm_bringup.commands.connect import Domain, join_graph, stop_event
 from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code, OpenArmError
 
-#: Packages whose versions are kept in a bag.
-PACKAGES = ("openarm-vision", "mujoco", "numpy", "opencv-python-headless", "ros-jazzy-rclpy", "rosbags")
-
 
 def record(
     bag: Path | None = None,
@@ -37,13 +34,14 @@ def record(
         image_rate: Keep at most this many frames a second of each camera; 0 keeps all.
     """
     join_graph(domain)
-    from openarm_bringup.bags.ros.recorder import PROFILES, Recorder
+    from openarm_bringup.bags.ros.listener import PROFILES
+    from openarm_bringup.bags.ros.recorder import Recorder
 
     path = bag or Path(datetime.now().strftime("bag_%Y%m%d_%H%M%S"))
     number = int(os.environ.get("ROS_DOMAIN_ID") or "0")
     with (
         stop_event() as stop,
-        Recorder(number, path, topics or PROFILES[profile], _custom(number), image_rate) as recorder,
+        Recorder(number, path, topics or PROFILES[profile], _about(number), image_rate) as recorder,
     ):
         while not stop.is_set() and not recorder.wait_began(0.2):
             pass
@@ -144,6 +142,8 @@ def replay(
 def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update: bool = False) -> Outcome:
     """Run detection, map and board detection on a bag, and compare with golden numbers; for CI. Needs no graph.
 
+    A flight recording has none, so its reason and its numbers are shown.
+
     Args:
         bag: Folder of rosbag2, or an MCAP file.
         golden: File with the numbers that are expected; golden.json in the bag's folder when not given.
@@ -157,10 +157,18 @@ def check(bag: Path, *, golden: Path | None = None, scene: str = "demo", update:
 
     path = golden or (bag if bag.is_dir() else bag.parent) / "golden.json"
     with open_bag(bag) as opened, progress() as shown:
-        expected = {} if update and not path.exists() else stored.read(path)
+        # A flight recording shows what went wrong; nobody knows beforehand which numbers it should give.
+        shown_only = not update and golden is None and not path.exists() and "reason" in opened.custom
+        expected = {} if shown_only or (update and not path.exists()) else stored.read(path)
+        kept = {name: opened.custom[name] for name in ("reason", "request", "again") if name in opened.custom}
         task = shown.add_task("frames", total=None)
         numbers = numbers_of(opened, scene=scene, on_progress=lambda n, of: shown.update(task, completed=n, total=of))
-    data: dict[str, Any] = {"bag": str(bag), "golden": str(path), "numbers": numbers}
+    data: dict[str, Any] = {"bag": str(bag), "golden": str(path), "numbers": numbers, **kept}
+    if shown_only:
+        text = "\n".join(f"{name}: {value}" for name, value in {**kept, **numbers}.items())
+        return Outcome(
+            True, f"{len(numbers)} numbers of {bag}; --update stores them to compare with", data=data, text=text
+        )
     if update:
         stored.write(path, numbers, expected)
         return Outcome(True, f"{len(numbers)} numbers written to {path}", data=data)
@@ -179,15 +187,11 @@ def _split(pair: str) -> tuple[str, str]:
     return old, new
 
 
-def _custom(domain: int) -> dict[str, str]:
-    """Return what is kept with a bag: versions, and graph and parameters of the run that it is recorded from."""
+def _about(domain: int) -> dict[str, str]:
+    from openarm_bringup.bags.about import about
     from openarm_bringup.supervision import runs
-    from openarm_bringup.versions import versions
 
-    custom = versions(PACKAGES)
     try:
-        run = runs.the_running(domain)
+        return about(runs.the_running(domain))
     except OpenArmError:
-        return custom  # recorded from a graph that was started by other means
-    files = sorted(Path(run.run_dir, "params").glob("*.yaml"))
-    return custom | {"graph": run.graph, "parameters": "".join(path.read_text(encoding="utf-8") for path in files)}
+        return about(None)  # recorded from a graph that was started by other means

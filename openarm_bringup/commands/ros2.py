@@ -11,7 +11,7 @@ import time
 from collections import deque
 from contextlib import suppress
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
@@ -46,6 +46,38 @@ def topic_list(*, domain: Domain = None) -> Outcome:
     """List topics and their types."""
     with graph_peer(domain) as peer:
         return _listing(peer.topics(), "topics")
+
+
+@topic.command(name="type")
+def topic_type(name: str, *, domain: Domain = None) -> Outcome:
+    """Print the type of a topic.
+
+    Args:
+        name: Of the topic.
+    """
+    return _type("topic", name, domain)
+
+
+@topic.command(name="info")
+def topic_info(name: str, *, domain: Domain = None) -> Outcome:
+    """Show the type of a topic, and who publishes and subscribes to it with which quality of service.
+
+    Args:
+        name: Of the topic.
+    """
+    with graph_peer(domain) as peer:
+        found, kind = peer.find("topic", name)
+        ends = {"publishers": peer.endpoints(found, publish=True), "subscribers": peer.endpoints(found, publish=False)}
+    lines = [f"{found}  {kind}"]
+    for key, rows in ends.items():
+        lines += [f"  {key}:", *(f"    {row['node']}  {row['reliability']}, {row['durability']}" for row in rows)]
+    return Outcome(True, data={"topic": found, "type": kind, **ends}, text="\n".join(lines))
+
+
+def _type(what: Literal["topic", "service"], name: str, domain: int | None) -> Outcome:
+    with graph_peer(domain) as peer:
+        found, kind = peer.find(what, name)
+    return Outcome(True, data={what: found, "type": kind}, text=kind)
 
 
 @topic.command
@@ -135,22 +167,27 @@ def pub(
     name: str,
     *message: str,
     type_: Annotated[str, Parameter(name="--type")] = "",
-    rate: float = 0.0,
-    count: Count = 1,
+    rate: float | None = None,
+    duration: float | None = None,
+    count: Annotated[int | None, Parameter(name=["--count", "-n"])] = None,
+    once: bool = False,
     domain: Domain = None,
 ) -> Outcome:
-    """Publish a message, given as YAML.
+    """Publish a message, given as YAML: once, or as a stream.
 
     Args:
         name: Of the topic.
         message: Its fields, such as "{name: [a], position: [0.1]}"; what is left out keeps its default. As with ros2,
             the type may precede it.
         type_: Of the message, where no other node has the topic.
-        rate: Hz, with more than one.
-        count: How many.
+        rate: Hz of a stream, until Ctrl-C, or for as long or as often as is said; 10 where only that is said.
+        duration: End after this time, s.
+        count: End after this many messages.
+        once: Publish one message; what happens without the other options.
     """
     from openarm_bringup.messages import fill, interface, type_and_fields
 
+    most, hertz = _stream(rate, duration, count, once)
     with graph_peer(domain) as peer:
         asked, fields = type_and_fields(message)
         if asked or type_:
@@ -161,13 +198,35 @@ def pub(
         publisher = peer.node.create_publisher(interface(kind), found, 10)
         heard = peer.spin_until(publisher.get_subscription_count, 2.0)
         peer.spin_until(lambda: False, _SETTLE_S if heard else 0.0)
-        for i in range(count):
-            publisher.publish(filled)
-            peer.spin_until(lambda: False, 1.0 / rate if rate > 0.0 and i + 1 < count else 0.0)
+        sent, began = 0, time.monotonic()
+        with suppress(KeyboardInterrupt):  # ends the stream
+            while sent < most:
+                # By the clock, not by pauses: their errors would add up.
+                peer.spin_until(lambda: False, began + sent / hertz - time.monotonic())
+                publisher.publish(filled)
+                sent += 1
         if heard:
-            publisher.wait_for_all_acked()
-    text = f"{count} x {kind} on {found}" + ("" if heard else "; it has no subscriber")
-    return Outcome(heard, text, Code.OK if heard else Code.NOT_READY, {"topic": found, "type": kind})
+            peer.wait_delivered(publisher)
+    data = {"topic": found, "type": kind, "messages": sent}
+    text = f"{sent} x {kind} on {found}" + ("" if heard else "; it has no subscriber")
+    return Outcome(heard, text, Code.OK if heard else Code.NOT_READY, data)
+
+
+def _stream(rate: float | None, duration: float | None, count: int | None, once: bool) -> tuple[float, float]:
+    """Return how many messages are published, and at how many Hz.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for a value out of range, or `--once` with what makes a stream.
+    """
+    for flag, value, most in (("--rate", rate, 1e4), ("--duration", duration, 1e7), ("--count", count, 1e9)):
+        if value is not None and not 0.0 < value <= most:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"{flag} {value:g}: expected more than 0, at most {most:g}")
+        if value is not None and once:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"--once publishes one message; leave out {flag}")
+    hertz = 10.0 if rate is None else rate
+    limits = [] if count is None else [float(count)]
+    limits += [] if duration is None else [max(1.0, round(duration * hertz))]
+    return min(limits, default=1.0 if rate is None else float("inf")), hertz
 
 
 @service.command(name="list")
@@ -179,6 +238,16 @@ def service_list(*, all_: Annotated[bool, Parameter("--all")] = False, domain: D
     """
     with graph_peer(domain) as peer:
         return _listing(peer.services(all_=all_), "services")
+
+
+@service.command(name="type")
+def service_type(name: str, *, domain: Domain = None) -> Outcome:
+    """Print the type of a service.
+
+    Args:
+        name: Of the service.
+    """
+    return _type("service", name, domain)
 
 
 @service.command
@@ -337,11 +406,11 @@ def param_set(node: str, name: str, value: str, *, domain: Domain = None) -> Out
         name: Of the parameter.
         value: As YAML.
     """
-    import yaml
+    from openarm_common.config import parse_yaml
 
     with graph_peer(domain) as peer:
         parameters = peer.parameters(node)
-        accepted, reason = parameters.set(name, yaml.safe_load(value))
+        accepted, reason = parameters.set(name, parse_yaml(value, "the value", Code.INVALID_ARGUMENT))
     found = parameters.node
     data = {"node": found, "name": name, "value": value}
     if not accepted:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,8 +41,20 @@ def echo(target: str, source: str, *, domain: Domain = None) -> Outcome:
     """
     from openarm_common.se3 import inverse, quat_xyzw_from_matrix
 
-    edges = _listen(domain).edges
-    T = inverse(_to_root(edges, target)) @ _to_root(edges, source)
+    def connected(frames: Frames) -> bool:
+        if not frames.names() >= {target, source}:
+            return False
+        return _to_root(frames.edges, target)[0] == _to_root(frames.edges, source)[0]
+
+    frames = _listen(domain, connected)
+    for name in (target, source):
+        if name not in frames.names():
+            raise unknown("frame", name, frames.names())
+    (root, T_root_target), (other, T_root_source) = (_to_root(frames.edges, name) for name in (target, source))
+    if root != other:
+        message = f"{target!r} and {source!r} are not connected: they are in the trees of {root!r} and {other!r}"
+        raise OpenArmError(Code.NO_TRANSFORM, message)
+    T = inverse(T_root_target) @ T_root_source
     position, quaternion = T[:3, 3].tolist(), quat_xyzw_from_matrix(T[:3, :3]).tolist()
     data = {"target": target, "source": source, "position": position, "orientation": quaternion}
     text = "position    [m]  " + "  ".join(f"{value: .4f}" for value in position)
@@ -79,24 +91,22 @@ def tree(*, out: Path | None = None, domain: Domain = None) -> Outcome:
     return Outcome(True, f"{len(rows)} frames" + (f", drawn in {out}" if out else ""), data=data, text=text)
 
 
-def _listen(domain: int | None) -> Frames:
+def _listen(domain: int | None, enough: Callable[[Frames], object] = lambda _: False) -> Frames:
     with graph_peer(domain) as peer:
-        frames = peer.frames(_LISTEN_S)
+        frames = peer.frames(_LISTEN_S, enough)
     if not frames.edges:
         raise OpenArmError(Code.NO_TRANSFORM, "nothing on /tf and /tf_static: no discovered node publishes frames")
     return frames
 
 
-def _to_root(edges: Edges, frame: str) -> NDArray[np.float64]:
+def _to_root(edges: Edges, frame: str) -> tuple[str, NDArray[np.float64]]:
+    """Return the root of the tree of a frame, and the pose of the frame in it, (4, 4)."""
     import numpy as np
 
-    known = edges.keys() | {parent for parent, _, _ in edges.values()}
-    if frame not in known:
-        raise unknown("frame", frame, known)
     T, name = np.eye(4), frame
     for _ in range(len(edges) + 1):
         if name not in edges:
-            return T
+            return name, T
         name, T_parent, _ = edges[name]
         T = T_parent @ T
     raise OpenArmError(Code.NO_TRANSFORM, f"the frames from {frame!r} on form a loop")

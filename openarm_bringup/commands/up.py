@@ -79,6 +79,7 @@ async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
     try:
         async with running_graph(graph, run_dir, show) as supervisor:
             data["ready_s"] = round(await supervisor.wait_ready(), 2)
+            supervisor.daemon.start()  # it has nothing to compete with any more
             shown.print(
                 f"[bold green]{graph.name} is ready[/bold green] after {data['ready_s']:.1f} s: "
                 f"domain {data['domain']}, logs in {run_dir / 'logs'}; Ctrl-C stops it",

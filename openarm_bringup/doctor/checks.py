@@ -18,6 +18,9 @@ RCLPY_MAJOR = 7
 #: UDP ports that fifty participants of a domain take from its first one on.
 PORTS = 110
 PYTHONS = ((3, 11), (3, 12), (3, 13))
+#: ID → VERSION_ID of /etc/os-release that the suite is tested on, and the least glibc that the wheels are built for.
+SYSTEMS = (("debian", "12"), ("ubuntu", "24.04"))
+GLIBC = (2, 28)
 
 #: Distribution → (lowest version, first unsupported one, purpose); mujoco is checked first.
 WANTED: Mapping[str, tuple[tuple[int, ...], tuple[int, ...] | None, str]] = {
@@ -68,6 +71,24 @@ def error(name: str, observed: str, advice: str) -> Finding:
 def version_tuple(text: str) -> tuple[int, ...]:
     """Return the leading numbers of a version."""
     return tuple(int(part) for part in re.findall(r"\d+", text.split("+")[0])[:3])
+
+
+def check_system(os_release: Mapping[str, str], libc: tuple[str, str]) -> Finding:
+    """Check the operating system: one that is tested, one that is not, or one where the wheels can't be loaded.
+
+    Args:
+        os_release: Fields of /etc/os-release; empty where there is none.
+        libc: Name and version of the C library, such as ("glibc", "2.36"); empty when they are unknown.
+    """
+    name, (library, version) = os_release.get("PRETTY_NAME") or os_release.get("ID") or "unknown", libc
+    observed = f"{name}, {library or 'unknown C library'} {version}".rstrip()
+    if library != "glibc" or version_tuple(version) < GLIBC:
+        advice = f"the wheels need glibc {'.'.join(map(str, GLIBC))} or later, as Debian 12 and Ubuntu 24.04 have"
+        return error("system", observed, advice)
+    if (os_release.get("ID", ""), os_release.get("VERSION_ID", "")) in SYSTEMS:
+        return ok("system", f"{observed}: supported")
+    advice = "tested are Debian 12 and Ubuntu 24.04; what fails here may work there, or in a container of one of them"
+    return note("system", f"{observed}: not among the tested ones", advice)
 
 
 def check_python(version: tuple[int, int], system: str, machine: str) -> Finding:

@@ -6,9 +6,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from openarm_bringup.doctor.checks import Finding, error, note, ok
+from openarm_bringup.supervision.runs import RECORDINGS, recordings
 
 if TYPE_CHECKING:
     from openarm_bringup.supervision.runs import RunRecord
@@ -66,6 +68,15 @@ def check_status(run: RunRecord, status: GraphStatus) -> list[Finding]:
         )
         return [error("graph", f"no node of {run.graph} is discovered in domain {run.domain}", advice)]
     return [*_rates(run, status), *_diagnostics(run, status), *_clash(run, status)]
+
+
+def check_recordings(run_dir: Path) -> Finding:
+    """List the flight recordings of a run: what failed requests have left."""
+    found = recordings(run_dir / RECORDINGS)
+    if not found:
+        return ok("recordings", f"{run_dir.name}: no request has failed")
+    names = ", ".join(path.name for path in found)
+    return note("recordings", f"{run_dir.name}: {names}", f"`openarm check {found[-1]}` shows the newest")
 
 
 def _rates(run: RunRecord, status: GraphStatus) -> list[Finding]:

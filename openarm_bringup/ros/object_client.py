@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from vision_msgs.msg import Detection3DArray
 
 from openarm_common.detection import Detection
@@ -12,7 +10,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import ContextNode
 from openarm_common.ros.detections import detections_from_msg
 from openarm_common.ros.node import reliable
-from openarm_perception.detection.attributes import parse, resolve
+from openarm_common.wanted import select
 
 
 class DetectionListener(ContextNode):
@@ -40,13 +38,11 @@ class DetectionListener(ContextNode):
         self._found = [detection for detection in detections_from_msg(message) if detection.measured]
 
 
-def find(requests: Sequence[str], timeout: float = 20.0) -> list[Detection]:
-    """Return the objects that requests in words select, such as "red cube left of the can".
+def find(words: str, timeout: float = 20.0) -> Detection:
+    """Return the object that words select, such as "red cube left of the can".
 
     Raises:
-        OpenArmError: TIMEOUT, when the detector publishes nothing; as `parse` and `resolve`.
+        OpenArmError: TIMEOUT, when the detector publishes nothing; as `openarm_common.wanted.select`.
     """
     with DetectionListener() as listener:
-        observed = listener.next(timeout)
-    labels = [item.label for item in observed]
-    return [resolve(parse(request, labels), observed) for request in requests]
+        return select(words, listener.next(timeout))[0]

@@ -6,11 +6,14 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping
+from itertools import count
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile
@@ -32,20 +35,38 @@ _FIRST_NODE_S = 4.0
 #: Services that every node has.
 _OF_ALL_NODES = ("rcl_interfaces/srv/", "type_description_interfaces/srv/")
 _ANSWER_S = 5.0
+_NUMBERS = count()
 
 
 class Peer(ContextNode):
     """A hidden node; a context manager, in which the nodes that run are discovered.
 
+    Args:
+        context: Of `new_context`, where many peers share what is discovered; without it one of its own.
+        check: Called whenever it waits; what it raises is raised there.
+        settled: What is discovered is not still growing.
+
     Raises:
         OpenArmError: NOT_READY, on entering, when no node runs.
     """
 
-    def __init__(self) -> None:
-        super().__init__(f"_openarm_cli_{os.getpid()}", bare=True)  # hidden, as those of ros2cli
+    def __init__(
+        self, context: Context | None = None, *, check: Callable[[], None] | None = None, settled: bool = False
+    ) -> None:
+        name = f"_openarm_cli_{os.getpid()}_{next(_NUMBERS)}"  # hidden, as those of ros2cli
+        super().__init__(name, bare=True, context=context)
         self.node = self._node
+        self._check, self._settled = check, settled
 
     def __enter__(self) -> Peer:
+        try:
+            self._discover()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def _discover(self) -> None:
         began = changed = time.monotonic()
         before: Any = None
         domain = self._context.get_domain_id()
@@ -54,18 +75,24 @@ class Peer(ContextNode):
             known = (self.nodes(), self.topics(), self.services())
             if known != before:
                 before, changed = known, now
-            elif now - changed > _QUIET_S and known[0] and (there <= set(known[0]) or now - began > _DISCOVERY_S / 2):
-                break
-            self._executor.spin_once(timeout_sec=0.05)
+            quiet = self._settled or now - changed > _QUIET_S
+            if quiet and known[0] and (there <= set(known[0]) or now - began > _DISCOVERY_S / 2):
+                return
+            self.spin_until(lambda: False, 0.05)
         if not self.nodes():
-            self.close()
             reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
             raise OpenArmError(
                 Code.NOT_READY,
                 f"no node is discovered in domain {domain} (ROS_AUTOMATIC_DISCOVERY_RANGE={reach}); start a graph with "
                 "`openarm up`, or set both as they are set where it runs (--domain N says the domain, too)",
             )
-        return self
+
+    def spin_until(self, condition: Callable[[], Any], seconds: float) -> bool:
+        """Handle what arrives until a condition holds; return whether it did in time."""
+        if self._check is None:
+            return super().spin_until(condition, seconds)
+        check = self._check
+        return super().spin_until(lambda: check() or condition(), seconds)
 
     def nodes(self) -> list[str]:
         """Full names of the nodes, without hidden ones."""
@@ -79,7 +106,7 @@ class Peer(ContextNode):
     def services(self, *, all_: bool = True) -> dict[str, str]:
         """Type by service, without those of actions and of hidden nodes; `all_` includes those that every node has."""
         found = {name: kinds[0] for name, kinds in self.node.get_service_names_and_types()}
-        names = [name for name in found if "/_action/" not in name and "/_openarm_cli" not in name]
+        names = [name for name in found if "/_action/" not in name and "/_openarm_" not in name]
         return {name: found[name] for name in names if all_ or not found[name].startswith(_OF_ALL_NODES)}
 
     def actions(self) -> dict[str, str]:
@@ -108,6 +135,20 @@ class Peer(ContextNode):
         """The quality of service with which every publisher of a topic is received."""
         return offered_qos(self.node, topic, 100)
 
+    def endpoints(self, topic: str, *, publish: bool) -> list[dict[str, str]]:
+        """Node, reliability and durability of each publisher or subscriber of a topic, without hidden nodes."""
+        ask = self.node.get_publishers_info_by_topic if publish else self.node.get_subscriptions_info_by_topic
+        rows = [
+            {
+                "node": f"{info.node_namespace.rstrip('/')}/{info.node_name}",
+                "reliability": info.qos_profile.reliability.name.lower(),
+                "durability": info.qos_profile.durability.name.lower(),
+            }
+            for info in ask(topic)
+            if not info.node_name.startswith("_")
+        ]
+        return sorted(rows, key=lambda row: row["node"])
+
     def action_client(self, kind: Any, name: str) -> Any:
         """A client of an action whose server answers.
 
@@ -127,6 +168,10 @@ class Peer(ContextNode):
         if not self.spin_until(server_is_ready, _ANSWER_S):
             raise OpenArmError(Code.NOT_READY, f"{name} does not answer")
 
+    def wait_delivered(self, publisher: Any) -> None:
+        """Wait until reliable subscribers have what was published, or do not answer."""
+        publisher.wait_for_all_acked(Duration(seconds=_ANSWER_S))
+
     def parameters(self, node: str) -> ParametersOf:
         """The parameters of a node.
 
@@ -135,8 +180,8 @@ class Peer(ContextNode):
         """
         return ParametersOf(self, self.find("node", node)[0])
 
-    def frames(self, seconds: float) -> Frames:
-        """Return what is published on /tf and /tf_static within a time, s."""
+    def frames(self, seconds: float, enough: Callable[[Frames], object] = lambda _: False) -> Frames:
+        """Return what is published on /tf and /tf_static within a time, s, or until it is enough."""
         frames = Frames()
         for topic, static, qos in (("/tf_static", True, QOS_STATIC_TF), ("/tf", False, QOS_TF)):
 
@@ -144,7 +189,7 @@ class Peer(ContextNode):
                 frames.add(message, info["publication_sequence_number"], static)
 
             self.node.create_subscription(TFMessage, topic, add, qos)
-        self.spin_until(lambda: False, seconds)
+        self.spin_until(lambda: enough(frames), seconds)
         return frames
 
 
@@ -160,6 +205,10 @@ class Frames:
         self.edges: dict[str, tuple[str, NDArray[np.float64], bool]] = {}
         self.clashes: dict[str, str] = {}
         self._last: dict[str, int] = {}
+
+    def names(self) -> set[str]:
+        """Names of all frames."""
+        return self.edges.keys() | {parent for parent, _, _ in self.edges.values()}
 
     def add(self, message: TFMessage, number: int, static: bool) -> None:
         """Add a message; `number` counts those of its publisher: with two publishers of a frame it goes back."""

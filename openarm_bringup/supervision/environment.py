@@ -40,20 +40,24 @@ def ros_environment(graph: Graph, environ: Mapping[str, str] = os.environ) -> di
     return variables(domain_id(graph, environ), graph.discovery)
 
 
-def node_environment(graph: Graph, name: str, run_dir: Path, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return the whole environment of one node; writes its Fast DDS profile when it has one."""
-    spec = graph.node(name)
-    env = {**environ, **ros_environment(graph, environ)}
+def client_environment(graph: Graph, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """Return the whole environment of a process that meets the graph."""
+    env = {**environ, **ros_environment(graph, environ), "PYTHONUNBUFFERED": "1"}
     env.pop("ROS_LOCALHOST_ONLY", None)  # deprecated, and would override the discovery range
-    env["PYTHONUNBUFFERED"] = "1"
     env.setdefault("RCUTILS_CONSOLE_OUTPUT_FORMAT", "[{severity}] {message}")
+    if graph.discovery in ACROSS_MACHINES:
+        env[PROFILE] = str(network_profile())
     # The nodes share few cores; a pool of BLAS threads in each would only fight over them.
     for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         env.setdefault(key, "1")
+    return env
+
+
+def node_environment(graph: Graph, name: str, run_dir: Path, environ: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """Return the whole environment of one node; writes its Fast DDS profile when it has one."""
+    spec, env = graph.node(name), client_environment(graph, environ)
     if spec.large_messages:
         env[PROFILE] = str(write_profile(spec, run_dir / "params" / f"{name}.fastdds.xml"))
-    elif graph.discovery in ACROSS_MACHINES:
-        env[PROFILE] = str(network_profile())
     return {**env, **spec.env}
 
 

@@ -13,12 +13,11 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import yaml
 from pydantic import Field, model_validator
 
 from openarm_bringup.supervision.discovery import LAST_DOMAIN, Discovery
 from openarm_bringup.supervision.params import flatten, read_params, substitute
-from openarm_common.config import Config, ConfigT, load_yaml, validate
+from openarm_common.config import Config, ConfigT, brief, load_yaml, parse_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 
@@ -162,24 +161,6 @@ class Graph(Config):
         return validate(model, nested, f"parameters of {name} in graph {self.name}")
 
 
-class _UniqueKeys(yaml.SafeLoader):
-    """A YAML loader that refuses a key given twice, which YAML would let the last one win."""
-
-
-def _mapping(loader: _UniqueKeys, node: yaml.MappingNode) -> dict[Any, Any]:
-    seen: set[Any] = set()
-    for key_node, _ in node.value:
-        key = loader.construct_object(key_node, deep=True)  # pyright: ignore[reportUnknownMemberType]
-        if key in seen:
-            mark = key_node.start_mark
-            raise yaml.constructor.ConstructorError(None, None, f"{key!r} is given twice", mark)
-        seen.add(key)
-    return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
-
-
-_UniqueKeys.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
-
-
 def graph_names() -> list[str]:
     """Return the names of the graphs that come with the suite."""
     return sorted(path.stem for path in (config_dir() / "graphs").glob("*.yaml"))
@@ -236,7 +217,7 @@ def _read(path: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
         raise OpenArmError(
             Code.CONFIG_INVALID, f"{path}:extends: {' → '.join(p.name for p in (*trail, path))} is a circle"
         )
-    graph: dict[str, Any] = {"name": path.stem, **load_yaml(path, loader=_UniqueKeys)}
+    graph: dict[str, Any] = {"name": path.stem, **load_yaml(path)}
     base_name, only = graph.pop("extends", None), graph.pop("only", None)
     if base_name is not None:
         sibling = path.parent / f"{base_name}.yaml"
@@ -304,7 +285,4 @@ def set_parameter(graph: Graph, item: str) -> None:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"--set {item}: expected node.param=value, such as grasp.velocity_scale=0.5"
         )
-    try:
-        graph.node(node).params[param] = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"--set {item}: {text!r} is not a value in YAML: {error}") from error
+    graph.node(node).params[param] = parse_yaml(text, f"--set {brief(item)}: the value", Code.INVALID_ARGUMENT)

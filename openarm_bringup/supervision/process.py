@@ -43,8 +43,16 @@ class NodeProcess:
         self._pump = asyncio.create_task(self._copy_output())
 
     @classmethod
-    async def start(cls, argv: Sequence[str], env: Mapping[str, str], log: Path) -> NodeProcess:
+    async def start(
+        cls, argv: Sequence[str], env: Mapping[str, str], log: Path, *, pass_fds: Sequence[int] = ()
+    ) -> NodeProcess:
         """Start a command in a new session, so that signals reach its whole group and none from the terminal do.
+
+        Args:
+            argv: The command.
+            env: Its whole environment.
+            log: File for what it prints.
+            pass_fds: Open files that it inherits.
 
         Raises:
             OpenArmError: ENVIRONMENT, when the command can't be started.
@@ -57,6 +65,7 @@ class NodeProcess:
                 stdout=asyncio.subprocess.PIPE,
                 stderr=asyncio.subprocess.STDOUT,
                 start_new_session=True,
+                pass_fds=pass_fds,
             )
         except OSError as error:
             raise OpenArmError(Code.ENVIRONMENT, f"{argv[0]} could not be started: {error}") from error

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
+import re
 from collections.abc import Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
@@ -19,8 +19,12 @@ from typing import Any
 import psutil
 from pydantic import ValidationError
 
+from openarm_bringup.supervision.state import state_dir
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
+
+#: Folder of a run with its flight recordings, and the name of one.
+RECORDINGS, RECORDING = "recordings", re.compile(r"\d+_\w+")
 
 
 class NodeRecord(Config):
@@ -92,14 +96,6 @@ def new_run_dir(root: Path | None = None) -> Path:
     return folder
 
 
-def state_dir(environ: Mapping[str, str] = os.environ) -> Path:
-    """Return the folder of records of running graphs."""
-    runtime = environ.get("XDG_RUNTIME_DIR")
-    if runtime and os.access(runtime, os.W_OK):
-        return Path(runtime) / "openarm"
-    return Path(tempfile.gettempdir()) / f"openarm-{os.getuid()}"
-
-
 def write_record(record: RunRecord) -> Path:
     """Write the record of this supervisor, atomically."""
     folder = state_dir()
@@ -154,6 +150,11 @@ def the_running(domain: int | None = None) -> RunRecord:
     raise OpenArmError(Code.INVALID_ARGUMENT, f"several graphs are running: {listed}; choose one with --domain")
 
 
+def own() -> RunRecord | None:
+    """Return the graph whose supervisor has started this process; None when another program has."""
+    return next((run for run in running() if run.pid == os.getppid()), None)
+
+
 def refuse_twins(domain: int, nodes: Iterable[str]) -> None:
     """Refuse nodes that run in a domain already: commands would reach both of a name.
 
@@ -168,6 +169,17 @@ def refuse_twins(domain: int, nodes: Iterable[str]) -> None:
                 f"{run.graph} (supervisor {run.pid}) runs in domain {domain} and has {', '.join(twins)} already: end "
                 "it with Ctrl-C where it was started, or start this one in a domain of its own (--domain)",
             )
+
+
+def recordings(folder: Path) -> list[Path]:
+    """Return the flight recordings in a folder, `NN_CODE`, the oldest first; none when there is no such folder."""
+    found = [path for path in folder.iterdir() if RECORDING.fullmatch(path.name)] if folder.is_dir() else []
+    return sorted(found, key=recording_number)
+
+
+def recording_number(path: Path) -> int:
+    """Return the number of a flight recording, which is in its name."""
+    return int(path.name.partition("_")[0])
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:

@@ -22,6 +22,7 @@ from typing import TypeVar
 import psutil
 
 from openarm_bringup.supervision import environment, guard, runs, shm
+from openarm_bringup.supervision.activation import Activation
 from openarm_bringup.supervision.graph import Graph
 from openarm_bringup.supervision.keeper import Keeper, NodeState, Probe
 from openarm_bringup.supervision.process import Ladder
@@ -77,6 +78,7 @@ class Supervisor:
         self.stop_asked = asyncio.Event()
         self.ladder, self.poll = ladder or Ladder(), poll
         self._keepers = {name: Keeper(name, self) for name in self.graph.nodes}
+        self.daemon = Activation(self)
 
     async def start(self) -> None:
         """Begin to start the nodes; returns at once.
@@ -103,6 +105,7 @@ class Supervisor:
             watcher = asyncio.create_task(keeper.keep([self._keepers[need] for need in keeper.spec.needs]))
             watcher.add_done_callback(lambda task, keeper=keeper: self._watcher_ended(keeper, task))
             self._watchers.append(watcher)
+        self.daemon.open()
         self._record()
 
     async def wait_ready(self) -> float:
@@ -142,6 +145,7 @@ class Supervisor:
     async def stop(self) -> None:
         """Stop every node, dependents before their needs, and leave nothing behind."""
         self.stop_asked.set()
+        await self.daemon.close()
         async with self.spawning:  # a process that is being started is known before its watcher is cancelled
             for watcher in self._watchers:
                 watcher.cancel()
@@ -156,7 +160,7 @@ class Supervisor:
         if self._probe is not None and (await asyncio.wait([self._probe])) and self._probe.exception() is None:
             await self.ask(lambda probe: probe.close())
         self._threads.shutdown()
-        mapped = set().union(*(keeper.mapped for keeper in self._keepers.values()))
+        mapped = self.daemon.mapped.union(*(keeper.mapped for keeper in self._keepers.values()))
         swept = await asyncio.to_thread(lambda: shm.sweep(mapped | shm.names_of(environment.domain_id(self.graph))))
         self.say(f"removed from /dev/shm: {', '.join(swept) or 'nothing'}")
         await self._dismiss_guard()

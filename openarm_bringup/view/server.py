@@ -48,6 +48,14 @@ class Order(Config):
     label: str = Field(default="", max_length=64, description="what to pick; empty = the best detection")
     arm: Literal["auto", "left", "right"] = "auto"
     dry_run: bool = False
+    confirm: bool = False
+
+
+class Confirmation(Config):
+    """The answer of a person to the plan that waits."""
+
+    plan_id: str = Field(max_length=64, description="of the plan")
+    accept: bool = Field(description="execute it; false: end the request")
 
 
 class Reset(Config):
@@ -109,6 +117,7 @@ class ViewServer:
         app.router.add_get("/", self._page)
         app.router.add_get("/socket", self._socket)
         app.router.add_post("/pick", self._pick)
+        app.router.add_post("/confirm", self._confirm)
         app.router.add_post("/cancel", self._cancel)
         app.router.add_post("/reset", self._reset)
         app.router.add_get("/{name:.+}", self._file)
@@ -218,6 +227,10 @@ class ViewServer:
 
     def _outcome(self, **values: Any) -> None:
         self.put(Item("states", "outcome", json.dumps({"kind": "outcome", **values})))
+
+    async def _confirm(self, request: web.Request) -> web.Response:
+        answer = await _body(request, Confirmation)
+        return await _answer(lambda: self._view.confirm(answer))
 
     async def _cancel(self, _: web.Request) -> web.Response:
         return await _answer(self._view.cancel)

@@ -12,11 +12,10 @@ from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError, field_validator, model_validator
 
-from openarm_common.config import Config, describe_faults
+from openarm_common.config import Config, brief, describe_faults, parse_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 
@@ -214,12 +213,9 @@ def read_board(text: str, where: str = "board") -> Board:
     Raises:
         OpenArmError: CONFIG_INVALID, naming `where` and what is wrong.
     """
-    try:
-        keys: Any = yaml.safe_load(text) if text else {}
-    except yaml.YAMLError as error:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{where} {text!r} is not YAML: {error}") from error
+    keys: Any = parse_yaml(text, where) if text else {}
     if not isinstance(keys, dict):
         raise OpenArmError(
-            Code.CONFIG_INVALID, f"{where} is {text!r}, expected keys and values, such as {{kind: charuco}}"
+            Code.CONFIG_INVALID, f"{where} is {brief(text)}, expected keys and values, such as {{kind: charuco}}"
         )
     return parse_board(keys, where)  # pyright: ignore[reportUnknownArgumentType]

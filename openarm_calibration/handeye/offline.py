@@ -141,7 +141,7 @@ def judged(
         offset, angle = mount_error(X, refined)
         sigma_t, sigma_r = float(np.hypot(sigma_t, offset)), float(np.hypot(sigma_r, angle))
     calibration = StoredCalibration.of_mount(
-        samples.head.camera, samples.head.parent, X @ se3.inverse(T_LINK_OPTICAL),
+        samples.head.camera, samples.head.parent, X @ se3.inverse(T_LINK_OPTICAL), intrinsics=problem.intrinsics[0],
         sigma_translation=sigma_t, sigma_rotation=sigma_r, mount_seed=samples.head.mount_seed, method=algorithm,
         board=samples.board.label, samples=int(np.count_nonzero(solution.used)), session=session, created=created,
         versions=versions(),

@@ -8,13 +8,18 @@ Example:
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 
 from openarm_interfaces.action import AutoCalibrate
-from openarm_interfaces.srv import GetSampleList, RemoveSample, SampleFile, TakeSample
+from openarm_interfaces.srv import GetSampleList, MeasureTable, RemoveSample, SampleFile, SaveTable, TakeSample
 
 from openarm_common.errors import Code
 from openarm_common.ros.client import BackgroundNode
+
+#: Nodes that measure the table, by camera; and how long they may need for an image, s.
+DETECTORS = {"overhead": "detector", "wrist": "wrist_detector"}
+_IMAGE_S, _AGAIN_S = 10.0, 0.25
 
 OnFeedback = Callable[[AutoCalibrate.Feedback], None]
 
@@ -83,3 +88,24 @@ class CalibrationClient(BackgroundNode):
     def save_samples(self, path: str) -> SampleFile.Response:
         """Write the samples to a session file."""
         return self.call(SampleFile, "/calibration/save_samples", SampleFile.Request(path=path))
+
+    def measure_table(self, camera: str, block_height: float = 0.0, label: str = "") -> MeasureTable.Response:
+        """Measure the height of the table by a camera's detector, which waits for its next image.
+
+        Args:
+            camera: One of `DETECTORS`.
+            block_height: Of a block whose top is measured, m; 0: the surface of the table.
+            label: Of that block.
+        """
+        request = MeasureTable.Request(block_height=block_height, label=label)
+        deadline = time.monotonic() + _IMAGE_S
+        while True:
+            answer = self.call(MeasureTable, f"/{DETECTORS[camera]}/measure_table", request)
+            if answer.code != Code.NOT_READY or time.monotonic() > deadline:
+                return answer
+            time.sleep(_AGAIN_S)  # the image was asked for just now
+
+    def save_table(self, measured: MeasureTable.Response, method: str) -> SaveTable.Response:
+        """Store a measured height; every node takes it over."""
+        request = SaveTable.Request(height=measured.height, std=measured.std, tilt=measured.tilt, method=method)
+        return self.call(SaveTable, "/calibration_publisher/save_table", request)

@@ -36,7 +36,8 @@ from openarm_calibration.ros.image_capture import ImageCapture, grey
 from openarm_calibration.sampling.gate import Matched, match
 from openarm_calibration.sampling.next_pose import advice
 from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead, head_of, load_session, session_path
-from openarm_calibration.store.store import CalibrationStore, default_folder, now
+from openarm_calibration.store.records import default_folder, now
+from openarm_calibration.store.store import CalibrationStore
 from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.answers import answer_async

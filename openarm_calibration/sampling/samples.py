@@ -12,12 +12,13 @@ import hashlib
 import io
 import json
 import math
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 import cv2
 import numpy as np
@@ -280,8 +281,8 @@ def load_session(path: Path, description: RobotDescription) -> tuple[SampleSet, 
     Raises:
         OpenArmError: CONFIG_INVALID, when it is missing, damaged, no session, or of another robot.
     """
-    _require_archive(path)
     try:
+        _require_archive(path)
         with np.load(path, allow_pickle=False) as data:
             text = bytes(data["head"]).decode()
             document = json.loads(text)
@@ -289,15 +290,28 @@ def load_session(path: Path, description: RobotDescription) -> tuple[SampleSet, 
             out = SampleSet(head, description)
             for k, entry in enumerate(document["samples"]):
                 out.add(_sample(entry, {name: data[f"{name}_{k}"] for name in _ARRAYS}, out))
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+    except _DAMAGED as error:
         raise OpenArmError(
             Code.CONFIG_INVALID, f"{path} is no session file, or damaged: {type(error).__name__}: {error}"
         ) from error
     return out, hashlib.sha256(text.encode()).hexdigest()
 
 
+#: What reading an altered archive of JSON and arrays ends in; RuntimeError: encrypted, or nested too deeply.
+_DAMAGED = (
+    AttributeError, EOFError, LookupError, OSError, OverflowError, RuntimeError, TypeError, ValueError, struct.error,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+#: Largest array, and the sum of all, unpacked, bytes.
+_MAX_ARRAY, _MAX_SESSION = 64 * 2**20, 512 * 2**20
+
+
 def _require_archive(path: Path) -> None:
-    """Say what a file is that is no archive at all."""
+    """Refuse what is no archive of arrays, or would fill the memory, before anything of it is unpacked.
+
+    Raises:
+        OpenArmError: CONFIG_INVALID.
+    """
     try:
         with path.open("rb") as file:
             begin = file.read(2)
@@ -308,6 +322,31 @@ def _require_archive(path: Path) -> None:
     if begin != b"PK":
         what = "is empty" if not begin else "is no session file: expected an .npz archive of samples"
         raise OpenArmError(Code.CONFIG_INVALID, f"{path} {what}")
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        largest, total = max((m.file_size for m in members), default=0), sum(m.file_size for m in members)
+        if largest > _MAX_ARRAY or total > _MAX_SESSION:
+            raise OpenArmError(
+                Code.CONFIG_INVALID,
+                f"{path} unpacks to {total / 2**20:.0f} MiB, its largest array to {largest / 2**20:.0f} MiB; expected"
+                f" at most {_MAX_SESSION // 2**20} and {_MAX_ARRAY // 2**20} MiB",
+            )
+        for member in members:
+            with archive.open(member) as file:
+                _require_array(file, member)
+
+
+def _require_array(file: IO[bytes], member: zipfile.ZipInfo) -> None:
+    """Refuse an array whose header says more than its data.
+
+    Raises:
+        ValueError: When there is no header, or it does not fit.
+    """
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize > member.file_size:
+        raise ValueError(f"{member.filename}: {dtype} of shape {shape} in {member.file_size} bytes")
 
 
 def _sample(entry: dict[str, Any], arrays: Mapping[str, NDArray[Any]], samples: SampleSet) -> Sample:

@@ -1,32 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stored calibrations: one YAML a camera, checked by its own hash, with history and rollback.
+"""Stored calibrations, one of each camera.
 
-A mount is `T_parent_link` of the camera (position in m, quaternion x, y, z, w; link frame x forward, z up). Files are
-written to another name and renamed, so that a reader gets an old or a new one, never a part. A damaged file is
-refused, and the newest good one of the history takes its place.
+A mount is `T_parent_link` of the camera (position in m, quaternion x, y, z, w; link frame x forward, z up).
 """
 
 from __future__ import annotations
 
-import contextlib
-import datetime
-import hashlib
-import json
-import os
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from pydantic import Field, field_validator
 
+from openarm_calibration.store.records import Found, Record, RecordStore
 from openarm_common import se3
-from openarm_common.config import Config, load_yaml, validate
-from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import config_dir, write_whole
+from openarm_common.camera.cameras import Intrinsics
+from openarm_common.config import Config, validate
+from openarm_common.errors import OpenArmError
+from openarm_common.resources import config_dir
 from openarm_common.types import Array
 
 
@@ -59,14 +51,14 @@ class PublisherConfig(StoreConfig):
     """Parameters of the node `calibration_publisher`."""
 
     period: float = Field(default=0.5, gt=0.0, le=60.0, description="of the checks of the store, s of wall clock")
-    nominal: bool = Field(default=False, description="publish the mounts of the configuration whatever is stored")
+    nominal: bool = Field(default=False, description="publish mounts and table of the configuration whatever is stored")
+    scene: str = Field(default="demo", description="scene whose table it is, where no height of it was measured")
 
 
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 _FORMAT = 1
 
 
-class StoredCalibration(Config):
+class StoredCalibration(Record):
     """The mount of one camera and where it comes from."""
 
     format: int = Field(default=_FORMAT, ge=_FORMAT, le=_FORMAT, description="of this file")
@@ -74,6 +66,9 @@ class StoredCalibration(Config):
     parent: str = Field(min_length=1, description="link that carries the camera")
     position: tuple[float, float, float] = Field(description="of <camera>_link in the parent, m")
     quaternion_xyzw: tuple[float, float, float, float] = Field(description="of <camera>_link in the parent")
+    intrinsics: Intrinsics | None = Field(
+        default=None, description="of the camera, that this mount was found with; files of old have none"
+    )
     sigma_translation: float = Field(default=0.0, ge=0.0, description="predicted error of the position, m")
     sigma_rotation: float = Field(default=0.0, ge=0.0, description="predicted error of the rotation, rad")
     mount_seed: int | None = Field(
@@ -93,6 +88,13 @@ class StoredCalibration(Config):
             raise ValueError("expected finite numbers")
         if len(value) == 4 and abs(float(np.linalg.norm(value)) - 1.0) > 1e-3:
             raise ValueError("expected a unit quaternion")
+        return value
+
+    @field_validator("intrinsics")
+    @classmethod
+    def _of_a_camera(cls, value: Intrinsics | None) -> Intrinsics | None:
+        if value is not None and not (np.isfinite(value.matrix).all() and min(value.fx, value.fy, value.width) > 0):
+            raise ValueError("expected a size, focal lengths above 0 and a principal point")
         return value
 
     @property
@@ -116,170 +118,30 @@ class StoredCalibration(Config):
         }
         return validate(cls, {"camera": camera, "parent": parent, **mount, **provenance}, f"calibration of {camera!r}")
 
-    def digest(self) -> str:
-        """Return the hash of all fields."""
-        text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
+    @property
+    def name(self) -> str:
+        """The camera."""
+        return self.camera
+
+    def fields(self) -> dict[str, Any]:
+        """Return what is written and hashed; a file of old has no intrinsics and keeps its hash."""
+        return self.model_dump(mode="json", exclude={"intrinsics"} if self.intrinsics is None else None)
 
 
-@dataclass(frozen=True)
-class Found:
-    """What the store has for a camera: the calibration, and what was wrong with the file when it is an older one."""
-
-    calibration: StoredCalibration
-    warning: str = ""
-
-
-class CalibrationStore:
-    """A folder of calibrations.
+class CalibrationStore(RecordStore[StoredCalibration]):
+    """A folder of calibrations, one of each camera.
 
     Args:
         folder: Where; made at the first save.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def path(self, camera: str) -> Path:
-        """Return the file of a camera.
-
-        Raises:
-            OpenArmError: INVALID_ARGUMENT, for a name that could lead elsewhere.
-        """
-        return self.folder / f"{checked_name(camera)}.yaml"
-
-    def cameras(self) -> tuple[str, ...]:
-        """Return the names of the cameras that have a file, damaged or not."""
-        return tuple(sorted(p.stem for p in self.folder.glob("*.yaml") if _NAME.fullmatch(p.stem)))
-
-    def save(self, calibration: StoredCalibration) -> Path:
-        """Make it the camera's calibration; the one before stays in the history.
-
-        Raises:
-            OpenArmError: ENVIRONMENT, when the folder can't be written.
-        """
-        path = self.path(calibration.camera)
-        digest = calibration.digest()
-        text = yaml.safe_dump({**calibration.model_dump(mode="json"), "sha256": digest}, sort_keys=False)
-        number = 1 + max(map(_number, self._past(calibration.camera)), default=0)
-        write_whole(self._history(calibration.camera) / f"{number:06d}-{digest[:12]}.yaml", text.encode())
-        write_whole(path, text.encode())
-        return path
-
-    def load(self, camera: str) -> StoredCalibration:
-        """Read the camera's calibration.
-
-        Raises:
-            OpenArmError: CONFIG_INVALID, when there is none or it is damaged, saying how.
-        """
-        path = self.path(camera)
-        if not path.is_file():
-            known = ", ".join(self.cameras()) or "none"
-            raise OpenArmError(
-                Code.CONFIG_INVALID, f"no calibration of {camera!r} in {self.folder}; stored cameras: {known}"
-            )
-        return read(path)
-
-    def find(self, camera: str) -> Found | None:
-        """Return the camera's calibration, or the newest good one before it; None when nothing was ever stored.
-
-        Raises:
-            OpenArmError: CONFIG_INVALID, when the file is damaged and the history has no good one.
-        """
-        if not self.path(camera).is_file() and not self._past(camera):
-            return None
-        try:
-            return Found(self.load(camera))
-        except OpenArmError as error:
-            good = self._good(camera)
-            if not good:
-                raise
-            older, calibration = good[-1]
-            return Found(calibration, f"{error.message}; the last good one, {older.name}, is used")
+        super().__init__(folder, StoredCalibration, "calibration")
 
     def in_use(self, camera: str, mount_seed: int | None) -> StoredCalibration | None:
         """Return what is stored of a camera; None also for other mounts, whose distance says nothing."""
         found = self.find(camera)
-        return found.calibration if found is not None and found.calibration.mount_seed == mount_seed else None
-
-    def history(self, camera: str) -> tuple[StoredCalibration, ...]:
-        """Return all good calibrations of a camera, oldest first."""
-        return tuple(calibration for _, calibration in self._good(camera))
-
-    def rollback(self, camera: str) -> StoredCalibration:
-        """Go back to the calibration before the present one; the present one leaves the history.
-
-        Raises:
-            OpenArmError: CONFIG_INVALID, when there is none before it.
-        """
-        past, good = self._past(camera), self._good(camera)
-        if len(good) < 2:
-            raise OpenArmError(
-                Code.CONFIG_INVALID,
-                f"going back needs a calibration of {camera!r} before the present one; stored: {len(good)}",
-            )
-        path, before = good[-2]
-        write_whole(self.path(camera), path.read_bytes())
-        for later in past[past.index(path) + 1 :]:
-            later.unlink()
-        return before
-
-    def state(self) -> tuple[tuple[str, int, int], ...]:
-        """Return what changes when a file does: names, sizes and times of the files."""
-        out: list[tuple[str, int, int]] = []
-        for camera in self.cameras():
-            try:
-                status = self.path(camera).stat()
-            except FileNotFoundError:
-                continue  # between the listing and now
-            out.append((camera, status.st_mtime_ns, status.st_size))
-        return tuple(out)
-
-    def _history(self, camera: str) -> Path:
-        return self.folder / "history" / checked_name(camera)
-
-    def _good(self, camera: str) -> list[tuple[Path, StoredCalibration]]:
-        """Return the calibrations of the history that are not damaged, oldest first."""
-        out: list[tuple[Path, StoredCalibration]] = []
-        for path in self._past(camera):
-            with contextlib.suppress(OpenArmError):
-                out.append((path, read(path)))
-        return out
-
-    def _past(self, camera: str) -> list[Path]:
-        return sorted(self._history(camera).glob("*.yaml"), key=_number)
-
-
-def checked_name(camera: str) -> str:
-    """Return a camera's name when it is one.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, for anything else, above all what a file system reads as a path.
-    """
-    if not _NAME.fullmatch(camera):
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT,
-            f"camera name {camera!r}: expected lower-case letters, digits and _, beginning with a letter, at most 64",
-        )
-    return camera
-
-
-def read(path: Path) -> StoredCalibration:
-    """Read and check one file.
-
-    Raises:
-        OpenArmError: CONFIG_INVALID, when it is not as it was written.
-    """
-    data = load_yaml(path)
-    stated = data.pop("sha256", None)
-    calibration = validate(StoredCalibration, data, str(path))
-    if stated != calibration.digest():
-        raise OpenArmError(
-            Code.CONFIG_INVALID,
-            f"{path} is damaged or was edited: its contents do not have the hash that it states; calibrate and save"
-            " again, or roll back",
-        )
-    return calibration
+        return found.record if found is not None and found.record.mount_seed == mount_seed else None
 
 
 def places(folder: Path, mount_seed: int | None) -> tuple[CalibrationStore, ...]:
@@ -296,7 +158,7 @@ def places(folder: Path, mount_seed: int | None) -> tuple[CalibrationStore, ...]
 
 def of_these_mounts(
     stores: Sequence[CalibrationStore], camera: str, parent: str, mount_seed: int | None
-) -> tuple[Found | None, tuple[str, ...]]:
+) -> tuple[Found[StoredCalibration] | None, tuple[str, ...]]:
     """Return the first calibration of a camera as it is mounted now, and why others that were met are not used.
 
     Args:
@@ -314,7 +176,7 @@ def of_these_mounts(
         except OpenArmError as error:
             faults.append(error.message)
             continue
-        calibration = found.calibration
+        calibration = found.record
         if calibration.mount_seed != mount_seed:
             stated, used = ("none" if seed is None else seed for seed in (calibration.mount_seed, mount_seed))
             faults.append(
@@ -329,22 +191,3 @@ def of_these_mounts(
         else:
             return found, (*faults, *([found.warning] if found.warning else []))
     return None, tuple(faults)
-
-
-def now() -> str:
-    """Return date and time for the record."""
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-
-
-def default_folder() -> Path:
-    """Return the default folder of calibrations: OPENARM_CALIBRATIONS, or the user's data folder."""
-    given = os.environ.get("OPENARM_CALIBRATIONS", "")
-    if given:
-        return Path(given).expanduser()
-    base = os.environ.get("XDG_DATA_HOME", "")
-    return (Path(base) if base else Path.home() / ".local" / "share") / "openarm" / "calibrations"
-
-
-def _number(path: Path) -> int:
-    head = path.name.partition("-")[0]
-    return int(head) if head.isdigit() else 0

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import stat
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -52,6 +53,8 @@ _HEAD = np.dtype(
     ]
 )
 _DATA_AT = 4096
+#: A field may be made while its reader asks for the time, s.
+_AHEAD = 0.1
 
 
 class CameraMoment(NamedTuple):
@@ -118,6 +121,10 @@ class DistanceField:
             OpenArmError: STALE_DATA, with what is how old.
         """
         age = (now_ns - self.now_ns) * 1e-9
+        if age < -_AHEAD:
+            raise OpenArmError(
+                Code.STALE_DATA, f"the distance field is stamped {-age:.1f} s in the future; is it of this machine?"
+            )
         if age > limit_s:
             raise OpenArmError(
                 Code.STALE_DATA,
@@ -185,7 +192,8 @@ class DistanceFieldWriter:
                 os.close(handle)
         except OSError as error:
             raise OpenArmError(
-                Code.ENVIRONMENT, f"no room for a distance field of {size / 2**20:.1f} MiB at {path}: {error}"
+                Code.ENVIRONMENT,
+                f"a distance field of {size / 2**20:.1f} MiB can't be made at {path}: {error.strerror}",
             ) from error
         self._head = head
         self._slots = _slots(self._map, lattice)
@@ -274,22 +282,60 @@ class DistanceFieldReader:
 
     def _open(self) -> None:
         try:
-            inode = self._path.stat().st_ino
-            if inode == self._inode:
+            if self._path.lstat().st_ino == self._inode:
                 return
-            with self._path.open("rb") as file:
-                memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            handle = os.open(self._path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                status = os.fstat(handle)
+                _require_own(self._path, status)
+                memory = mmap.mmap(handle, 0, access=mmap.ACCESS_READ)
+            finally:
+                os.close(handle)
         except (FileNotFoundError, ValueError) as error:
             raise OpenArmError(
                 Code.NOT_READY, f"no distance field at {self._path}; is the node octomap running?"
             ) from error
-        head = _header(memory) if len(memory) >= _DATA_AT else None
-        if head is None or bytes(head["magic"]) != _MAGIC:
+        except OSError as error:
+            raise OpenArmError(
+                Code.ENVIRONMENT, f"the distance field at {self._path} can't be opened: {error.strerror}"
+            ) from error
+        lattice = _lattice(memory)
+        if lattice is None:
             raise OpenArmError(Code.NOT_READY, f"{self._path} is no distance field of this version of the suite")
-        key, shape = ([int(v) for v in head[k]] for k in ("key_min", "shape"))
-        self._lattice = Lattice(float(head["resolution"]), (key[0], key[1], key[2]), (shape[0], shape[1], shape[2]))
-        self._head, self._inode = head, inode
-        self._slots = _slots(memory, self._lattice)
+        self._lattice, self._head, self._inode = lattice, _header(memory), status.st_ino
+        self._slots = _slots(memory, lattice)
+
+
+def _require_own(path: Path, status: os.stat_result) -> None:
+    """Refuse a field that another user made or may change.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, naming the owner.
+    """
+    if not stat.S_ISREG(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o022:
+        raise OpenArmError(
+            Code.ENVIRONMENT,
+            f"the distance field at {path} belongs to user {status.st_uid} (mode {stat.filemode(status.st_mode)});"
+            f" expected a file that only user {os.getuid()} can write: have it removed, or choose another map.name",
+        )
+
+
+def _lattice(memory: mmap.mmap) -> Lattice | None:
+    """Return the cells of a field; None when it is none, or does not hold what its header says."""
+    if len(memory) < _DATA_AT:
+        return None
+    head = _header(memory)
+    key, shape = ([int(v) for v in head[k]] for k in ("key_min", "shape"))
+    resolution, reach = float(head["resolution"]), float(head["reach"])
+    sound = (
+        bytes(head["magic"]) == _MAGIC
+        and 0.0 < resolution < np.inf
+        and 0.0 < reach < np.inf
+        and min(shape) > 0
+        and len(memory) == _DATA_AT + _SLOTS * 4 * shape[0] * shape[1] * shape[2]
+        and -1 <= int(head["current"]) < _SLOTS
+    )
+    return Lattice(resolution, (key[0], key[1], key[2]), (shape[0], shape[1], shape[2])) if sound else None
 
 
 def _header(memory: mmap.mmap) -> Any:

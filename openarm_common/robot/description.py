@@ -161,6 +161,27 @@ class RobotDescription:
             )
         return self._chains[link]
 
+    def reach(self, link: str, offset: float = 0.0) -> dict[str, float]:
+        """Return by movable joint how far a point can move when the joint does: at most m per rad, or m per m.
+
+        Args:
+            link: That carries the point.
+            offset: Distance of the point from the origin of the link, m.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for an unknown link.
+        """
+        out: dict[str, float] = {}
+        length = offset
+        for joint in reversed(self.chain(link)):
+            if joint.type != "fixed":
+                leader, ratio = joint.mimic or joint.name, abs(joint.multiplier)
+                out[leader] = out.get(leader, 0.0) + ratio * (1.0 if joint.type == "prismatic" else length)
+            if joint.type == "prismatic":
+                length += max(abs(joint.lower), abs(joint.upper))
+            length += float(np.linalg.norm(joint.T_parent_joint[:3, 3]))
+        return out
+
     def link_pose(self, link: str, q: Mapping[str, float]) -> Array:
         """Return the pose ``T_root_link`` (4, 4) of one link; only the joints of its chain are evaluated.
 

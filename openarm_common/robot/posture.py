@@ -65,7 +65,9 @@ class PostureTracker:
             self._received_at, self._listening_since = -math.inf, now
         self._listening = on
 
-    def add(self, t_ns: int, names: Sequence[str], positions: Sequence[float], now: float) -> None:
+    def add(
+        self, t_ns: int, names: Sequence[str], positions: Sequence[float], now: float, velocities: Sequence[float] = ()
+    ) -> None:
         """Add a joint state.
 
         Args:
@@ -73,9 +75,10 @@ class PostureTracker:
             names: Joints.
             positions: Of each, rad or m.
             now: When it arrived, s.
+            velocities: Of each, rad/s or m/s, where they are measured.
         """
         self._received_at = now
-        self.buffer.add_joint_state(t_ns, names, positions)
+        self.buffer.add_joint_state(t_ns, names, positions, velocities)
 
     def age_s(self, now: float) -> float:
         """Return the seconds since a joint state arrived; infinite before the first."""

@@ -28,6 +28,13 @@ _GONE = 20
 _UP = "is the graph up, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE?"
 
 
+def new_context(domain: int | None = None) -> Context:
+    """Return a ROS context that leaves signals to the program, in a domain or in that of the environment."""
+    context = Context()
+    rclpy.init(args=[], context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    return context
+
+
 class ContextNode:
     """A node in a ROS context of its own, so that it works next to an rclpy program; a context manager.
 
@@ -37,11 +44,14 @@ class ContextNode:
         name: Of the node; names that begin with _ are hidden.
         domain: ROS_DOMAIN_ID; None takes the environment's.
         bare: Without parameter services and /rosout.
+        context: Of `new_context`, where several nodes share one; it stays when this node is closed.
     """
 
-    def __init__(self, name: str, *, domain: int | None = None, bare: bool = False) -> None:
-        self._context = Context()
-        rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    def __init__(
+        self, name: str, *, domain: int | None = None, bare: bool = False, context: Context | None = None
+    ) -> None:
+        self._owns = context is None
+        self._context = new_context(domain) if context is None else context
         self._node: Any = Node(
             name,
             context=self._context,
@@ -63,7 +73,8 @@ class ContextNode:
         if self._context.ok():
             self._executor.shutdown(timeout_sec=2.0)
             self._node.destroy_node()
-            self._context.try_shutdown()
+            if self._owns:
+                self._context.try_shutdown()
 
     def spin_until(self, condition: Callable[[], Any], seconds: float) -> bool:
         """Handle what arrives until a condition holds; return whether it did in time."""
@@ -128,6 +139,7 @@ class BackgroundNode(ContextNode):
         timeout: float,
         on_feedback: Callable[[Any], None] | None = None,
         stop: threading.Event | None = None,
+        meanwhile: Callable[[], None] = lambda: None,
     ) -> Any:
         """Send a goal to an action and return its result, also that of a failure.
 
@@ -138,6 +150,7 @@ class BackgroundNode(ContextNode):
             timeout: Longest wait for the end, s of wall clock; then, and at any exception, the goal is cancelled.
             on_feedback: Called with each feedback, in the background thread; what it raises is raised here.
             stop: When it is set the goal is cancelled, and its result waited for.
+            meanwhile: Called again and again in the thread of the caller while the goal is active.
 
         Raises:
             OpenArmError: NOT_READY, when there is no server, or it ends; BUSY, when the goal is refused; TIMEOUT.
@@ -155,7 +168,7 @@ class BackgroundNode(ContextNode):
         try:
             ended = self._begin(handle.get_result_async)
             cancel = partial(self._begin, handle.cancel_goal_async)
-            answer = self._wait(ended, timeout, name, there, stop, cancel, trouble)
+            answer = self._wait(ended, timeout, name, there, stop, cancel, trouble, meanwhile)
         except BaseException:
             # Whatever keeps the caller from waiting (a deadline, Ctrl-C): the robot would continue unattended.
             _event(self._begin(handle.cancel_goal_async)).wait(2.0)
@@ -189,11 +202,13 @@ class BackgroundNode(ContextNode):
         stop: threading.Event | None = None,
         cancel: Callable[[], object] = lambda: None,
         trouble: Sequence[Exception] = (),
+        meanwhile: Callable[[], None] = lambda: None,
     ) -> Any:
         done = _event(future)
         deadline = time.monotonic() + timeout
         missed, stopped = 0, False
         while not done.wait(_CHECK_S):
+            meanwhile()
             missed = 0 if there() else missed + 1
             if missed > _GONE:
                 raise OpenArmError(Code.NOT_READY, f"the server of {name} is gone")

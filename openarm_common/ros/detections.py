@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detections to and from vision_msgs/Detection3DArray: all that is known of /detections_3d is here.
 
-The first hypothesis is the label; others of the same score name the shape (box, cylinder, sphere, cube, can). An object
-that was detected but not measured has covariance[0] = -1, the mark of ROS for an unknown value; its box encloses its
-visible part.
+The hypotheses of an object are its attributes: name, colour, shape, wider shape, those that are known, all of the same
+score; the label comes first. Its id says which is which: `name/colour/shape`, where % / and # are percent-encoded, and
+`#2` from the second object on that is described alike. A message of another detector needs no such id: of its classes
+those that name a shape are the shape, the best of the others the name, the next the colour. An object that was detected
+but not measured has a negative covariance[0] (-1 is the mark of ROS for an unknown value), which says why; its box
+encloses its visible part.
 """
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Sequence
+from urllib.parse import unquote
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovariance
@@ -20,12 +26,15 @@ from vision_msgs.msg import (
     ObjectHypothesisWithPose,
 )
 
-from openarm_common.detection import WIDER, Detection
+from openarm_common.detection import KINDS, Described, Detection
+from openarm_common.errors import Code
 from openarm_common.ros.convert import header, matrix_to_pose, pose_to_matrix, vector, xyz
 from openarm_common.types import Array
 
-#: First element of the covariance of a pose that was not measured.
+#: First element of the covariance of a pose that was not measured; and what it is for other reasons than the image.
 UNKNOWN = -1.0
+_MARKS = {Code.INTRINSICS_MISMATCH: -2.0, Code.TABLE_MISMATCH: -3.0}
+_REASONS = {mark: code for code, mark in _MARKS.items()}
 #: Shapes that are round seen from above when they stand; one that lies is seldom as long as wide.
 _ROUND, _AS_LONG_AS_WIDE = frozenset({"cylinder", "can", "sphere"}), 0.001
 
@@ -42,13 +51,12 @@ def detections_to_msg(
         t_ns: Stamp of the image.
     """
     message = Detection3DArray(header=header(frame_id, t_ns))
-    ids = numbered([detection.label for detection in detections])
-    for name, detection, covariance in zip(ids, detections, covariances, strict=True):
+    for name, detection, covariance in zip(ids(detections), detections, covariances, strict=True):
         pose = matrix_to_pose(detection.T_base_object)
         uncertain = PoseWithCovariance(pose=pose, covariance=covariance.ravel())
         if not detection.measured:
-            uncertain.covariance[0] = UNKNOWN
-        results = [hypothesis(each, detection.score, uncertain) for each in class_ids(detection)]
+            uncertain.covariance[0] = _MARKS.get(detection.code, UNKNOWN)
+        results = [hypothesis(each, detection.score, uncertain) for each in detection.attributes]
         box = BoundingBox3D(center=pose, size=vector(detection.size))
         message.detections.append(Detection3D(header=message.header, results=results, bbox=box, id=name))
     return message
@@ -65,13 +73,13 @@ def detections_from_msg(message: Detection3DArray) -> tuple[Detection, ...]:
         if not item.results:
             continue
         result = max(item.results, key=lambda result: result.hypothesis.score)
-        best, measured = result.hypothesis, result.pose.covariance[0] != UNKNOWN
+        best, variance = result.hypothesis, result.pose.covariance[0]
         others = [r.hypothesis.class_id for r in item.results if r.hypothesis.class_id != best.class_id]
-        T, size = pose_to_matrix(item.bbox.center), xyz(item.bbox.size)
-        names = {best.class_id, *others}
-        is_round = bool(names & _ROUND) and abs(float(size[0] - size[1])) < _AS_LONG_AS_WIDE
-        kind = others[0] if others else best.class_id
-        out.append(Detection(best.class_id, best.score, T, np.asarray(size), is_round, kind, measured))
+        name, color, kind = _attributes(item.id, [best.class_id, *others])
+        T, size = pose_to_matrix(item.bbox.center), np.asarray(xyz(item.bbox.size))
+        is_round = kind in _ROUND and abs(float(size[0] - size[1])) < _AS_LONG_AS_WIDE
+        code = _REASONS.get(variance, Code.NOTHING_DETECTED)
+        out.append(Detection(name, best.score, T, size, is_round, kind, variance >= 0.0, code, color))
     return tuple(out)
 
 
@@ -88,12 +96,21 @@ def hypothesis(name: str, score: float, pose: PoseWithCovariance | None = None) 
     )
 
 
-def numbered(labels: Sequence[str]) -> list[str]:
-    """Return ids: the labels, with a number from the second of a label on."""
-    return [label if (n := labels[: i + 1].count(label)) == 1 else f"{label}_{n}" for i, label in enumerate(labels)]
+def ids(detections: Sequence[Described]) -> list[str]:
+    """Return an id for each: its name, colour and shape, and a number from the second of such on."""
+    counts, out = Counter[str](), list[str]()
+    for one in detections:
+        parts = (re.sub("[%/#]", lambda m: f"%{ord(m[0]):02X}", part) for part in (one.name, one.color, one.kind))
+        text = "/".join(parts)
+        counts[text] += 1
+        out.append(text if counts[text] == 1 else f"{text}#{counts[text]}")
+    return out
 
 
-def class_ids(detection: Detection) -> tuple[str, ...]:
-    """Return what an object may be called: its label, its kind, and the wider kind."""
-    names = (detection.label, detection.kind, WIDER.get(detection.kind, ""))
-    return tuple(dict.fromkeys(name for name in names if name))
+def _attributes(text: str, classes: Sequence[str]) -> tuple[str, str, str]:
+    """Return name, colour and shape: as the id says where it speaks of these classes, else by what the classes are."""
+    parts = [unquote(part) for part in text.partition("#")[0].split("/")]
+    if len(parts) == 3 and any(parts) and {*parts} - {""} <= {*classes}:
+        return parts[0], parts[1], parts[2]
+    name, color, *_ = (*(each for each in classes if each not in KINDS), "", "")
+    return name, color, next((each for each in classes if each in KINDS), "")

@@ -8,7 +8,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future as ThreadFuture
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Generic, ParamSpec, TypeVar, get_args
@@ -128,9 +128,16 @@ class BaseNode(Node, Generic[ConfigT]):
         return self.__description
 
     def diagnose(self, ok: bool, message: str, **values: object) -> None:
-        """Set what /diagnostics reports of this node once per second."""
+        """Set what /diagnostics reports of this node once per second: OK or an error."""
+        self.__report(DiagnosticStatus.OK if ok else DiagnosticStatus.ERROR, message, values)
+
+    def diagnose_warning(self, message: str, **values: object) -> None:
+        """The same of a warning."""
+        self.__report(DiagnosticStatus.WARN, message, values)
+
+    def __report(self, level: bytes, message: str, values: Mapping[str, object]) -> None:
         status = DiagnosticStatus(name=self.__status.name, hardware_id=self.__status.hardware_id, message=message)
-        status.level = DiagnosticStatus.OK if ok else DiagnosticStatus.ERROR
+        status.level = level
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         self.__status = status
 

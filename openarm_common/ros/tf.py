@@ -22,6 +22,14 @@ from openarm_common.robot.posture import PostureTracker
 from openarm_common.ros.convert import held_from_msg, stamp_to_ns, transform_to_matrix
 from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF, reliable
 
+#: Its origin is on the table top below the base; where the table is, for every node.
+TABLE_FRAME = "table"
+
+
+def table_height(message: TFMessage) -> float | None:
+    """Return the height of the table in fixed transforms, base frame, m; None when they do not say."""
+    return next((e.transform.translation.z for e in message.transforms if e.child_frame_id == TABLE_FRAME), None)
+
 
 class RobotStateListener:
     """Keeps a `PostureTracker` filled.
@@ -54,6 +62,7 @@ class RobotStateListener:
         self._depth = depth
         self._users: set[object] = set()
         self._watchers: list[Callable[[], None]] = []
+        self._on_table: Callable[[float], None] | None = None
         self._joints: Subscription | None = None
         node.create_subscription(TFMessage, "/tf_static", self._on_static, QOS_STATIC_TF)
         if held_topic:
@@ -76,18 +85,26 @@ class RobotStateListener:
         """Call a function after each joint state and each transform."""
         self._watchers.append(on_news)
 
+    def follow_table(self, on_height: Callable[[float], None]) -> None:
+        """Call a function with the height of the frame `table`, base frame, m, whenever it is published."""
+        self._on_table = on_height
+
     def age_s(self) -> float:
         """Return the seconds of wall clock since the newest joint state arrived; infinite before the first."""
         return self.tracker.age_s(time.monotonic())
 
     def _on_joints(self, message: JointState) -> None:
-        self.tracker.add(stamp_to_ns(message.header.stamp), message.name, message.position, time.monotonic())
+        t_ns = stamp_to_ns(message.header.stamp)
+        self.tracker.add(t_ns, message.name, message.position, time.monotonic(), message.velocity)
         self.efforts = dict(zip(message.name, message.effort, strict=False))
         self._notify()
 
     def _on_static(self, message: TFMessage) -> None:
         for edge in message.transforms:
             self.buffer.set_static(edge.header.frame_id, edge.child_frame_id, transform_to_matrix(edge.transform))
+        height = table_height(message)
+        if height is not None and self._on_table is not None:
+            self._on_table(height)
         self._notify()
 
     def _on_held(self, message: MarkerArray) -> None:

@@ -37,6 +37,8 @@ PALETTE: Mapping[str, Rgba] = MappingProxyType(
         "purple": (0.46, 0.10, 0.66, 1.0),
     }
 )
+#: Those of scenes: what is grey is found by no colour, so only depth and the map know it.
+COLORS: Mapping[str, Rgba] = MappingProxyType({**PALETTE, "grey": (0.45, 0.45, 0.45, 1.0)})
 Shape = Literal["box", "cylinder", "sphere"]
 SHAPES: tuple[Shape, ...] = ("box", "cylinder", "sphere")
 RESERVED_NAMES = ("world", "floor", "table", "table_top")
@@ -76,6 +78,10 @@ class Table(Config):
             raise ValueError(f"the front edge would stand in the pedestal; expected at least {_COLUMN_FRONT}")
         return value
 
+    def at(self, height: float) -> Table:
+        """Return the same table with its top at another height, base frame, m."""
+        return self.model_copy(update={"top_z": height})
+
     @property
     def centre(self) -> tuple[float, float]:
         """Middle of the top, m."""
@@ -99,7 +105,7 @@ class SceneObject(Config):
     label: str = Field(default="", description="what the detector calls it; the colour where it is not given")
     shape: Shape
     size: tuple[Edge, Edge, Edge] = Field(description="extents, m")
-    color: str = Field(description="a colour of the palette")
+    color: str = Field(description="a colour of the palette, or grey")
     mass: float = Field(default=0.0, ge=0.0, le=10.0, description="kg; 0 is the volume times the density of hard wood")
     position: tuple[FiniteFloat, FiniteFloat] | tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field(
         description="of the centre, m"
@@ -124,8 +130,8 @@ class SceneObject(Config):
     @field_validator("color")
     @classmethod
     def _known_color(cls, value: str) -> str:
-        if value not in PALETTE:
-            raise ValueError(f"unknown colour; colours: {', '.join(PALETTE)}")
+        if value not in COLORS:
+            raise ValueError(f"unknown colour; colours: {', '.join(COLORS)}")
         return value
 
     @model_validator(mode="after")
@@ -137,7 +143,7 @@ class SceneObject(Config):
     @property
     def rgba(self) -> Rgba:
         """Colour."""
-        return PALETTE[self.color]
+        return COLORS[self.color]
 
     @property
     def volume(self) -> float:

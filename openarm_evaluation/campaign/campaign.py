@@ -68,13 +68,16 @@ def run_campaign(
     """
     for seed in options.seeds[:1]:
         make_task(options.set_name, seed)  # faults of the call show before anything is started
-    suite_config(options.graph_parameters())
-    campaign = Campaign(folder, options, read_rows(folder, options))
+    suite = suite_config(options.graph_parameters())
+    detector = suite.detectors[suite.grasp.camera].detector  # as --set leaves it
+    rows = [{"detector": detector} | row for row in read_rows(folder, options)]
+    campaign = Campaign(folder, options, rows)
     campaign.resumed = len(campaign.rows)
     on_begin(campaign.resumed)
     done = {row["seed"] for row in campaign.rows}
 
     def keep(row: Row) -> None:
+        row = {**row, "detector": detector}
         with (folder / ROWS).open("a", encoding="utf-8") as file:
             file.write(json.dumps(row, default=str) + "\n")
         campaign.rows.append(row)
@@ -87,6 +90,15 @@ def run_campaign(
         campaign.wall_s = time.monotonic() - began
         campaign.report = write_reports(campaign)
     return campaign
+
+
+def joined(parts: Sequence[Campaign], folder: Path) -> Campaign:
+    """Report campaigns of the same scenes with several detectors, which are in folders below, as one."""
+    rows = [{**row, "folder": f"{part.folder.name}/"} for part in parts for row in part.rows]
+    wall_s, resumed = sum(part.wall_s for part in parts), sum(part.resumed for part in parts)
+    whole = Campaign(folder, parts[0].options, rows, wall_s, resumed)
+    whole.report = write_reports(whole)
+    return whole
 
 
 def run_in_processes(options: CampaignOptions, seeds: Sequence[int], folder: Path, keep: Callable[[Row], None]) -> None:
@@ -149,12 +161,15 @@ def _quiet_worker() -> None:
 
 def write_reports(campaign: Campaign) -> dict[str, Any]:
     """Write JSON, CSV and HTML, and return what the JSON says."""
-    rows = sorted(campaign.rows, key=lambda row: row["seed"])
-    new = len(rows) - campaign.resumed
+    rows = sorted(campaign.rows, key=lambda row: (row["seed"], row["detector"]))
+    new, settings = len(rows) - campaign.resumed, campaign.options.settings()
+    detectors = list(dict.fromkeys(row["detector"] for row in campaign.rows))
+    if len(detectors) > 1:
+        settings["detector"] = ", ".join(detectors)
     data: dict[str, Any] = {
-        "settings": campaign.options.settings(),
+        "settings": settings,
         "summary": report.summarise(rows),
-        "asked": len(campaign.options.seeds),
+        "asked": len(campaign.options.seeds) * max(len(detectors), 1),
         "wall_s": round(campaign.wall_s, 1),
         "scenes_per_hour": round(3600.0 * new / campaign.wall_s) if new and campaign.wall_s > 0.0 else None,
         "workers": campaign.options.workers,

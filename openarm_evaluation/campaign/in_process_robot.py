@@ -11,7 +11,7 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_evaluation.campaign.robot import PLANNING_S, SimRobot
+from openarm_evaluation.campaign.robot import SimRobot
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import Box as GraspBox
@@ -54,8 +54,6 @@ class InProcessRobot:
         self.deadline_ns = 0
         #: Longest start delay of a motion until the other arm leaves clearance, s; 0: the arms never move at once.
         self.max_start_delay = 0.0
-        #: So many plans fail, by fault injection.
-        self.plans_to_fail = 0
         #: Called after each tick; what it raises ends what is waited for.
         self.watch: Callable[[], None] = lambda: None
 
@@ -107,7 +105,7 @@ class InProcessRobot:
         self, done: Callable[[], bool], limit: float, what: str, guard: Callable[[], None] | None = None
     ) -> None:
         """Wait for a condition, `limit` s of simulated time."""
-        deadline_ns = self.robot.t_ns + round(limit * 1e9)
+        deadline_ns = self.robot.t_ns + limit * 1e9
         while not done():
             self.check()
             if guard is not None:
@@ -151,10 +149,6 @@ class InProcessRobot:
         Raises:
             OpenArmError: With the planner's code.
         """
-        if self.plans_to_fail > 0:
-            self.plans_to_fail -= 1
-            await self.robot.wait(PLANNING_S)
-            raise OpenArmError(Code.NO_PLAN, f"{request.arm} arm: no path, by fault injection")
         after = request.after if isinstance(request, PlanPlace) else None
         asked = PlanApproachRequest(
             request.arm,
@@ -168,7 +162,13 @@ class InProcessRobot:
         plan = answer.plan
         if plan is None:
             raise NoWayError(answer.code, answer.message, refusals) from answer.error
-        return Planned(plan.chosen, *plan.parts, refusals, plan.limit_margins)
+        transfer, duration = plan.transfer, sum(part.duration for part in plan.parts)
+        start = dict(zip(transfer.names, transfer.q[0].tolist(), strict=True))
+        return Planned(plan.chosen, *plan.parts, refusals, plan.limit_margins, start, duration, answer.scene_version)
+
+    async def scene_version(self) -> int:
+        """Version of the planning scene of the motion service."""
+        return self.robot.motion.scene.version
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:
         """How far the arm's TCP stays from a point, in any orientation."""

@@ -61,7 +61,7 @@ def with_mounts(task: Task, mount_seeds: Sequence[int], folder: Path) -> tuple[T
         found = store.find(camera.name)
         if found is None:
             raise OpenArmError(Code.INTERNAL, f"the calibration of {camera.name!r} was saved and is not there")
-        mounts[camera.name] = found.calibration.T_parent_link
+        mounts[camera.name] = found.record.T_parent_link
     return replace(task, mount_seed=seed), mounts
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from cyclopts import Parameter, Token
 from cyclopts.validators import Number
@@ -36,7 +36,18 @@ def _from_command_line(_: object, tokens: Sequence[Token]) -> tuple[int, ...]:
     return parse_seeds(tokens[0].value)
 
 
+def _detectors(_: object, tokens: Sequence[Token]) -> tuple[DetectorKind, ...]:
+    kinds = tuple(dict.fromkeys(tokens[0].value.split(",")))
+    known: tuple[DetectorKind, ...] = get_args(DetectorKind)
+    if wrong := [kind for kind in kinds if kind not in known]:
+        text = f"detectors {', '.join(map(repr, wrong))} do not exist; there are {', '.join(known)}"
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
+    return tuple(kind for kind in known if kind in kinds)
+
+
 Seeds = Annotated[tuple[int, ...], Parameter(converter=_from_command_line, n_tokens=1, show_default=False)]
+
+Detectors = Annotated[tuple[DetectorKind, ...], Parameter(converter=_detectors, n_tokens=1, show_default=False)]
 
 
 @Parameter(name="*")
@@ -51,7 +62,7 @@ class CampaignOptions:
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.
         use_effort: Whether the force of the fingers counts as evidence.
-        detector: What finds objects: their colour, the network, or both checking each other.
+        detector: What finds objects: their colour, the network, both checking each other, a tag on them, or depth.
         parameters: A parameter of a node of the graph `sim`, as node.param=value; may be given several times.
         ray: Address of a Ray cluster, such as HOST:6379 or auto, whose machines run the workers.
     """

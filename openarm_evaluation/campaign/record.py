@@ -22,6 +22,15 @@ _VIEWS = ("overhead", "spectator")
 _PICTURES = 6
 
 
+def write_reason(folder: Path, row: Mapping[str, Any]) -> None:
+    """Write the row of a task, and for people why it failed and how to run it again."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "row.json").write_text(json.dumps(row, indent=1, default=str), encoding="utf-8")
+    truth = "; ".join(row["reasons"]) or "as asked"
+    text = f"{row['outcome']}: {row['code']}: {row['message']}\nground truth: {truth}\nagain: {row['again']}\n"
+    (folder / "reason.txt").write_text(text, encoding="utf-8")
+
+
 class Keeper:
     """Collects while a task runs; writes nothing unless it is asked to.
 
@@ -64,10 +73,7 @@ class Keeper:
         t_ns, position, effort = map(np.array, zip(*self._robot.trace, strict=True))
         names = np.array(self._robot.world.joint_names)
         np.savez_compressed(folder / "joints.npz", joint_names=names, t_ns=t_ns, position=position, effort=effort)
-        (folder / "row.json").write_text(json.dumps({**row, "transitions": list(steps)}, indent=1), encoding="utf-8")
-        truth = "; ".join(row["reasons"]) or "as asked"
-        text = f"{row['outcome']}: {row['code']}: {row['message']}\nground truth: {truth}\nagain: {row['again']}\n"
-        (folder / "reason.txt").write_text(text, encoding="utf-8")
+        write_reason(folder, {**row, "transitions": list(steps)})
         return folder
 
     def _shoot(self, name: str) -> None:

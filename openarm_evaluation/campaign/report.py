@@ -15,8 +15,8 @@ from openarm_evaluation.judging.statistics import interval, rate_of, spread
 Row = Mapping[str, Any]
 
 _COLUMNS: Sequence[str] = (
-    "set", "seed", "kind", "scene_hash", "objects", "targets", "outcome", "as_expected", "code", "arm", "attempts",
-    "place_error_mm", "sim_s", "wall_s", "message", "again",
+    "set", "seed", "detector", "kind", "scene_hash", "objects", "targets", "outcome", "as_expected", "code", "arm",
+    "attempts", "place_error_mm", "sim_s", "wall_s", "message", "again",
 )  # fmt: skip
 
 
@@ -52,6 +52,10 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "causes": dict(Counter(_cause(row) for row in failed).most_common()),
         "kinds": _kinds(rows),
         "arms": {arm: rate_of(g["placed"] for g in grasps if g["arm"] == arm) for arm in ("left", "right")},
+        "detectors": {
+            kind: rate_of(row["placed"] for row in possible if row["detector"] == kind)
+            for kind in sorted({row["detector"] for row in rows})
+        },
         "place_error_mm": spread(grasp["place_error_mm"] for grasp in done),
         "cycle_s": spread(grasp["sim_s"] for grasp in done),
         "state_s": _states(done),
@@ -109,6 +113,8 @@ def figures(data: Mapping[str, Any]) -> list[tuple[str, str]]:
     out += [
         ("false successes", f"{s['false_success']} (95 %: below {100 * s['false_success_high']:.2f} %)"),
         ("objects placed", _rate(s["objects"])),
+        *((f"objects placed by the {arm} arm", _rate(rate)) for arm, rate in s["arms"].items()),
+        *((f"placed with detector {kind}", _rate(rate)) for kind, rate in s["detectors"].items()),
         ("attempts: scenes", ", ".join(f"{k}: {v}" for k, v in s["attempts"].items()) or "none"),
         ("causes of what failed", ", ".join(f"{k}: {v}" for k, v in s["causes"].items()) or "none"),
     ]
@@ -131,7 +137,8 @@ def _rate(v: Mapping[str, Any]) -> str:
 
 def write_html(path: Path, data: Mapping[str, Any]) -> None:
     """Write one page; only the pictures of failures are files next to it."""
-    failures = [(row, _pictures(path.parent / "failures" / str(row["seed"]))) for row in data["rows"]]
+    kept = [f"{row.get('folder', '')}failures/{row['seed']}" for row in data["rows"]]
+    failures = [(row, _pictures(path.parent, folder)) for row, folder in zip(data["rows"], kept, strict=True)]
     page = render_page(
         Path(__file__).with_name("report.html"),
         data=data,
@@ -143,6 +150,8 @@ def write_html(path: Path, data: Mapping[str, Any]) -> None:
     path.write_text(page, encoding="utf-8")
 
 
-def _pictures(folder: Path) -> list[str]:
-    """Return the names of the spectator's pictures at each failure and at the end."""
-    return [path.name for pattern in ("failed*", "end") for path in sorted(folder.glob(f"{pattern}_spectator.png"))]
+def _pictures(campaign: Path, folder: str) -> list[str]:
+    """Return the spectator's pictures at each failure and at the end, relative to the campaign's folder."""
+    names = ("failed*", "end")
+    found = (path for name in names for path in sorted((campaign / folder).glob(f"{name}_spectator.png")))
+    return [f"{folder}/{path.name}" for path in found]

@@ -34,6 +34,7 @@ from openarm_evaluation.campaign.map_feed import SimulatedMap
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.judging.judge import Sample
 from openarm_grasp.perception.detections import Frame
+from openarm_motion.config import FaultsConfig, MotionConfig
 from openarm_motion.planning.arm import Arm
 from openarm_motion.service.motion_service import MotionService, make_arms, table_box
 from openarm_motion.service.robot import Outcome
@@ -45,7 +46,8 @@ from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer
 from openarm_perception.detection.pipeline import Pipeline, make_pipeline
 from openarm_perception.detection.robot import RobotFinder
-from openarm_perception.geometry.depth import DepthImage, DepthLimits
+from openarm_perception.geometry.depth import DepthImage, DepthLimits, View
+from openarm_perception.geometry.watch import CameraWatch
 from openarm_sim_bridge.cameras.cameras import SimulatedCameras
 from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
 from openarm_sim_bridge.control.arm import End, TrajectoryFollower, TrajectoryOutcome
@@ -94,6 +96,7 @@ class SimRobot:
         senses: How well it sees.
         mount_seed: Of the true camera mounts; None mounts them where the configuration says.
         mounts: T_parent_link by camera as the suite believes; those left out are nominal.
+        table: As the suite believes; None: as it is.
         seed: Of the noise.
         posture: Joints that start elsewhere than at home, rad by name.
     """
@@ -105,6 +108,7 @@ class SimRobot:
         *,
         mount_seed: int | None = None,
         mounts: Mapping[str, Array] | None = None,
+        table: Table | None = None,
         seed: int = 0,
         posture: Mapping[str, float] | None = None,
     ) -> None:
@@ -128,8 +132,6 @@ class SimRobot:
         self.tracks: dict[str, list[Sample]] = {item.name: [] for item in scene.objects}
         self.trace: deque[tuple[int, Array, Array]] = deque(maxlen=int(_TRACE_S * 1e9) // self.world.period_ns)
         self.images: dict[str, tuple[int, NDArray[np.uint8], DepthImage]] = {}
-        #: Share of the frames in which the detector misses an object: an injected fault.
-        self.missed = 0.0
         self._mounts = dict(mounts or {})
         self._arriving: deque[tuple[int, Frame]] = deque()
         self.frames: deque[Frame] = deque(maxlen=64)
@@ -137,13 +139,14 @@ class SimRobot:
         self.held: tuple[HeldBox, ...] = ()
         self._observing = ""
         self._detected_ns = -(10**12)
-        self._table_z = scene.table.top_z
+        self.table = table or scene.table
+        self._watches = {name: self._watch(name) for name in suite.detectors}
         self._published_ns = 0
         #: How long plans took, s of wall clock.
         self.planning_s: list[float] = []
         self.map = SimulatedMap(self.description, suite.octomap)
         self._controllers = {arm: _ArmController(self, arm) for arm in self.simulated.controller.arms}
-        arms = arms_behind(self._sets, scene.table)
+        arms = arms_behind(self._sets, self.table)
         self.motion = MotionService(self, suite.motion, arms, self.map, (self.description.root,))
         self.motion.on_held = self._take_held
         self._note()
@@ -174,7 +177,9 @@ class SimRobot:
         state = self.world.read_joints()
         self.trace.append((state.t_ns, state.position.copy(), state.effort.copy()))
         if self.world_faults.publishes_joints(state.t_ns):
-            self.states.add_joint_state(state.t_ns, self.world.joint_names, state.position.tolist())
+            self.states.add_joint_state(
+                state.t_ns, self.world.joint_names, state.position.tolist(), state.velocity.tolist()
+            )
             self.efforts = dict(zip(self.world.joint_names, state.effort.tolist(), strict=True))
             self._published_ns = state.t_ns
         if state.t_ns % _TRUTH_NS == 0:
@@ -283,15 +288,27 @@ class SimRobot:
         rgb, depth = self.draw(name)
         try:
             T_base_camera = self.camera_pose(camera, stamp_ns)
-            optics = self._drawing.intrinsics(name)
-            view = DepthView(depth, optics, T_base_camera, camera.near, camera.far)
-            perceived = _pipeline(self._sets, name, self._table_z).run(
-                rgb, depth, optics, T_base_camera, self._robot_in(name, view, stamp_ns)
+            optics, robot = self._drawing.intrinsics(name), None
+            if self.suite.detectors[name].depth_topic:
+                view = DepthView(depth, optics, T_base_camera, camera.near, camera.far)
+                robot = self._robot_in(name, view, stamp_ns)
+            else:
+                depth = np.zeros_like(depth)
+            seen = View(rgb, depth, optics, T_base_camera, robot)
+            withheld = self._watches[name].look(stamp_ns, seen, self.table.top_z)
+            perceived = _pipeline(self._sets, name, self.table.top_z).run(
+                rgb, depth, optics, T_base_camera, robot, withheld, stamp_ns
             )
         except OpenArmError:
             return None  # as the detector: the frame is skipped, the next may do
-        detected = (d for d in perceived.boxes if not self.missed or self._rng.random() >= self.missed)
-        return Frame(stamp_ns, tuple(detected))
+        return Frame(stamp_ns, perceived.boxes)
+
+    def _watch(self, name: str) -> CameraWatch:
+        camera = self.cameras[name]
+        limits = DepthLimits(near=camera.near, far=camera.far)
+        watch = CameraWatch(self.suite.detectors[name].watch, limits, camera.intrinsics)
+        watch.calibrated = camera.intrinsics  # mounts of campaigns are calibrated with them
+        return watch
 
     def _scan(self, name: str) -> MapFrame | None:
         """What the map takes of a camera now; None when the frame is lost or its posture is not known."""
@@ -393,13 +410,14 @@ class _Goal:
 
 def arms_behind(sets: tuple[str, ...], table: Table) -> Mapping[str, Arm]:
     """Return the arms of the motion service behind a table; made once a process."""
-    return _arms(sets, table.model_dump_json())
+    motion = suite_config(sets).motion.model_copy(update={"faults": FaultsConfig()})
+    return _arms(motion.model_dump_json(), table.model_dump_json())
 
 
 @cache
-def _arms(sets: tuple[str, ...], table: str) -> Mapping[str, Arm]:
+def _arms(config: str, table: str) -> Mapping[str, Arm]:
     fixed = (table_box(Table.model_validate_json(table)),)
-    return make_arms(suite_config(sets).motion, RobotDescription.load(), fixed)
+    return make_arms(MotionConfig.model_validate_json(config), RobotDescription.load(), fixed)
 
 
 @cache
@@ -413,4 +431,8 @@ def _pipeline(sets: tuple[str, ...], name: str, table_z: float) -> Pipeline:
     path = Path(config.colors) if config.colors else config_dir() / "params" / "detector.yaml"
     colors = ColorDetector(load_config(path, ColorDetectorConfig))
     localizer = Localizer(config.localizer, DepthLimits(near=camera.near, far=camera.far), table_z)
-    return make_pipeline(config.detector, colors, config.network, localizer, config.policy, config.label)
+    made = make_pipeline(
+        config.detector, colors, config.network, localizer, config.policy, config.label, tags=config.tag
+    )
+    made.faults = config.faults
+    return made

@@ -7,6 +7,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,11 @@ from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.campaign.robot import SimRobot, SimulatedSenses
 from openarm_evaluation.campaign.tasks.suites import make_task
-from openarm_evaluation.campaign.tasks.task import MISSES, PLAN_FAILS, Task
+from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, watch_clearance
 from openarm_evaluation.judging.judge import RULES, at_rest, end_of, judge
 from openarm_evaluation.judging.provenance import scene_hash
-from openarm_evaluation.judging.trial import Step, Trial
+from openarm_evaluation.judging.trial import Step, Trial, choose_targets
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.planning.arms import ARMS
@@ -71,15 +72,18 @@ class Trials:
         self._task = task
         self._again = again
         self._config = config
+        senses = senses.model_copy(update={"sets": (*senses.sets, *task.sets)})
         self.robot = SimRobot(
             task.scene, senses, mount_seed=task.mount_seed, mounts=mounts, seed=task.seed, posture=task.posture
         )
         self.link = InProcessRobot(self.robot, config)
         self.skills = Skills(self.link, config)
-        self.session = GraspSession(GraspContext.of(config, task.scene.table, self.robot.description))
+        self.session = GraspSession(GraspContext.of(config, self.robot.table, self.robot.description))
         self.steps: list[Step] = []
         self._keep = record.Keeper(self.robot, folder) if folder is not None else None
         self._faulty = False
+        #: Whether the fault of the task has begun.
+        self.injected = False
         self._placed_at: tuple[float, ...] = ()
 
     def run(self) -> dict[str, Any]:
@@ -114,7 +118,7 @@ class Trials:
             open_[ask.label] = trial
             if trial.answer.attempts and not clear:  # three attempts are what a scene may take
                 order.failed[ask.label] = trial.answer.message
-        missing = Counter(labels) - Counter(trial.answer.label for trial in placed)
+        missing = Counter(labels) - Counter(order.placed)
         return [*placed, *(open_[label] for label in missing.elements())]
 
     def _grasp(self, ask: GraspRequest) -> Trial:
@@ -130,7 +134,7 @@ class Trials:
             outcome = GraspOutcome(error.code, error.message, ask.label)
         wall_s = time.monotonic() - began
         self._placed_at = outcome.place_position
-        return self._trial(outcome, self.steps[first:], wall_s)
+        return self._trial(ask.label, outcome, self.steps[first:], wall_s)
 
     def _both(self) -> list[Trial]:
         """Ask for two objects at once, of both arms."""
@@ -152,7 +156,7 @@ class Trials:
         except OpenArmError as error:
             outcomes = [GraspOutcome(error.code, error.message, label) for label in task.labels]
         wall_s = 0.5 * (time.monotonic() - began)
-        return [self._trial(outcome, mine, wall_s) for outcome, mine in zip(outcomes, steps, strict=True)]
+        return [self._trial(*each, wall_s) for each in zip(task.labels, outcomes, steps, strict=True)]
 
     def grasp_task(self, request: GraspRequest) -> GraspTask:
         """A request, to be carried out by a strategy."""
@@ -180,15 +184,10 @@ class Trials:
         if fault is None or self._faulty or fault.when != state:
             return
         self._faulty = True
-        if fault.name == PLAN_FAILS:
-            self.link.plans_to_fail = int(fault.parameters["times"])
-            return
-        if fault.name == MISSES:
-            self.robot.missed = float(fault.parameters["share"])
-            return
         for seed in range(self._task.seed, self._task.seed + _DIRECTIONS):
             try:
                 self.robot.inject(checked_fault(fault.name, fault.parameters, seed))
+                self.injected = True
                 return
             except OpenArmError as error:
                 if error.code is not Code.SCENE_INVALID:
@@ -196,10 +195,12 @@ class Trials:
         # Blocked on every side: it is not pushed, and the task is a nominal one.
 
     # --- after it
-    def _trial(self, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
-        """Judge the object of that label; where there are several, the one that went highest."""
+    def _trial(self, asked: str, outcome: GraspOutcome, steps: Sequence[Step], wall_s: float) -> Trial:
+        """Judge the object that was asked for; where there are several, the one that went highest."""
         robot, task, end_ns = self.robot, self._task, self.robot.t_ns
-        names = [item.name for item in task.scene.objects if item.label == outcome.label]
+        names: list[str] = []
+        with suppress(OpenArmError):  # what the scene has not is asked for, too
+            names = [item.name for item in choose_targets(task.scene, asked)]
         if not names:
             return Trial(task.scene, task.seed, "", outcome, None, steps, wall_s, end_ns)
         self._rest(names)

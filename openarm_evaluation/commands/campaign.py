@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from openarm_bringup.outcome import Outcome, console
-from openarm_common.errors import Code
-from openarm_evaluation.campaign.options import CampaignOptions
+from openarm_common.errors import Code, OpenArmError
+from openarm_evaluation.campaign.options import CampaignOptions, Detectors
 
 DEFAULTS = CampaignOptions()
 
@@ -15,6 +16,7 @@ DEFAULTS = CampaignOptions()
 def campaign(
     *,
     options: CampaignOptions = DEFAULTS,
+    detectors: Detectors = (),
     graph: bool = False,
     against: Path | None = None,
     out: Path | None = None,
@@ -26,6 +28,8 @@ def campaign(
     joint trace and reason. With --out of an earlier run, the seeds that are done are not run again.
 
     Args:
+        detectors: Several, such as color,both: all scenes with each, in folders below, and one report with the rate of
+            each.
         graph: Through a node graph of its own, over DDS and in real time, instead of in one process.
         against: Folder of another campaign; agreement on the scenes of both is reported, and accepted by the same
             share.
@@ -34,15 +38,22 @@ def campaign(
     """
     from openarm_bringup.supervision import runs
     from openarm_evaluation.campaign.agree import compare, rows_of, text_of
-    from openarm_evaluation.campaign.campaign import run_campaign
+    from openarm_evaluation.campaign.campaign import Campaign, joined, run_campaign
     from openarm_evaluation.campaign.progress import Watch
     from openarm_evaluation.campaign.report import figures
     from openarm_evaluation.campaign.ros.graph import rows_of_graph
 
+    if detectors and against is not None:
+        raise OpenArmError(Code.INVALID_ARGUMENT, "--against compares one campaign with another; leave --detectors out")
     folder = (out or runs.new_run_dir()).resolve()
     others = rows_of(against) if against is not None else []
-    with Watch(len(options.seeds), console()) as watch:
-        result = run_campaign(options, folder, watch.show, watch.begin, rows_of_graph if graph else None)
+    runner, parts = rows_of_graph if graph else None, list[Campaign]()
+    for kind in detectors or (options.detector,):
+        below = folder / kind if detectors else folder
+        with Watch(len(options.seeds), console()) as watch:
+            part = replace(options, detector=kind)
+            parts.append(run_campaign(part, below, watch.show, watch.begin, runner))
+    result = joined(parts, folder) if detectors else parts[0]
     data = result.report
     text = "\n".join(f"{name:<44} {value}" for name, value in figures(data))
     good = sum(bool(row["as_expected"]) for row in result.rows)

@@ -16,6 +16,7 @@ from cyclopts import App
 from openarm_bringup.commands.connect import Domain, join_graph
 from openarm_bringup.outcome import Outcome, console
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.wanted import describe
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -125,7 +126,7 @@ def report(
 
 @detector.command
 def find(*words: str, domain: Domain = None, timeout: float = 20.0) -> Outcome:
-    """Find the object that words describe among those that the running detector observes: its label and position.
+    """Find the object that words describe among those that the running detector observes: attributes and position.
 
     `openarm detector find red cube left of the can`. Sides are the robot's: left is +y of the base frame.
 
@@ -136,10 +137,10 @@ def find(*words: str, domain: Domain = None, timeout: float = 20.0) -> Outcome:
     join_graph(domain)
     from openarm_bringup.ros import object_client
 
-    (found,) = object_client.find([" ".join(words)], timeout)
+    found = object_client.find(" ".join(words), timeout)
     x, y, z = (round(float(value), 4) for value in found.p_base)
-    message = f"{found.label} {found.kind} at x {x} y {y} z {z} m"
-    return Outcome(True, message, data={"label": found.label, "kind": found.kind, "position": [x, y, z]})
+    what = {"name": found.name, "color": found.color, "kind": found.kind}
+    return Outcome(True, f"{describe([found])} at x {x} y {y} z {z} m", data={**what, "position": [x, y, z]})
 
 
 def _require(folder: Path) -> None:

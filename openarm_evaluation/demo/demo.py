@@ -19,7 +19,7 @@ from openarm_evaluation.demo import mounts
 from openarm_evaluation.demo.options import DemoOptions
 from openarm_evaluation.judging import provenance
 from openarm_evaluation.judging.statistics import summarise
-from openarm_evaluation.judging.trial import Step, Trial, choose_target, run_trial
+from openarm_evaluation.judging.trial import Step, Trial, choose_targets, run_trial
 from openarm_grasp.strategies.request import GraspRequest
 
 if TYPE_CHECKING:
@@ -68,11 +68,13 @@ def run_demo(options: DemoOptions, listeners: Listeners | None = None) -> DemoRe
     }
     if options.seeds:
         overrides["seed"] = options.seeds[0]
-    sets = (*options.sets, *(("calibration_publisher.nominal=true",) if options.uncalibrated else ()))
+    # the detector would notice most mounts that are off by the table, and refuse
+    uncalibrated = ("calibration_publisher.nominal=true", "detector.watch.enabled=false")
+    sets = (*options.sets, *(uncalibrated if options.uncalibrated else ()))
     graph = load_graph(options.graph, overrides=overrides, sets=sets)
     # Faults of the call show before anything is started.
     for seed in options.seeds or (graph.seed,):
-        choose_target(load_scene(graph.scene, seed), options.label)
+        choose_targets(load_scene(graph.scene, seed), options.label or "")
     result = DemoResult(runs.new_run_dir())
     listeners = listeners or Listeners()
     try:

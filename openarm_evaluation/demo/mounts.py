@@ -11,7 +11,8 @@ from collections.abc import Callable
 
 from openarm_bringup.calibration.run import CalibrationListeners, CalibrationOptions, run_calibration
 from openarm_calibration.handeye.refine import mount_error
-from openarm_calibration.store.store import default_folder, of_these_mounts, places
+from openarm_calibration.store.records import default_folder
+from openarm_calibration.store.store import of_these_mounts, places
 from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
 
@@ -63,7 +64,7 @@ def errors(mount_seed: int, *, nominal: bool) -> dict[str, dict[str, float]]:
             continue
         true = true_mount(camera, mount_seed)
         found, _ = of_these_mounts(stores, camera.name, camera.parent, mount_seed)
-        used = camera.T_parent_link if nominal or found is None else found.calibration.T_parent_link
+        used = camera.T_parent_link if nominal or found is None else found.record.T_parent_link
         row: dict[str, float] = {}
         for name, mount in (("nominal", camera.T_parent_link), ("used", used)):
             offset, angle = mount_error(mount, true)

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from openarm_common.detection import Detection, kind_of
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, SceneObject
+from openarm_common.wanted import describe, select
 from openarm_evaluation.judging.judge import RULES, Sample, Verdict, at_rest, end_of, judge
 from openarm_evaluation.judging.provenance import scene_hash
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
@@ -119,17 +121,22 @@ class Trial:
         }
 
 
-def choose_target(scene: Scene, label: str | None) -> SceneObject:
-    """Return the object to grasp: the first, or the one with that label.
+def choose_targets(scene: Scene, words: str) -> tuple[SceneObject, ...]:
+    """Return the objects of a scene that words ask for, the best first; all without words.
 
     Raises:
-        OpenArmError: UNKNOWN_OBJECT, listing the labels of the scene.
+        OpenArmError: UNKNOWN_OBJECT or NOTHING_DETECTED, listing the objects of the scene.
     """
+    things: dict[Detection, SceneObject] = {}
     for item in scene.objects:
-        if label is None or item.label == label:
-            return item
-    labels = ", ".join(item.label for item in scene.objects) or "none"
-    raise OpenArmError(Code.UNKNOWN_OBJECT, f"scene {scene.name} has no object {label or ''!r}; it has {labels}")
+        name, size = "" if item.label == item.color else item.label, np.array(item.size)
+        kind, T = kind_of(item.shape, size), item.T_world_object(scene.table)
+        things[Detection(name, 1.0, T, size, kind=kind, color=item.color)] = item
+    try:
+        return tuple(things[one] for one in select(words, tuple(things)))
+    except OpenArmError as error:
+        text = f"scene {scene.name} has no object {words!r}; it has {describe(tuple(things))}"
+        raise OpenArmError(error.code, text) from error
 
 
 def shows(scene: Scene, positions: Mapping[str, Sample]) -> bool:
@@ -183,7 +190,7 @@ def run_trial(
     Raises:
         OpenArmError: TIMEOUT, when the scene does not show; UNKNOWN_OBJECT.
     """
-    item = choose_target(scene, wanted.label or None)
+    item = choose_targets(scene, wanted.label)[0]
     if not moved:
         wait_scene(observer, scene, after_ns)
     if before is not None:
@@ -191,7 +198,7 @@ def run_trial(
     observer.forget()
 
     def request() -> Sequence[GraspResult]:
-        return [client.pick(item.label, arm=wanted.arm, place=wanted.place)]
+        return [client.pick(wanted.label or item.label, arm=wanted.arm, place=wanted.place)]
 
     (trial,) = _observed(observer, scene, seed, [item], request, wanted.place)
     return trial
@@ -207,13 +214,13 @@ def run_pair(
     after_ns: int = 0,
 ) -> list[Trial]:
     """As `run_trial`, for two objects that are requested simultaneously; the observer keeps joint states meanwhile."""
-    first, second = items = [choose_target(scene, label) for label in labels]
+    items = [choose_targets(scene, label)[0] for label in labels]
     wait_scene(observer, scene, after_ns)
     observer.forget()
     observer.wait(lambda: observer.joints() or None, SETTLE_TIMEOUT_S, "/joint_states")
 
     def request() -> Sequence[GraspResult | GraspOutcome]:
-        both = client.pick_two(first.label, second.label)
+        both = client.pick_two(*labels)
         return both.results or [GraspOutcome(both.code, both.message, item.label) for item in items]
 
     return _observed(observer, scene, seed, items, request)
@@ -245,7 +252,7 @@ def _observed(
         chosen = result.place_position if any(result.place_position) else (math.nan, math.nan)
         x, y = (place or chosen)[:2]
         verdict = judge(observer.track(item.name), (x, y), claimed=result.success)
-        steps = [step for step in observer.steps() if len(items) == 1 or step.label == item.label]
+        steps = [step for step in observer.steps() if len(items) == 1 or step.label in (item.label, result.label)]
         trials.append(Trial(scene, seed, item.name, result, verdict, steps, wall_s))
     return trials
 

@@ -22,6 +22,8 @@ from openarm_grasp.perception.detections import Frame, apart, sticks_out
 YAW_TOLERANCE = float(np.radians(15.0))
 #: An object that is placed is as high as before; one that differs by more lies on its side, m.
 UPRIGHT_WITHIN = 0.006
+#: One whose footprint has grown by more in every frame leans (by 15° at the latest), m.
+FOOTPRINT_WITHIN = 0.010
 #: What is farther from an object is another one, or the hand hides it, m.
 _ELSEWHERE = 0.10
 #: Edges of a footprint that differ by less are taken for equal, m; those of what is round are, too.
@@ -114,8 +116,13 @@ def judge_sight(
     *,
     match_radius: float,
     others: Sequence[Detection] = (),
+    lift: float = 0.0,
 ) -> CameraVerdict:
-    """Whether the object has left its place: GRASP_MISSED, when it is still there or held elsewhere; STALE_DATA.
+    """Whether the object has left its place, and risen with the hand.
+
+    GRASP_MISSED, when it is still there or held elsewhere; GRASP_LOST, when it has slipped in the hand; STALE_DATA. The
+    detector takes what is held for a part of the hand, as long as it is where the hand took hold of it; what is seen
+    below that has slipped by at least so much.
 
     Args:
         before: The object as it was before the grasp.
@@ -123,6 +130,7 @@ def judge_sight(
         config: Thresholds.
         match_radius: Horizontal distance that counts as the old place, m.
         others: What else stood there; those like the object are not taken for it.
+        lift: How far the hand has risen, m.
     """
     if not frames:
         return CameraVerdict(Code.STALE_DATA, "no camera frame after the lift")
@@ -140,6 +148,13 @@ def judge_sight(
     risen = highest.top - before.top
     if risen >= config.rise:
         text = f"{before.label!r} is seen {risen * 1e3:.0f} mm higher"
+        slipped = before.bottom + lift - highest.top
+        if slipped > config.slip_along:
+            limit = f"expected at most {config.slip_along * 1e3:.0f} mm"
+            return CameraVerdict(
+                Code.GRASP_LOST,
+                f"{text}, the hand {lift * 1e3:.0f} mm: it has slipped by at least {slipped * 1e3:.0f} mm, {limit}",
+            )
         off = sticks_out(highest, before)
         if off > config.askew:
             limit = f"expected at most {config.askew * 1e3:.0f} mm"
@@ -189,8 +204,11 @@ def judge_place(
     tolerance: float,
     yaw: float | None = None,
     height: float | None = None,
+    footprint: Array | None = None,
 ) -> CameraVerdict:
-    """Whether the camera sees the object at the place target after the arm has left.
+    """Whether the camera sees the object at the place target after the arm has left, as it stood before.
+
+    What has turned onto a face of the same size looks as before: that no camera sees.
 
     Args:
         label: Of the object.
@@ -199,15 +217,13 @@ def judge_place(
         tolerance: Largest horizontal distance, m.
         yaw: Of its x axis, where one was asked for, rad; what looks square or round is not judged by it.
         height: Of the object as it stood, m: one of another height lies on its side. None: it is not judged.
+        footprint: (2,) edges of the object as it stood, m: one that leans shows larger ones. None: they are not judged.
     """
     if not frames:
         return CameraVerdict(Code.STALE_DATA, "no camera frame after the place")
-    same = next(
-        (found for frame in reversed(frames) if (found := [d for d in frame.detections if d.label == label])), ()
-    )
-    if not same:
+    nearest = next((d for frame in reversed(frames) if (d := _nearest(label, p_target, frame)) is not None), None)
+    if nearest is None:
         return CameraVerdict(Code.PLACE_FAILED, f"{label!r} is not in view after the place")
-    nearest = min(same, key=lambda d: float(np.linalg.norm((d.p_base - p_target)[:2])))
     distance = float(np.linalg.norm((nearest.p_base - p_target)[:2]))
     text = f"{label!r} stands {distance * 1e3:.0f} mm from its target"
     if distance > tolerance:
@@ -216,9 +232,26 @@ def judge_place(
     if height is not None and abs(top - height) > UPRIGHT_WITHIN:
         was = f"it is {top * 1e3:.0f} mm high there and was {height * 1e3:.0f} mm"
         return CameraVerdict(Code.PLACE_FAILED, f"{label!r} has fallen over: {was}", final=True)
+    if footprint is not None:
+        sights = [_nearest(label, p_target, frame) for frame in frames]
+        larger = [_larger(d, footprint) for d in sights if d is not None and d.measured]
+        if larger and min(larger) > FOOTPRINT_WITHIN:
+            leans = f"seen from above it is {min(larger) * 1e3:.0f} mm larger than it was"
+            return CameraVerdict(Code.PLACE_FAILED, f"{label!r} does not stand upright: {leans}", final=True)
     if yaw is not None and abs(float(nearest.size[0] - nearest.size[1])) > SQUARE_WITHIN:
         off = abs((nearest.yaw - yaw + np.pi / 2.0) % np.pi - np.pi / 2.0)
         text += f", turned {np.degrees(off):.0f}° from what was asked"
         if off > YAW_TOLERANCE:
             return CameraVerdict(Code.PLACE_FAILED, f"{text}, expected at most {np.degrees(YAW_TOLERANCE):.0f}°")
     return CameraVerdict(Code.OK, text)
+
+
+def _nearest(label: str, p: Array, frame: Frame) -> Detection | None:
+    """The object of a frame that is nearest to a point."""
+    same = (d for d in frame.detections if d.label == label)
+    return min(same, key=lambda d: float(np.linalg.norm((d.p_base - p)[:2])), default=None)
+
+
+def _larger(d: Detection, footprint: Array) -> float:
+    """By how much an edge of what is seen is longer than that of a footprint, m, whichever is the longer one."""
+    return float((np.sort(d.size[:2]) - np.sort(footprint)).max())

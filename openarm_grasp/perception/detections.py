@@ -18,6 +18,7 @@ from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
+from openarm_common.wanted import describe, select
 from openarm_grasp.config import DetectConfig
 
 #: An object that is chosen by its position is no farther from it than this, m.
@@ -62,11 +63,6 @@ def in_base(frames: Sequence[Frame], lookup: Callable[[int], Array]) -> tuple[Fr
     return tuple(moved)
 
 
-def labels_in_view(frames: Sequence[Frame]) -> list[str]:
-    """Labels seen in any of the frames, sorted."""
-    return sorted({d.label for frame in frames for d in frame.detections})
-
-
 def apart(a: Detection, b: Detection) -> float:
     """Horizontal distance of two objects, m."""
     return float(np.linalg.norm((a.p_base - b.p_base)[:2]))
@@ -99,7 +95,27 @@ def average(track: Sequence[Detection]) -> Detection:
     p = np.mean([d.p_base for d in track], axis=0)
     score = float(np.mean([d.score for d in track]))
     around = 2 * sum(d.round for d in track) > len(track)
-    return Detection(reference.label, score, se3.make(se3.rot_z(yaw), p), np.mean(sizes, axis=0), around)
+    T, size = se3.make(se3.rot_z(yaw), p), np.mean(sizes, axis=0)
+    return replace(reference, score=score, T_base_object=T, size=size, round=around)
+
+
+def in_view(frames: Sequence[Frame], label: str) -> tuple[Detection, ...]:
+    """What words fit in the newest frame, the first choice at the front.
+
+    Raises:
+        OpenArmError: NOTHING_DETECTED or UNKNOWN_OBJECT, when no frame shows any; STALE_DATA, when older ones do.
+    """
+    fault: OpenArmError | None = None
+    for frame in reversed(frames):
+        try:
+            fitting = select(label, frame.detections)
+        except OpenArmError as error:
+            fault = fault or error
+            continue
+        if fault is None:
+            return fitting
+        raise OpenArmError(Code.STALE_DATA, f"{label or 'the object'!r} was in view, but not in the newest frame")
+    raise fault or OpenArmError(Code.NOTHING_DETECTED, "no frame of the camera")
 
 
 def find(
@@ -109,27 +125,27 @@ def find(
     *,
     at: Sequence[float] | None = None,
     exclude_near: Sequence[Sequence[float]] = (),
+    same: Sighting | None = None,
 ) -> Sighting:
     """Follow one object through all frames and average it.
 
     Args:
         frames: At least one, oldest first.
-        label: What to look for; "" takes any.
+        label: What to look for, in words; "" takes any. Of those that fit, the first is taken.
         limits: How near detections must be to be one object, and how much it may seem to move.
-        at: (x, y) where it stands, m; None takes the detection with the highest score.
+        at: (x, y) where it stands, m; None: anywhere.
         exclude_near: (x, y) of objects that are excluded, m.
+        same: The object as it was seen or left before: it is looked for alone, whatever the words fit now.
 
     Raises:
         OpenArmError: NOTHING_DETECTED, when no frame holds anything, or the chosen one cannot be measured;
+            INTRINSICS_MISMATCH or TABLE_MISMATCH, when what its camera sees is not to be trusted;
             UNKNOWN_OBJECT, naming what is in view; STALE_DATA, when the object was not in the newest frame and two
             thirds of all, or moved between them.
     """
-    seen = labels_in_view(frames)
-    if not seen:
-        raise OpenArmError(Code.NOTHING_DETECTED, f"nothing is in view (asked for {label or 'any object'!r})")
-    if label and label not in seen:
-        raise OpenArmError(Code.UNKNOWN_OBJECT, f"no {label!r} in view; in view: {', '.join(seen)}")
-    anchor = _anchor(frames[-1], label, at, exclude_near)
+    anchor = _same(frames, same) if same else _anchor(in_view(frames, label), label, at, exclude_near)
+    if not anchor.measured:
+        raise _not_measured(anchor)
     track: list[Detection] = []
     for frame in frames:
         fit = [d for d in frame.detections if d.label == anchor.label and d.measured]
@@ -156,12 +172,25 @@ def find(
     return Sighting(target, _others(frames, target, limits.match_radius), frames[-1].t_ns)
 
 
-def _anchor(frame: Frame, label: str, at: Sequence[float] | None, exclude_near: Sequence[Sequence[float]]) -> Detection:
+def _same(frames: Sequence[Frame], before: Sighting) -> Detection:
+    """The detection of an object that was seen before: its like that is nearest to it, and was not there next to it."""
+    target, newest = before.target, frames[-1].detections
+    alike = [d for d in newest if d.label == target.label]
+    for twin in (d for d in before.others if d.label == target.label):
+        stays = min(alike, key=lambda d: apart(d, twin), default=None)
+        if stays is not None and apart(stays, twin) <= min(SAME_PLACE, apart(stays, target)):
+            alike.remove(stays)
+    if not alike:
+        text = f"{target.label!r} that was at {_text(target.p_base)} is not in view; in view: {describe(newest)}"
+        raise OpenArmError(Code.UNKNOWN_OBJECT, text)
+    return min(alike, key=lambda d: (not d.measured, apart(d, target)))
+
+
+def _anchor(
+    fitting: Sequence[Detection], label: str, at: Sequence[float] | None, exclude_near: Sequence[Sequence[float]]
+) -> Detection:
     """The detection of the object that is asked for."""
     name = label or "the object"
-    fitting = [d for d in frame.detections if not label or d.label == label]
-    if not fitting:
-        raise OpenArmError(Code.STALE_DATA, f"{name!r} was in view, but not in the newest frame")
     chosen = [d for d in fitting if all(_from(d, p) > SAME_PLACE for p in exclude_near)]
     if not chosen:
         raise OpenArmError(
@@ -174,10 +203,7 @@ def _anchor(frame: Frame, label: str, at: Sequence[float] | None, exclude_near: 
             limit = f"within {SAME_PLACE * 1e3:.0f} mm of ({at[0]:.3f}, {at[1]:.3f}) m"
             raise OpenArmError(Code.UNKNOWN_OBJECT, f"no {name!r} {limit}; it is seen at {there}")
         chosen = [min(near, key=lambda d: _from(d, at))]
-    measured = [d for d in chosen if d.measured]
-    if not measured:
-        raise _not_measured(chosen[0])
-    return max(measured, key=lambda d: d.score)
+    return next((d for d in chosen if d.measured), chosen[0])
 
 
 def _same_thing(a: Detection, b: Detection) -> bool:
@@ -185,11 +211,17 @@ def _same_thing(a: Detection, b: Detection) -> bool:
 
 
 def _not_measured(d: Detection) -> OpenArmError:
-    return OpenArmError(
-        Code.NOTHING_DETECTED,
-        f"{d.label!r} is in view at about {_text(d.p_base)}, but cannot be measured: something hides its outline, or"
-        " the border of the image cuts it",
-    )
+    why = _WHY.get(d.code, "cannot be measured: something hides its outline, or the border of the image cuts it")
+    return OpenArmError(d.code, f"{d.label!r} is in view at about {_text(d.p_base)}, but {why}")
+
+
+#: Why nothing that a camera sees is a target; its detector knows the figures.
+_WHY = {
+    Code.INTRINSICS_MISMATCH: "its camera_info does not fit its calibration or what it sees, so that nothing it sees"
+    " is a target; /diagnostics of its detector has the figures",
+    Code.TABLE_MISMATCH: "the table is not seen where it is expected, so that nothing is a target; measure it with"
+    " `openarm calibrate table`; /diagnostics of the detector has the figures",
+}
 
 
 def on_table(d: Detection, table_z: float, *, reach: float = 0.03) -> Detection:

@@ -24,8 +24,6 @@ from openarm_common.types import Array
 from openarm_grasp.config import ApproachConfig, GraspConfig, HandConfig
 
 UP = np.array([0.0, 0.0, 1.0])
-#: Below every difference that a tilt makes: a candidate that has failed is tried after all that have not.
-USED_PENALTY = 10.0
 #: A tilt of 15° costs more than width and side together can win back.
 _TILT_COST_PER_RAD = 2.0
 _WIDTH_WEIGHT = 0.15
@@ -58,7 +56,7 @@ class GraspCandidate:
 
     Attributes:
         id: Names edge (of what is round, the direction in degrees), flip, tilt and lean, for example
-            "red/x+/tilt15/lean-", "red/x+/tilt0" or "red/30+/tilt0".
+            "red/x+/tilt15/lean-", "red/x+/tilt0/up10" (10 mm higher) or "red/30+/tilt0".
         T_base_tcp: (4, 4) pose of the TCP at the grasp.
         approach_offset: (3,) from the grasp to the pre-grasp, base frame, m.
         retreat_offset: (3,) from the grasp to the end of the lift, base frame, m.
@@ -99,6 +97,10 @@ class PlaceTarget:
     approach_offset: Array
     retreat_offset: Array
     score: float
+
+    def __str__(self) -> str:
+        """Its id, and where it is."""
+        return "{} at ({:.3f}, {:.3f}) m".format(self.id, *self.position[:2])
 
 
 def tcp_height(height: float, tilt: float, hand: HandConfig) -> float:
@@ -157,8 +159,8 @@ def propose(
     config: GraspConfig,
     *,
     shoulder_xy: Sequence[float] = (0.0, 0.0),
-    used: frozenset[str] = frozenset(),
     others: Sequence[Detection] = (),
+    raised: float = 0.0,
 ) -> tuple[GraspCandidate, ...]:
     """Every grasp worth planning, best first.
 
@@ -166,31 +168,35 @@ def propose(
         target: The object; its lower face is the surface it stands on.
         config: Parameters.
         shoulder_xy: (2,) of the arm's shoulder in the base frame, m; leaning away from it reaches furthest.
-        used: Ids that have failed before; they come last.
         others: What stands around it; hands whose fingers have room come first.
+        raised: TCP so much higher than it need be, m; nothing is proposed where the pads would leave the object.
 
     Raises:
         OpenArmError: TOO_WIDE, when no side fits into the hand.
     """
     found: list[GraspCandidate] = []
+    height = float(target.size[2])
     for edge, direction, width in graspable_edges(target, config.approach):
         room = _room(target.p_base, direction, others, config.hand)
         for flip, tilt_deg, lean in product(("+", "-"), config.approach.tilts_deg, ("+", "-")):
             if tilt_deg == 0.0 and lean == "-":
                 continue  # a vertical hand leans nowhere
+            tilt = radians(tilt_deg)
+            above = tcp_height(height, tilt, config.hand) + raised
+            if raised and above + config.hand.pad_centre > height:
+                continue
             name = f"{target.label}/{edge}{flip}/tilt{tilt_deg:g}" + (f"/lean{lean}" if tilt_deg else "")
+            name += f"/up{raised * 1e3:g}" if raised else ""
             y_tool = direction if flip == "+" else -direction
             heading = np.cross(UP, direction) * (1.0 if lean == "+" else -1.0)
-            tilt = radians(tilt_deg)
             z_tool = sin(tilt) * heading - cos(tilt) * UP
             p = target.p_base.copy()
-            p[2] = target.bottom + tcp_height(float(target.size[2]), tilt, config.hand)
+            p[2] = target.bottom + above
             parts = {
                 "tilt": -_TILT_COST_PER_RAD * tilt,
                 "width": _WIDTH_WEIGHT * max(0.0, 1.0 - width / config.approach.max_width),
                 "side": _SIDE_WEIGHT * sin(tilt) * _outward(target.p_base, heading, shoulder_xy),
                 "room": _ROOM_WEIGHT * (min(room, _ROOM) / _ROOM - 1.0),
-                "used": -USED_PENALTY if name in used else 0.0,
             }
             found.append(
                 GraspCandidate(
@@ -210,7 +216,7 @@ def propose(
 
 def hold_of(candidate: GraspCandidate) -> str:
     """The hold of a grasp, whatever its tilt: label and edge."""
-    return "/".join(candidate.id.split("/")[:2])
+    return candidate.id.rpartition("/tilt")[0]  # a label may have strokes of its own
 
 
 def _outward(p_base: Array, heading: Array, shoulder_xy: Sequence[float]) -> float:

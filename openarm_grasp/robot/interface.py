@@ -75,6 +75,9 @@ class Planned:
         refusals: Why others were refused, by id.
         limit_margins: Of each way, how near it comes to a joint limit, rad; NaN: refused or not evaluated. Empty when
             the planner does not say.
+        start: Joints at its beginning, rad by name.
+        duration: Of the three, s.
+        scene_version: Of the planning scene that it was planned in.
     """
 
     chosen: int
@@ -83,6 +86,9 @@ class Planned:
     retreat: Trajectory
     refusals: Mapping[str, Verdict] = field(default_factory=dict[str, Verdict])
     limit_margins: tuple[float, ...] = ()
+    start: Mapping[str, float] = field(default_factory=dict[str, float])
+    duration: float = 0.0
+    scene_version: int = 0
 
 
 class RobotInterface(Protocol):
@@ -142,6 +148,10 @@ class RobotInterface(Protocol):
 
     async def plan(self, request: PlanGrasp | PlanPlace) -> Planned:
         """Plan; raises with the planner's code."""
+        ...
+
+    async def scene_version(self) -> int:
+        """Version of the planning scene."""
         ...
 
     async def reach(self, arm: str, T_base_tcp: Array) -> Mapping[str, float]:

@@ -7,7 +7,9 @@ does not succeed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
@@ -21,8 +23,10 @@ from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget, held_box, obstacle_boxes, target_box
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 
+#: The map shows an object so much wider than it is, m.
+_CELL = 0.01
 #: Errors of a robot that end a request at once, with the arm where it is.
-STOPS = (Code.CANCELLED, Code.ROBOT_LOST, Code.INTERNAL)
+STOPS = (Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.INTERNAL)
 
 
 def reraise_stop(error: OpenArmError) -> None:
@@ -63,6 +67,11 @@ class Skills:
     def warn(self, text: str) -> None:
         """Report something that does not stop the work."""
         self.robot.warn(text)
+
+    async def until(self, done: Callable[[], bool], limit: float, what: str) -> None:
+        """Wait for a condition, no longer than `limit` s."""
+        self.robot.check()
+        await self.robot.until(done, limit, what)
 
     async def wait(self, duration: float) -> None:
         """Let robot time pass, s."""
@@ -127,7 +136,7 @@ class Skills:
         candidate: GraspCandidate,
         after: Trajectory | None = None,
     ) -> Planned:
-        """Plan how to put the object down; the map may still show it where it was.
+        """Plan how to put the object down; the map may still show it where it was, or below the hand that lifted it.
 
         Args:
             arm: Whose.
@@ -137,8 +146,15 @@ class Skills:
             after: Trajectory whose end is the start; None starts at the present joints.
         """
         held, obstacles = held_box(found.target, candidate, self._config), obstacle_boxes(found.others, self._config)
-        stood = (target_box(found.target, self._config),)
-        return await self.plan(PlanPlace(arm, tuple(ways), obstacles, held, after, stood))
+        stood, lift = target_box(found.target, self._config), self._config.approach.lift_height
+        grown = np.array([2.0 * _CELL, 2.0 * _CELL, lift])
+        column = Box(stood.id, se3.make(p=(0.0, 0.0, 0.5 * lift)) @ stood.T_frame_box, stood.size + grown)
+        return await self.plan(PlanPlace(arm, tuple(ways), obstacles, held, after, (column,)))
+
+    async def scene_version(self) -> int:
+        """Version of the planning scene."""
+        self.robot.check()
+        return await self.robot.scene_version()
 
     async def reach(self, arms: Sequence[str], T_base_tcp: Array) -> dict[str, float]:
         """How far each arm's TCP stays from a point, m by arm; those of which nothing is known are left out."""
@@ -149,7 +165,15 @@ class Skills:
         return distances
 
     # --- moving
-    async def follow(self, arm: str, trajectory: Trajectory, what: str, *, carrying: bool = False) -> None:
+    async def follow(
+        self,
+        arm: str,
+        trajectory: Trajectory,
+        what: str,
+        *,
+        carrying: bool = False,
+        line: tuple[Array, Array] | None = None,
+    ) -> None:
         """Follow a planned trajectory.
 
         Args:
@@ -157,12 +181,14 @@ class Skills:
             trajectory: Of the planner.
             what: For errors, for example "lift".
             carrying: A hand that closes or slips stops it.
+            line: Ends (3,) of the straight line that the TCP follows, base frame, m; leaving it by more than
+                `path_tolerance` stops it.
 
         Raises:
-            OpenArmError: GRASP_LOST; as the robot.
+            OpenArmError: GRASP_LOST; HAND_COLLISION; as the robot.
         """
         self.robot.check()
-        held, at_first = self._config.held, self.aperture(arm)
+        held, at_first, tolerance = self._config.held, self.aperture(arm), self._config.approach.path_tolerance
 
         def still_held() -> None:
             now = self.aperture(arm)
@@ -175,7 +201,14 @@ class Skills:
                     f" way, expected to stay within {held.slip * 1e3:.0f} mm",
                 )
 
-        await self.robot.follow(arm, trajectory, f"{arm} arm: {what}", still_held if carrying else None)
+        def on_line() -> None:
+            off = 0.0 if line is None else _off_line(self._hands[arm].T_base_tcp()[:3, 3], *line)
+            if off > tolerance:
+                text = f"{what}: the hand is {off * 1e3:.0f} mm off its straight line, expected at most"
+                raise OpenArmError(Code.HAND_COLLISION, f"{text} {tolerance * 1e3:.0f} mm; is something in its way?")
+
+        guard = still_held if carrying else None if line is None else on_line
+        await self.robot.follow(arm, trajectory, f"{arm} arm: {what}", guard)
 
     async def follow_and_grip(self, arm: str, trajectory: Trajectory, what: str, *, position: float, how: str) -> None:
         """Follow a trajectory and move the fingers at the same time; arguments as of `follow` and `grip`."""
@@ -215,6 +248,11 @@ class Skills:
                     reraise_stop(error)
                     robot.warn(error.message)  # the free path home may still be there
             await robot.move(arm, config.home_state, f"{arm} arm: go {config.home_state}", obstacles)
+
+    def joints(self) -> dict[str, float]:
+        """Positions of the joints of all arms, rad by name."""
+        _, q = self.robot.states.latest()
+        return {name: q[name] for arm in ARMS for name in self.description.arm_joints(arm)}
 
     # --- the hand
     def aperture(self, arm: str) -> float:
@@ -281,3 +319,10 @@ class Skills:
         await robot.until(at_rest, limit, "waiting for the fingers to rest")
         pads = robot.pads(arm) if self._config.held.use_finger_force else ()
         return hand.evidence(expected, robot.effort(hand.joint), T_base_tcp, pads)
+
+
+def _off_line(p: Array, begin: Array, end: Array) -> float:
+    """Distance of a point from a line segment, m."""
+    way = end - begin
+    share = float(np.clip((p - begin) @ way / (way @ way), 0.0, 1.0))
+    return float(np.linalg.norm(p - begin - share * way))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Any
 
 from openarm_interfaces.action import Pick, PickTwo
 from openarm_interfaces.msg import GraspStatus, PickRequest, PickResult
+from openarm_interfaces.srv import ConfirmPlan
 
 from openarm_common.errors import Answer, Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
@@ -17,8 +19,10 @@ from openarm_common.ros.convert import point, xyz
 from openarm_grasp.planning.options import Option
 from openarm_grasp.ros.messages import code_from_text, option_from_msg
 from openarm_grasp.strategies.request import GraspRequest
+from openarm_grasp.strategies.state_times import StateTime
 
 OnFeedback = Callable[[GraspStatus], None]
+OnPlan = Callable[[GraspStatus], bool]
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,8 @@ class GraspResult(Answer):
         route: "direct"; "hand_over": by way of the middle, with both arms; "push": pushed into reach; "" when it was
             not placed.
         options: Ways to grasp that were weighed for the newest plan, by arm, the preferred first; of one object only.
+        state_times: Time spent in each state, and how long a visit is expected to take.
+        recording: Path of the flight recording of a failure, of one object only; "" when there is none.
     """
 
     outcome: str
@@ -47,6 +53,8 @@ class GraspResult(Answer):
     duration: float
     route: str = ""
     options: tuple[Option, ...] = ()
+    state_times: tuple[StateTime, ...] = ()
+    recording: str = ""
 
 
 @dataclass(frozen=True)
@@ -61,12 +69,14 @@ class PairResult(Answer):
         simultaneous: Both arms moved at the same time.
         results: Of each, in the order asked; none when they were not taken.
         duration: s of robot time.
+        recording: Path of the flight recording of a failure; "" when there is none.
     """
 
     outcome: str
     simultaneous: bool
     results: tuple[GraspResult, ...]
     duration: float
+    recording: str = ""
 
 
 class GraspClient(BackgroundNode):
@@ -96,6 +106,7 @@ class GraspClient(BackgroundNode):
         exclude_near: Sequence[Sequence[float]] = (),
         phase: str = "all",
         dry_run: bool = False,
+        confirm: OnPlan | bool = False,
         time_limit: float = 0.0,
         timeout: float = 300.0,
         on_feedback: OnFeedback | None = None,
@@ -112,6 +123,9 @@ class GraspClient(BackgroundNode):
             exclude_near: (x, y) of objects that stay where they are.
             phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
             dry_run: Plan and report, do not move.
+            confirm: Called in the thread of the caller with the `GraspStatus` of each plan that waits (its `plan_id`,
+                `arm`, and `reason` in a sentence); whether that plan is executed. True: plans wait for somebody else,
+                who calls `confirm` or /grasp/confirm. False: nothing waits.
             time_limit: s of robot time; then it ends with TIMEOUT, the hand keeping what it holds. 0: none.
             timeout: s of wall clock; then the grasp is cancelled.
             on_feedback: Called with each `GraspStatus`, in the background thread; it may call `cancel`.
@@ -126,7 +140,15 @@ class GraspClient(BackgroundNode):
         goal = Pick.Goal(label=label, arm=arm, dry_run=dry_run, phase=phase, timeout=time_limit)
         _where(goal, place, place_yaw, object_at)
         goal.exclude_near = [point((p[0], p[1], 0.0)) for p in exclude_near]
-        return _result(self._ask(Pick, "/grasp/pick", goal, timeout, on_feedback))
+        goal.confirm = bool(confirm)
+        return _result(self._ask(Pick, "/grasp/pick", goal, timeout, on_feedback, confirm))
+
+    def confirm(self, plan_id: str, *, accept: bool) -> Answer:
+        """Confirm or reject the plan that waits, of whichever client."""
+        request = ConfirmPlan.Request(plan_id=plan_id, accept=accept)
+        answer = self.call(ConfirmPlan, "/grasp/confirm", request, self._timeout)
+        code = Code.OK if answer.success else code_from_text(answer.code, Code.INTERNAL)
+        return Answer(answer.success, code, answer.message)
 
     def pick_two(
         self,
@@ -162,17 +184,37 @@ class GraspClient(BackgroundNode):
             _where(request, asked.place, asked.place_yaw, asked.object_at)
         answer: PickTwo.Result = self._ask(PickTwo, "/grasp/pick_two", goal, timeout, on_feedback)
         results = tuple(_result(one) for one in answer.results)
-        return PairResult(**_same(answer, "simultaneous"), results=results)
+        return PairResult(**_same(answer, "simultaneous", "recording"), results=results)
 
     def cancel(self) -> None:
         """Ask what runs to stop; it returns with CANCELLED, the arms holding where they are."""
         self._stop.set()
 
-    def _ask(self, kind: Any, name: str, goal: object, timeout: float, on_feedback: OnFeedback | None) -> Any:
+    def _ask(
+        self,
+        kind: Any,
+        name: str,
+        goal: object,
+        timeout: float,
+        on_feedback: OnFeedback | None,
+        confirm: OnPlan | bool = False,
+    ) -> Any:
         """Send a goal and return its result message."""
         self._stop.clear()
-        deliver = None if on_feedback is None else (lambda feedback: on_feedback(feedback.status))
-        return self.do(kind, name, goal, timeout=timeout, on_feedback=deliver, stop=self._stop)
+        plans: queue.SimpleQueue[GraspStatus] = queue.SimpleQueue()
+
+        def deliver(feedback: Any) -> None:
+            if feedback.status.plan_id:
+                plans.put(feedback.status)
+            if on_feedback is not None:
+                on_feedback(feedback.status)
+
+        def answer() -> None:
+            while callable(confirm) and not plans.empty():
+                plan = plans.get()
+                self.confirm(plan.plan_id, accept=confirm(plan))
+
+        return self.do(kind, name, goal, timeout=timeout, on_feedback=deliver, stop=self._stop, meanwhile=answer)
 
 
 def _where(
@@ -195,9 +237,11 @@ def _where(
 
 def _result(message: Pick.Result | PickResult) -> GraspResult:
     x, y, z = (float(v) for v in xyz(message.place_position))
-    options = () if isinstance(message, PickResult) else tuple(map(option_from_msg, message.options))
     same = _same(message, "label", "arm", "attempts", "route")
-    return GraspResult(**same, place_position=(x, y, z), options=options)
+    if not isinstance(message, PickResult):
+        same |= {"options": tuple(map(option_from_msg, message.options)), "recording": message.recording}
+    times = tuple(StateTime(one.state, one.duration, one.budget, one.longest) for one in message.state_times)
+    return GraspResult(**same, place_position=(x, y, z), state_times=times)
 
 
 def _same(message: Pick.Result | PickResult | PickTwo.Result, *names: str) -> dict[str, Any]:

@@ -9,8 +9,9 @@ from typing import Any
 
 from control_msgs.action import GripperCommand, ParallelGripperCommand
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
-from openarm_interfaces.srv import ComputeIK
+from openarm_interfaces.srv import ComputeIK, GetScene
 from rclpy.action import ActionClient
+from rclpy.client import Client
 from rclpy.task import Future
 
 from openarm_common.errors import Code, OpenArmError
@@ -42,6 +43,7 @@ class GraphRobot:
         self._execute = ActionClient(node, ExecuteTrajectory, "/motion/execute")
         self._move = ActionClient(node, MoveArm, "/motion/move")
         self._ik = node.create_client(ComputeIK, "/motion/compute_ik")
+        self._scene = node.create_client(GetScene, "/motion/get_scene")
         gripper_action = ParallelGripperCommand if config.gripper_action == "parallel" else GripperCommand
         self._grippers = {
             arm: ActionClient(node, gripper_action, f"/{arm}_gripper_controller/gripper_cmd") for arm in ARMS
@@ -68,6 +70,10 @@ class GraphRobot:
     def end(self) -> None:
         """Stop listening."""
         self._nodes.end()
+
+    def follow_table(self, on_height: Callable[[float], None]) -> None:
+        """Call a function with the height of the table, base frame, m, whenever it is published."""
+        self._nodes.robot.follow_table(on_height)
 
     def close(self) -> None:
         """Take the clients down."""
@@ -192,9 +198,18 @@ class GraphRobot:
         """Ask /motion/compute_ik."""
         if not self._ik.service_is_ready():
             return {}
-        answered = self._ik.call_async(messages.reach_request(arm, T_base_tcp))
-        await self._nodes.until(answered.done, self._config.limits.answer_timeout, "/motion/compute_ik")
-        return messages.reach_from_msg(arm, answered.result(), T_base_tcp)
+        answer = await self._answer(self._ik, messages.reach_request(arm, T_base_tcp), "/motion/compute_ik")
+        return messages.reach_from_msg(arm, answer, T_base_tcp)
+
+    async def scene_version(self) -> int:
+        """Ask /motion/get_scene."""
+        answer = await self._answer(self._scene, GetScene.Request(), "/motion/get_scene")
+        return int(answer.version)
+
+    async def _answer(self, client: Client, request: object, what: str) -> Any:
+        answered = client.call_async(request)
+        await self._nodes.until(answered.done, self._config.limits.answer_timeout, what)
+        return answered.result()
 
     async def follow(
         self, arm: str, trajectory: Trajectory, what: str, guard: Callable[[], None] | None = None

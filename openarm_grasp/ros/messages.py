@@ -4,33 +4,41 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import replace
-from typing import Literal
+from dataclasses import asdict, replace
+from typing import Any, Literal
 
 import numpy as np
 from control_msgs.action import GripperCommand, ParallelGripperCommand
 from geometry_msgs.msg import Point
 from openarm_interfaces.action import MoveArm, Pick, PickTwo, PlanApproach
 from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspOption, GraspStatus, PickRequest, PickResult
+from openarm_interfaces.msg import StateTime as StateTimeMsg
 from openarm_interfaces.srv import ComputeIK, Grasp
 from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA, Header
+from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, point, vector, xyz
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, point, stamp_to_ns, vector, xyz
 from openarm_common.ros.node import BASE_FRAME
 from openarm_common.types import Array
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NoWayError, Option
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
+from openarm_grasp.strategies.confirm import ShownPlan
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome
 from openarm_grasp.strategies.task import Status
 
 _CHOSEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 _REFUSED = ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.35)
+_WAITING = ColorRGBA(r=0.95, g=0.6, b=0.1, a=1.0)
 _OFFERED = ColorRGBA(r=0.4, g=0.5, b=0.9, a=0.35)
+
+#: What the namespaces of the parts of a plan that waits begin with.
+PLAN = "plan/"
 
 
 # --- requests and answers
@@ -39,6 +47,7 @@ def request_from_msg(message: Grasp.Request | Pick.Goal) -> GraspRequest:
     return replace(
         _request(message),
         dry_run=message.dry_run,
+        confirm=message.confirm,
         phase=message.phase or "all",
         timeout=message.timeout,
         exclude_near=tuple((p.x, p.y) for p in message.exclude_near),
@@ -69,8 +78,10 @@ def fill_answer(answer: Grasp.Response | Pick.Result | PickResult, outcome: Gras
         setattr(answer, name, getattr(outcome, name))
     answer.outcome, answer.code = outcome.kind, outcome.code.value
     answer.place_position = point(outcome.place_position)
+    answer.state_times = [StateTimeMsg(**asdict(one)) for one in outcome.state_times]
     if not isinstance(answer, PickResult):
         answer.options = [option_to_msg(option) for option in outcome.options]
+        answer.recording = outcome.recording
 
 
 def option_to_msg(option: Option) -> GraspOption:
@@ -109,6 +120,7 @@ def pair_result(outcome: PairOutcome) -> PickTwo.Result:
         message=outcome.message,
         simultaneous=outcome.simultaneous,
         duration=outcome.duration,
+        recording=outcome.recording,
     )
     for one in outcome.answers:
         answer = PickResult()
@@ -127,10 +139,38 @@ def status_msg(status: Status, t_ns: int) -> GraspStatus:
         attempt=status.attempt,
         label=status.label,
         arm=status.arm,
+        plan_id=status.plan.id if status.plan else "",
+        code=status.code,
+        budget=status.budget,
     )
 
 
 # --- pictures
+def status_markers(status: Status, robot: RobotDescription, t_ns: int) -> MarkerArray:
+    """The candidates of a state, and the plan that waits in it; they replace what was shown before."""
+    markers = candidate_markers(status.candidates, status.chosen, status.refused, t_ns)
+    if status.plan is not None:
+        markers.markers += plan_markers(status.plan, robot, t_ns)
+    return markers
+
+
+def plan_markers(plan: ShownPlan, robot: RobotDescription, t_ns: int) -> list[Marker]:
+    """The path of the TCP on each part of a plan, a point for each point of its trajectory."""
+    link = robot.tcp_link("left" if plan.arm == "left" else "right")
+    found: list[Marker] = []
+    for i, (name, trajectory) in enumerate(plan.parts):
+        if not isinstance(trajectory, JointTrajectory):
+            raise OpenArmError(Code.INTERNAL, f"{type(trajectory).__name__} is not a trajectory of the graph")
+        planned: Any = trajectory
+        joints = (dict(zip(planned.joint_names, p.positions, strict=True)) for p in planned.points)
+        path = _points(*(robot.link_pose(link, q)[:3, 3] for q in joints))
+        line = Marker(ns=f"{PLAN}{name}", id=i, type=Marker.LINE_STRIP, color=_WAITING, points=path)
+        line.header = Header(stamp=ns_to_stamp(t_ns), frame_id=BASE_FRAME)
+        line.pose.orientation.w, line.scale.x = 1.0, 0.005
+        found.append(line)
+    return found
+
+
 def candidate_markers(
     candidates: Sequence[GraspCandidate], chosen: str, refused: Collection[str], t_ns: int
 ) -> MarkerArray:
@@ -209,6 +249,10 @@ def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
         raise NoWayError(code_from_text(result.code, Code.NO_PLAN), result.message or "no plan", refusals)
     if not 0 <= result.chosen < offered:
         raise OpenArmError(Code.INTERNAL, f"the planner chose target {result.chosen} of {offered}")
+    parts = (result.transfer, result.approach, result.retreat)
+    if not all(part.points for part in parts):
+        raise OpenArmError(Code.INTERNAL, "the planner answered with a trajectory without points")
+    first = result.transfer.points[0]
     return Planned(
         result.chosen,
         result.transfer,
@@ -216,6 +260,9 @@ def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
         result.retreat,
         refusals,
         tuple(result.limit_margins),
+        dict(zip(result.transfer.joint_names, first.positions, strict=True)),
+        sum(stamp_to_ns(part.points[-1].time_from_start) * 1e-9 for part in parts),
+        result.scene_version,
     )
 
 

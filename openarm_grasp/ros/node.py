@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The grasp node: service /grasp, actions /grasp/pick and /grasp/pick_two, topics /grasp/status and /grasp/markers."""
+"""The grasp node.
+
+Services /grasp and /grasp/confirm, actions /grasp/pick and /grasp/pick_two, topics /grasp/status and /grasp/markers.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from typing import Any, TypeVar
 
 from openarm_interfaces.action import Pick, PickTwo
 from openarm_interfaces.msg import GraspStatus
-from openarm_interfaces.srv import Grasp
+from openarm_interfaces.srv import ConfirmPlan, Grasp
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.qos import QoSProfile
@@ -26,6 +29,7 @@ from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.ros import messages
+from openarm_grasp.ros.flight_recorder_client import FlightRecorderClient
 from openarm_grasp.ros.graph_robot import GraphRobot
 from openarm_grasp.strategies.pair import Pair
 from openarm_grasp.strategies.registry import carry_out, carry_out_pair
@@ -49,12 +53,15 @@ class GraspNode(BaseNode[GraspConfig]):
         self._robot = GraphRobot(self, self.config)
         self._skills = Skills(self._robot, self.config)
         self._session = GraspSession(context)
+        self._flight_recorder = FlightRecorderClient(self)
+        self._robot.follow_table(self._take_table)
         self._running: tuple[GraspRequest, ...] = ()
         self._newest: dict[int, Status] = {}
         self._goal: ServerGoalHandle | None = None
         self._status_topic = self.create_publisher(GraspStatus, "/grasp/status", _QOS_STATUS)
         self._marker_topic = self.create_publisher(MarkerArray, "/grasp/markers", QOS_LATCHED)
         self.create_service(Grasp, "/grasp", self._on_grasp)
+        self.create_service(ConfirmPlan, "/grasp/confirm", self._on_confirm)
         self._actions = [
             self._serve(Pick, "/grasp/pick", self._on_pick),
             self._serve(PickTwo, "/grasp/pick_two", self._on_pick_two),
@@ -68,9 +75,21 @@ class GraspNode(BaseNode[GraspConfig]):
             self._actions.pop().destroy()
         super().close()
 
+    def _take_table(self, height: float) -> None:
+        context = self._session.context
+        self._session.context = replace(context, table=context.table.at(height))
+
     # --- callbacks
     async def _on_grasp(self, request: Grasp.Request, response: Grasp.Response) -> Grasp.Response:
         messages.fill_answer(response, await self._one(messages.request_from_msg(request)))
+        return response
+
+    def _on_confirm(self, request: ConfirmPlan.Request, response: ConfirmPlan.Response) -> ConfirmPlan.Response:
+        try:
+            response.message = self._session.gate.answer(request.plan_id, accept=request.accept)
+            response.success, response.code = True, Code.OK.value
+        except OpenArmError as error:
+            response.code, response.message = error.code.value, error.message
         return response
 
     async def _on_pick(self, goal: ServerGoalHandle) -> Pick.Result:
@@ -90,11 +109,10 @@ class GraspNode(BaseNode[GraspConfig]):
 
     async def _as_goal(self, goal: ServerGoalHandle, work: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
         """Carry a goal out; a cancel reaches the one that is being carried out."""
-        mine = not self._running
-        if mine:
+        if not self._running:
             self._goal = goal
         outcome = await work()
-        if mine:
+        if self._goal is goal:
             self._goal = None
         if outcome.success:
             goal.succeed()
@@ -122,9 +140,10 @@ class GraspNode(BaseNode[GraspConfig]):
             )
         except OpenArmError as error:
             self._refused(f"grasp of {request.label!r}", error)
-            return GraspOutcome(error.code, error.message, request.label)
-        self._report(outcome)
-        return outcome
+            outcome = GraspOutcome(error.code, error.message, request.label)
+        else:
+            self._report(outcome)
+        return replace(outcome, recording=await self._flight_recorder.save(outcome, (request,)))
 
     async def _two(self, requests: tuple[GraspRequest, GraspRequest], on_status: OnStatus) -> PairOutcome:
         report = partial(self._publish, on_status=on_status)
@@ -136,10 +155,10 @@ class GraspNode(BaseNode[GraspConfig]):
             )
         except OpenArmError as error:
             self._refused(f"grasp of {requests[0].label!r} and {requests[1].label!r}", error)
-            return PairOutcome((), error.code, error.message)
+            outcome = PairOutcome((), error.code, error.message)
         for answer in outcome.answers:
             self._report(answer)
-        return outcome
+        return replace(outcome, recording=await self._flight_recorder.save(outcome, requests))
 
     async def _take(self, requests: tuple[GraspRequest, ...], work: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
         """Carry requests out, one or two at a time.
@@ -161,24 +180,34 @@ class GraspNode(BaseNode[GraspConfig]):
     def _refused(self, what: str, error: OpenArmError) -> None:
         self.get_logger().warning(f"{what} refused: {error}")
         if error.code is not Code.BUSY:  # what runs publishes its own state
+            status = Status(State.IDLE, State.IDLE, error.message, code=error.code.value)
+            self._status_topic.publish(messages.status_msg(status, self._robot.now_ns))
             self._diagnose(error.code is not Code.NOT_READY, f"{error.code}: {error.message}")
 
     # --- publishing
-    def _diagnose(self, ok: bool, text: str, **values: str) -> None:
-        self.diagnose(ok, text, state=self._newest[0].state.value if 0 in self._newest else State.IDLE.value, **values)
+    def _diagnose(self, ok: bool, text: str, *, late: bool = False, **values: str) -> None:
+        values.setdefault("state", self._newest[0].state.value if 0 in self._newest else State.IDLE.value)
+        if ok and late:
+            self.diagnose_warning(text, **values)
+        else:
+            self.diagnose(ok, text, **values)
 
     def _report(self, outcome: GraspOutcome) -> None:
         """Publish how a request ended."""
         report = f"{outcome.code}: {outcome.message} (arm {outcome.arm or '-'}, attempts {outcome.attempts})"
+        late = [f"{one.state} {one.longest:.1f} of {one.budget:g} s" for one in outcome.state_times if one.exceeded]
+        report += f"; longer than expected: {', '.join(late)}" if late else ""
         self.get_logger().info(report) if outcome.success else self.get_logger().warning(report)
         drift = self._session.drift.drift()
         if drift.alarm:
             self.get_logger().error(drift.message)
-        self._diagnose(not drift.alarm, f"{drift.message}; {report}" if drift.alarm else report, drift=drift.message)
+        text = f"{drift.message}; {report}" if drift.alarm else report
+        self._diagnose(not drift.alarm, text, late=bool(late), drift=drift.message)
 
     def _publish(self, status: Status, on_status: OnStatus | None) -> None:
         """Publish a state that was entered."""
         t_ns = self._robot.now_ns
+        before = self._newest.get(status.request)
         self._newest[status.request] = status
         message = messages.status_msg(status, t_ns)
         self._status_topic.publish(message)
@@ -192,11 +221,11 @@ class GraspNode(BaseNode[GraspConfig]):
         change = f"{message.previous_state} -> {message.state} at {t_ns * 1e-9:.2f} s, attempt {status.attempt}"
         about = f"{status.label} " if status.label else ""
         self.get_logger().info(f"{about}{change}: {status.reason}")
-        text = f"{message.state}: {status.reason}"
-        self.diagnose(True, text, state=message.state, label=status.label, arm=status.arm)
-        if status.candidates:
-            markers = messages.candidate_markers(status.candidates, status.chosen, status.refused, t_ns)
-            self._marker_topic.publish(markers)
+        text = f"{message.state}: {status.reason}" + (f"; {status.late}" if status.late else "")
+        self._diagnose(True, text, late=bool(status.late), state=message.state, label=status.label, arm=status.arm)
+        answered = before is not None and before.plan is not None
+        if status.candidates or status.plan or answered:
+            self._marker_topic.publish(messages.status_markers(status, self.description, t_ns))
 
 
 def main() -> None:

@@ -27,5 +27,5 @@ async def direct(task: Task) -> GraspOutcome:
         if await feasible.refusal(arm, found, asked.place, yaw=asked.place_yaw):
             continue
         why = f"the {arm} arm does it alone, from the other side"
-        return await pick_and_place(task, replace(asked, arm=arm, why=why))
+        return await pick_and_place(task, replace(asked.about(found), arm=arm, why=why))
     return outcome

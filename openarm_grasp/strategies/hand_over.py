@@ -80,11 +80,14 @@ async def hand_over(task: Task) -> GraspOutcome | None:
         again = "" if number == 1 else f", at try number {number}"
         x, y = (float(v) for v in way.spot)
         why = f"hand-over, 1 of 2: {way}"
-        brought = await pick_and_place(task, replace(asked, arm=way.giver, place=(x, y), place_yaw=way.yaw, why=why))
+        bring = replace(asked.about(found), arm=way.giver, place=(x, y), place_yaw=way.yaw, why=why)
+        brought = await pick_and_place(task, bring)
         if not brought.success:
             return replace(brought, message=f"on the way to the middle: {brought.message}")
         task.displaced = f"brought to the middle{again}"
-        taken = await pick_and_place(task, replace(asked, arm=way.taker, why=f"hand-over, 2 of 2: {way}"))
+        there = replace(found, target=standing_at(found.target, way.spot))
+        take = replace(asked.about(there), arm=way.taker, why=f"hand-over, 2 of 2: {way}")
+        taken = await pick_and_place(task, take)
         if taken.success:
             text = f"{taken.message}; the {way.giver} arm had brought it to the middle, ({x:.3f}, {y:.3f}) m{again}"
             return replace(taken, message=text)

@@ -26,7 +26,7 @@ Spot = tuple[float, float]
 #: With these another place in a bin may be had.
 _BLOCKED = (Code.IN_COLLISION, Code.UNREACHABLE, Code.NO_PLAN)
 #: Nothing changes these. With any other, what others hid or blocked may be had when they have been taken away.
-_FINAL = (Code.TOO_WIDE, Code.INVALID_ARGUMENT, Code.CANCELLED, Code.ROBOT_LOST, Code.NOT_READY)
+_FINAL = (Code.TOO_WIDE, Code.INVALID_ARGUMENT, Code.CANCELLED, Code.ROBOT_LOST, Code.STOPPED, Code.NOT_READY)
 #: There is no more of it in view.
 _GONE = (Code.UNKNOWN_OBJECT, Code.NOTHING_DETECTED)
 
@@ -82,7 +82,7 @@ class Order:
     """Objects to be picked one after the other.
 
     Attributes:
-        labels: In this order; each is asked for until none of it is left, as often as `each` says at most.
+        labels: Words for objects, in this order; each is asked for until none is left, as often as `each` says at most.
         bins: Where they go; None: to free spots.
         each: Most objects of one label, or of each label.
         placed: Labels that were placed, in order.
@@ -96,7 +96,7 @@ class Order:
     failed: dict[str, str] = field(default_factory=dict[str, str])
     _used: Counter[str] = field(default_factory=Counter[str])
     _blocked: dict[str, tuple[int, str]] = field(default_factory=dict[str, tuple[int, str]])
-    _stand: dict[str, tuple[Spot, ...]] = field(default_factory=dict[str, tuple[Spot, ...]])
+    _stand: list[Spot] = field(default_factory=list[Spot])
 
     def __post_init__(self) -> None:
         """Refuse an order that asks for nothing, or for what has no bin.
@@ -119,7 +119,7 @@ class Order:
                 continue
             if label in self._blocked and self._blocked[label][0] == len(self.placed):
                 continue  # nothing has been taken away since
-            stand = self._stand.get(label, ())
+            stand = tuple(self._stand)  # whatever it was asked for as, it is not asked for again
             if self.bins is None:
                 return GraspRequest(label, exclude_near=stand)
             name = self.bins.of(label)
@@ -141,7 +141,7 @@ class Order:
         if code is Code.OK:
             self.placed.append(label)
             if len(where) >= 2:
-                self._stand[label] = (*self._stand.get(label, ()), (float(where[0]), float(where[1])))
+                self._stand.append((float(where[0]), float(where[1])))
         elif code in _FINAL:
             self.failed[label] = f"{code}: {message}"
         elif self.bins is None or not next_slot:

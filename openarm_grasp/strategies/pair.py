@@ -14,7 +14,8 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
-from openarm_grasp.perception.detections import SAME_PLACE, Sighting, find, on_table
+from openarm_grasp.config import DetectConfig
+from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart, on_table
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.robot.coordination import ArmCoordination, coordinated
@@ -29,8 +30,10 @@ Requests = tuple[GraspRequest, GraspRequest]
 
 #: Places nearer to each other than this are served one after the other, m.
 _APART = 0.20
+#: Detections nearer to each other than this are one object, m.
+_ONE = 0.005
 #: These end a request, and one that runs concurrently; no other strategy is tried.
-ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST)
+ENDS = (Code.CANCELLED, Code.TIMEOUT, Code.ROBOT_LOST, Code.STOPPED)
 
 
 @dataclass
@@ -191,11 +194,25 @@ async def _observe_both(pair: Pair) -> list[Sighting]:
     if not pair.requests[0].dry_run:
         await robot.go_home(ARMS, back_off_below=context.clear_of_objects)
     frames = (await robot.observe_in_base(context.config.detect.frames)).frames
-    found = [
-        find(frames, request.label, context.config.detect, at=request.object_at, exclude_near=request.exclude_near)
-        for request in pair.requests
-    ]
-    return [replace(one, target=on_table(one.target, context.table.top_z)) for one in found]
+    first, second = (request.find(frames, context.config.detect) for request in pair.requests)
+    if apart(first.target, second.target) <= _ONE:
+        first, second = _two_of(pair.requests, frames, context.config.detect, first)
+    pair.requests = (pair.requests[0].about(first), pair.requests[1].about(second))
+    return [replace(one, target=on_table(one.target, context.table.top_z)) for one in (first, second)]
+
+
+def _two_of(requests: Requests, frames: Sequence[Frame], limits: DetectConfig, one: Sighting) -> Sequence[Sighting]:
+    """Two objects, where the words of both requests fit the same one first.
+
+    Raises:
+        OpenArmError: UNKNOWN_OBJECT, when neither fits another.
+    """
+    taken = ((float(one.target.p_base[0]), float(one.target.p_base[1])),)
+    first, second = (replace(request, exclude_near=(*request.exclude_near, *taken)) for request in requests)
+    try:
+        return one, second.find(frames, limits)
+    except OpenArmError:
+        return first.find(frames, limits), one
 
 
 async def _fault(pair: Pair, found: Sequence[Sighting], arms: tuple[Side, Side]) -> str:

@@ -11,25 +11,28 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
+from itertools import product
 
-import numpy as np
-
-from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
+from openarm_common.wanted import describe
 from openarm_grasp.evidence import verdicts
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict, Verdict
-from openarm_grasp.perception.detections import Frame, Sighting, apart, find, labels_in_view, on_table
-from openarm_grasp.planning import candidates
+from openarm_grasp.perception.detections import Frame, Sighting, apart, in_view, on_table
+from openarm_grasp.planning import retries
 from openarm_grasp.planning.arms import ARMS, arm_order, out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
+from openarm_grasp.planning.feasibility import standing_at
 from openarm_grasp.planning.options import NoWayError, Options, not_placeable, options_of, planned
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, placing_error
 from openarm_grasp.robot.interface import Frames, Planned
 from openarm_grasp.robot.skills import reraise_stop
+from openarm_grasp.strategies.confirm import GRASP, PLACE, ShownPlan, agree, outdated
 from openarm_grasp.strategies.request import Feasible, GraspOutcome, GraspRequest, Proof
+from openarm_grasp.strategies.retreat import Hand, Placed, retreat, still_held
+from openarm_grasp.strategies.second_look import second_look
 from openarm_grasp.strategies.states import State, check_transition
 from openarm_grasp.strategies.task import Findings, Grasp, Status, Task
 
@@ -37,34 +40,6 @@ from openarm_grasp.strategies.task import Findings, Grasp, Status, Task
 _LIFT_FRAMES = 2
 #: An object that is observed so may be trusted in the next frames.
 _NOT_TRUSTED = (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT, Code.STALE_DATA)
-
-
-class Hand(Enum):
-    """Where the hand is, as far as known; it decides the way home."""
-
-    FREE = "away from objects, empty"
-    AT_OBJECT = "around the object or straight above its grasp, empty"
-    HOLDING = "around the object or straight above its grasp, holding it"
-    CARRYING = "elsewhere, holding the object"
-    RELEASED = "around the object that it has put down"
-    CLEAR = "away from the object that it has put down"
-
-
-@dataclass(frozen=True)
-class Placed:
-    """An object that was put down.
-
-    Attributes:
-        target: Where.
-        gripper: That the hand held it above that place.
-        reason: How it was put down.
-        failure: Why it was put back where it came from; None when it was put where it belongs.
-    """
-
-    target: PlaceTarget
-    gripper: GripperVerdict
-    reason: str
-    failure: Verdict | None = None
 
 
 class NoGraspError(OpenArmError):
@@ -96,13 +71,13 @@ class Run:
         self.missed = self.plans_failed = 0
         #: The newest failure; None while nothing has failed.
         self.failure: Verdict | None = None
-        #: Ids of grasps that have failed, and places that could not be reached with the object in the hand.
-        self.used: frozenset[str] = frozenset()
+        #: Grasps that have failed, and places that could not be reached with the object in the hand.
+        self.failed: tuple[retries.FailedGrasp, ...] = ()
         self.used_places: tuple[PlaceTarget, ...] = ()
         #: The object and its neighbours, and why arms were refused for it.
         self.findings = Findings()
-        #: Height of the object when it was first observed, m.
-        self.height: float | None = None
+        #: (3,) edges of the object when it was first observed, m.
+        self.size: Array | None = None
         #: The object where it was when the hand was last about to go down.
         self.suspected: Detection | None = None
         #: Candidates that the planner chooses from, and the results of those that it was offered before.
@@ -111,6 +86,8 @@ class Run:
         self.arm = kept.arm if kept else ""
         self.grasp: Grasp | None = None
         self.place_target: PlaceTarget | None = None
+        #: How to put it down, confirmed with the grasp.
+        self.place_plan: Planned | None = None
         self.hand = Hand.CARRYING if kept else Hand.FREE
 
     @property
@@ -123,8 +100,8 @@ class Run:
         """Whether the hand holds the object, as far as known."""
         return self.hand in (Hand.HOLDING, Hand.CARRYING)
 
-    def enter(self, state: State, reason: str) -> None:
-        """Enter a state and report it.
+    def enter(self, state: State, reason: str, plan: ShownPlan | None = None) -> None:
+        """Enter a state and report it, with the plan that waits for a person.
 
         Raises:
             OpenArmError: INTERNAL, when that state may not follow.
@@ -132,7 +109,7 @@ class Run:
         check_transition(self.state, state)
         previous, self.state = self.state, state
         failed = self.failure is not None
-        status = Status(state, previous, reason, self.attempt, self.label, self.arm, self.task.index, failed)
+        status = Status(state, previous, reason, self.attempt, self.label, self.arm, self.task.index, failed, plan=plan)
         if state in (State.PLAN, State.MOVE_TO_PREGRASP):
             mine = (option for option in self.options.values() if option.arm == self.arm)
             refused = frozenset(option.id for option in mine if option.code not in ("", Code.OK))
@@ -165,12 +142,21 @@ class Run:
     def forget(self) -> None:
         """Start over from the camera."""
         self.findings, self.offered = Findings(), ()
-        self.grasp = self.place_target = None
+        self.grasp = self.place_target = self.place_plan = None
         if self.kept is None:
             self.arm, self.hand = "", Hand.FREE
 
-    def start_again(self, target: Detection, candidate: GraspCandidate) -> str:
-        """Begin the next attempt at the same object, the failed grasp marked; returns why.
+    def ways(self, arm: str, sighting: Sighting) -> retries.Ways:
+        """Grasps for an arm; those that have failed apart from the others."""
+        shoulder = self.context.shoulders.get(arm, (0.0, 0.0))
+        return retries.ways(sighting.target, self.config, self.failed, shoulder_xy=shoulder, others=sighting.others)
+
+    def start_again(self, grasp: Grasp, placed: Placed | None) -> str:
+        """Begin the next attempt at the same object, the failed grasp remembered; returns why.
+
+        Args:
+            grasp: That has failed.
+            placed: Where the object was put down, when it was.
 
         Raises:
             OpenArmError: With the failure, when no attempt is left or another would not help.
@@ -178,11 +164,12 @@ class Run:
         failure = self.failure or Verdict(Code.INTERNAL, "an attempt ended without a failure")
         if failure.final or self.attempt >= self.config.limits.max_attempts:
             raise OpenArmError(failure.code, failure.reason)
-        request, x, y = self.request, float(target.p_base[0]), float(target.p_base[1])
-        phase = "all" if self.kept else request.phase
-        at = (x, y) if request.object_at else None
-        self.request = replace(request, label=target.label, phase=phase, object_at=at)
-        self.used |= {candidate.id}
+        same = grasp.sighting
+        self.failed += (retries.FailedGrasp.of(failure.code, grasp.arm, grasp.candidate, same.target),)
+        if placed is not None:
+            same = replace(same, target=standing_at(same.target, placed.target.position))
+        phase = "all" if self.kept else self.request.phase
+        self.request = replace(self.request.about(same), phase=phase)
         self.attempt += 1
         self.missed = self.plans_failed = 0
         self.kept = None
@@ -202,6 +189,7 @@ class Run:
             duration=(self.robot.now_ns - self.began_ns) * 1e-9,
             held=self.holding,
             options=tuple(self.options.values()),
+            state_times=self.task.clock.times(self.robot.now_ns),
             proof=proof,
         )
 
@@ -240,7 +228,7 @@ async def pick_and_place(task: Task, request: GraspRequest) -> GraspOutcome:
     task.outcome, task.findings, task.attempts = outcome, run.findings, max(task.attempts, outcome.attempts)
     check_transition(run.state, State.IDLE)
     about = Status(State.IDLE, run.state, outcome.message, label=outcome.label, arm=outcome.arm, request=task.index)
-    task.report(about)
+    task.report(replace(about, code=outcome.code.value))
     return outcome
 
 
@@ -251,6 +239,10 @@ async def _attempts(run: Run) -> GraspOutcome:
         grasp, plan, why = await find_grasp(run, why)
         if run.request.dry_run:
             return run.answer(Code.OK, f"can be done: {why}", Feasible(why))
+        if plan is not None and (changed := await _agree(run, State.PLAN, grasp, why, plan, run.place_plan)):
+            run.forget()
+            why = changed
+            continue
         placed = None
         try:
             if plan is not None:
@@ -265,6 +257,7 @@ async def _attempts(run: Run) -> GraspOutcome:
             raise
         except OpenArmError as error:
             reraise_stop(error)
+            grasp = run.grasp or grasp  # corrected by the second observation
             run.fail(error.code, error.message)
             run.enter(State.RESET, error.message)
         await retreat(run, grasp, placed)
@@ -274,7 +267,7 @@ async def _attempts(run: Run) -> GraspOutcome:
                 text = f"{seen.reason}, placed by the {run.arm} arm"
                 return succeeded(run, text, gripper=placed.gripper, camera=seen)
             run.failure = seen
-        why = run.start_again(grasp.sighting.target, grasp.candidate)
+        why = run.start_again(grasp, placed)
 
 
 def succeeded(run: Run, message: str, *, gripper: GripperVerdict, camera: CameraVerdict) -> GraspOutcome:
@@ -309,7 +302,7 @@ async def find_grasp(run: Run, why: str) -> tuple[Grasp, Planned | None, str]:
             why = f"the {grasp.arm} hand holds {run.label!r}; {len(grasp.places)} ways to place it"
             if run.request.dry_run:
                 _, target = await plan_place(run, grasp, grasp.places, why)
-                why = f"place {target.id}"
+                why = f"place {target}"
             return grasp, None, why
         try:
             return await plan(run, sighting)
@@ -332,16 +325,11 @@ async def detect(run: Run, why: str) -> Sighting:
         run.enter(State.DETECT, why)
         await _clear_view(run)
         seen = await run.robot.observe(run.config.detect.frames)
-        labels = labels_in_view(seen.frames)
-        text, asked = f"in view: {', '.join(labels) or 'nothing'}", run.request.label
+        text = f"in view: {describe([d for frame in seen.frames for d in frame.detections])}"
         if run.kept is not None:
             text = f"holding {run.label!r}; {text}"
-        elif not labels or asked not in ("", *labels):
-            code, missing = Code.UNKNOWN_OBJECT, f"no {asked!r} in view; {text}"
-            if not labels:
-                code = Code.NOTHING_DETECTED
-                missing = f"nothing is in view of the camera (asked for {asked or 'any object'!r})"
-            run.enter(State.IDLE, run.missed_round(code, missing))
+        elif missing := _missing(run, seen):
+            run.enter(State.IDLE, run.missed_round(missing.code, missing.message))
             why = "the next frame has come"
             try:
                 await run.robot.observe(1)
@@ -360,9 +348,18 @@ async def detect(run: Run, why: str) -> Sighting:
             run.forget()
 
 
+def _missing(run: Run, seen: Frames) -> OpenArmError | None:
+    """Why nothing in view is what is asked for; None when something is."""
+    try:
+        in_view(run.robot.in_base(seen).frames, run.request.label)
+    except OpenArmError as error:
+        return error if error.code in (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT) else None
+    return None
+
+
 async def _clear_view(run: Run) -> None:
-    """Send the arms home that may hide something. A dry run moves nothing."""
-    if run.request.dry_run or run.missed > 0 or run.plans_failed > 0:
+    """Send the arms home that may hide something. A dry run moves nothing, nor does what nobody has confirmed yet."""
+    if run.request.dry_run or run.request.confirm or run.missed > 0 or run.plans_failed > 0:
         return
     if run.kept is not None:
         # A hand that holds something stays where it is; it may be among the objects.
@@ -383,7 +380,7 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
         others = (d for d in newest.detections if d.label != kept.sighting.target.label)
         sighting = Sighting(kept.sighting.target, _standing(others, top_z), newest.t_ns)
     else:
-        found = find(frames, request.label, limits, at=request.object_at, exclude_near=request.exclude_near)
+        found = request.find(frames, limits)
         target = on_table(found.target, top_z)
         sighting = replace(found, target=target, others=_standing(found.others, top_z))
     age = (run.robot.now_ns - sighting.t_ns) * 1e-9
@@ -391,8 +388,8 @@ def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
         text = f"the newest detection is {age:.2f} s old, expected at most {limits.max_age:g} s"
         raise OpenArmError(Code.STALE_DATA, text)
     run.findings.sighting = sighting
-    if kept or run.height is None or any(d.label == sighting.target.label for d in sighting.others):
-        run.height = float(sighting.target.size[2])
+    if kept or run.size is None or any(d.label == sighting.target.label for d in sighting.others):
+        run.size = sighting.target.size
     return sighting
 
 
@@ -413,14 +410,18 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
         check_position(request.place, target, sighting.others, table)
     run.options, why = {}, ""
     arms = arm_order(request.arm, float(target.p_base[1]), run.config.approach.overlap_half_width)
+    arms = retries.arms_to_try(arms, run.failed)
+    ways = {arm: run.ways(arm, sighting) for arm in arms}
     where = "({:.3f}, {:.3f}, {:.3f}) m".format(*target.p_base)
-    for run.arm in arms:
-        shoulder = run.context.shoulders.get(run.arm, (0.0, 0.0))
-        offered = candidates.propose(target, run.config, shoulder_xy=shoulder, used=run.used, others=sighting.others)
+    for repeats, run.arm in product((False, True), arms):
+        offered = ways[run.arm].repeats if repeats else ways[run.arm].fresh
+        if not offered:
+            continue
         run.options |= options_of(run.arm, offered, target, run.config.approach)
-        first = f"{target.label!r} stands at {where}; {len(offered)} ways to grasp it"
+        text = f"{why}; trying the {run.arm} arm" if why else f"{target.label!r} stands at {where}"
+        text += f"; {len(offered)} ways to grasp it" + ("; all that is left has failed before" if repeats else "")
         try:
-            return await _plan_with(run, sighting, offered, f"{why}; trying the {run.arm} arm" if why else first)
+            return await _plan_with(run, sighting, offered, text)
         except NoGraspError as error:
             run.findings.refusals[run.arm] = Verdict(error.code, error.message)
             why = error.message
@@ -459,7 +460,7 @@ async def _plan_with(
         # Also without a place that is asked for: no free spot is a reason not to lift.
         grasp = run.grasp = _grasp(run, arm, sighting, candidate)
         chosen = f"grasp {candidate.id} with the {arm} arm"
-        if request.place is None and not request.dry_run:
+        if request.place is None and not (request.dry_run or (request.confirm and request.phase == "all")):
             return grasp, found, chosen
         run.enter(State.PLAN, f"{chosen}; planning the place")
         try:
@@ -479,7 +480,8 @@ async def _plan_with(
             offered, why = left, f"{why}; trying another grasp"
             continue
         run.place_target = grasp.places[end.chosen]
-        return grasp, found, f"{chosen}, place {run.place_target.id}"
+        run.place_plan = end if request.confirm and request.phase == "all" else None
+        return grasp, found, f"{chosen}, place {run.place_target}"
 
 
 def _grasp(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) -> Grasp:
@@ -507,7 +509,8 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
         The grasp and its trajectories, corrected where the second observation said so, and how well it was reached.
 
     Raises:
-        OpenArmError: GRASP_MISSED, when the object has moved; HAND_COLLISION, when the hand stops short of the grasp.
+        OpenArmError: GRASP_MISSED, when the object has moved; HAND_COLLISION, when the hand leaves its straight line or
+            stops short of the grasp.
     """
     arm, config, robot = grasp.arm, run.config, run.robot
     run.tried += 1
@@ -528,8 +531,9 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
     run.enter(State.MOVE_TO_GRASP, why)
     robot.stop_observing()
     run.hand = Hand.AT_OBJECT
-    await robot.follow(arm, plan.approach, "move to the grasp")
     c = grasp.candidate
+    p = c.T_base_tcp[:3, 3]
+    await robot.follow(arm, plan.approach, "move to the grasp", line=(p + c.approach_offset, p))
     error, limit = (await robot.measure(arm, c.width, c.T_base_tcp)).tcp_error, config.held.max_tcp_error
     if error > limit:
         text = f"the hand stopped {error * 1e3:.1f} mm from the grasp, expected at most {limit * 1e3:.0f} mm"
@@ -542,53 +546,28 @@ async def _correct(run: Run, grasp: Grasp, plan: Planned) -> tuple[Grasp, Planne
 
     Whatever keeps the second observation from helping, the grasp goes on with what is known.
     """
-    near, robot, before = run.config.near, run.robot, grasp.sighting
+    config, near, robot = run.config, run.config.near, run.robot
     run.enter(State.MOVE_TO_PREGRASP, f"the open hand is before the object; observing with the {near.camera} camera")
-    try:
-        seen = await robot.observe(near.frames, near=True)
-    except OpenArmError as error:
-        reraise_stop(error)
-        return grasp, plan, f"no second observation: {error.message}"
-    try:
-        target, candidate = second_look(run, grasp, seen)
-    except OpenArmError as error:
-        return grasp, plan, f"the second observation does not help: {error.message}"
-    dx, dy, _ = target.p_base - before.target.p_base
-    size = float(np.hypot(dx, dy))
-    text = f"the {near.camera} camera sees it {size * 1e3:.1f} mm off ({dx * 1e3:+.1f}, {dy * 1e3:+.1f})"
-    if size < near.least:
-        return grasp, plan, text
-    sighting = run.findings.sighting = replace(before, target=target)
-    grasp = replace(grasp, sighting=sighting)
-    run.offered = (candidate,)
-    run.enter(State.MOVE_TO_PREGRASP, f"{text}; correcting")
+    corrected, why = await second_look(run, grasp, config.confirm.correction if run.request.confirm else near.least)
+    if corrected is None:
+        return grasp, plan, why
+    run.findings.sighting, run.offered = corrected.sighting, (corrected.candidate,)
+    run.enter(State.MOVE_TO_PREGRASP, f"{why}; correcting")
     robot.stop_observing()
     try:
-        corrected = await robot.plan_grasp(grasp.arm, run.offered, sighting)
+        plan = await robot.plan_grasp(grasp.arm, run.offered, corrected.sighting)
     except OpenArmError as error:
         reraise_stop(error)
-        return grasp, plan, f"the correction cannot be planned, going on without: {error.message}"
-    grasp = run.grasp = replace(grasp, candidate=candidate)
-    run.enter(State.MOVE_TO_PREGRASP, f"correcting to {candidate.id}")
-    await robot.follow(grasp.arm, corrected.transfer, "correct the pre-grasp")
-    return grasp, corrected, "the open hand is before the object"
-
-
-def second_look(run: Run, grasp: Grasp, seen: Frames) -> tuple[Detection, GraspCandidate]:
-    """The object as the camera on the hand sees it, and the grasp whose hand is turned most like the chosen one's.
-
-    Raises:
-        OpenArmError: When the object is not among the detections, or cannot be trusted.
-    """
-    before, config = grasp.sighting.target, run.config
-    frames: list[Frame] = []
-    for frame in seen.frames:
-        near = (d for d in frame.detections if d.label == before.label and apart(d, before) <= config.near.largest)
-        frames.append(Frame(frame.t_ns, tuple(near)))
-    target = on_table(find(frames, before.label, config.detect).target, run.context.table.top_z)
-    # A box that is observed again may have its edges swapped.
-    R = grasp.candidate.T_base_tcp[:3, :3]
-    return target, min(candidates.propose(target, config), key=lambda c: se3.angle_between(c.T_base_tcp[:3, :3], R))
+        if run.request.confirm:
+            raise
+        uncorrected = replace(grasp, sighting=corrected.sighting)
+        return uncorrected, plan, f"the correction cannot be planned, going on without: {error.message}"
+    run.grasp, run.place_plan, why = corrected, None, f"correcting to {corrected.candidate.id}"
+    if changed := await _agree(run, State.MOVE_TO_PREGRASP, corrected, why, plan):
+        raise OpenArmError(Code.GRASP_MISSED, changed)
+    run.enter(State.MOVE_TO_PREGRASP, why)
+    await robot.follow(grasp.arm, plan.transfer, "correct the pre-grasp")
+    return corrected, plan, "the open hand is before the object"
 
 
 # --- grasp
@@ -637,8 +616,14 @@ async def lift(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gripper
     evidence = await robot.measure(arm, grasp.candidate.width, settle=config.timing.settle_limit)
     frames = (await robot.observe(_LIFT_FRAMES)).frames
     gripper = verdicts.judge_grip(evidence, config.held, was_held=True)
-    radius = config.detect.match_radius
-    camera = verdicts.judge_sight(sighting.target, frames, config.held, match_radius=radius, others=sighting.others)
+    camera = verdicts.judge_sight(
+        sighting.target,
+        frames,
+        config.held,
+        match_radius=config.detect.match_radius,
+        others=sighting.others,
+        lift=float(grasp.candidate.retreat_offset[2]),
+    )
     verdict = verdicts.judge_lift(gripper, camera)
     if not verdict.ok:
         run.hand = Hand.HOLDING if gripper.ok else Hand.AT_OBJECT
@@ -665,7 +650,7 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
             if error.code is Code.GRASP_LOST:
                 raise
             if run.kept is not None or failure is not None:
-                raise ObjectKeptError(Code.PLACE_FAILED, _still_held(run, error)) from error
+                raise ObjectKeptError(Code.PLACE_FAILED, still_held(run, error)) from error
             text = f"{run.label!r} could not be placed ({error.code}): {error.message}"
             # What kept it from its place may not do so at the next attempt.
             passing = error.code in (Code.EXECUTION_FAILED, Code.TIMEOUT)
@@ -676,16 +661,34 @@ async def place(run: Run, grasp: Grasp, why: str) -> Placed:
         ways = place_targets(target, grasp.candidate, (target.p_base[:2],), run.config)
 
 
-def _still_held(run: Run, error: OpenArmError) -> str:
-    return f"{error.message}; the {run.arm} hand still holds {run.label!r}: open it over a safe place"
-
-
 async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str) -> tuple[Planned, PlaceTarget]:
-    """Plan from where the arm is how to put the object down in one of these ways."""
+    """Plan from where the arm is how to put the object down in one of these ways, unless that is confirmed already."""
     run.enter(State.PLACE, why)
     run.robot.stop_observing()
-    plan = await run.robot.plan_place(grasp.arm, ways, grasp.sighting, grasp.candidate)
-    return plan, ways[plan.chosen]
+    ready, run.place_plan = run.place_plan, None
+    if ready is not None:
+        why = await outdated(run.robot, (ready,), ready.start, run.config.confirm.joints)
+        if not why:
+            return ready, ways[ready.chosen]
+        run.enter(State.PLACE, f"the confirmed place has to be planned anew: {why}")
+    while True:
+        plan = await run.robot.plan_place(grasp.arm, ways, grasp.sighting, grasp.candidate)
+        target = ways[plan.chosen]
+        why = await _agree(run, State.PLACE, grasp, f"place {target} with the {grasp.arm} arm", place=plan)
+        if not why:
+            return plan, target
+        run.enter(State.PLACE, why)
+
+
+async def _agree(
+    run: Run, state: State, grasp: Grasp, why: str, plan: Planned | None = None, place: Planned | None = None
+) -> str:
+    """Let a person confirm what is planned; returns why it has to be planned anew, "" when it has not."""
+    plans = [(names, part) for names, part in ((GRASP, plan), (PLACE, place)) if part is not None]
+    standing = (grasp.sighting.target, *grasp.sighting.others) if state is State.PLAN else ()
+    return await agree(
+        run.task, grasp.arm, why, plans, lambda text, shown: run.enter(state, text, shown), standing=standing
+    )
 
 
 async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str) -> Placed:
@@ -723,58 +726,7 @@ async def _put_down(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: 
     return Placed(target, gripper, reason)
 
 
-# --- retreat and verify
-async def retreat(run: Run, grasp: Grasp, placed: Placed | None) -> None:
-    """Leave the object, putting it down first when it is held, and go home with an open hand.
-
-    Raises:
-        OpenArmError: When there is no way home, also without regard to obstacles; the arm stays where it is.
-    """
-    run.robot.stop_observing()
-    failure = run.failure if placed is None else placed.failure
-    for last, obstacles in ((False, _obstacles(run, grasp, placed)), (True, ())):
-        try:
-            await _leave(run, grasp, placed)
-            await run.robot.go_home((grasp.arm,), obstacles)
-            return
-        except OpenArmError as error:
-            reraise_stop(error)
-            if last or run.holding:
-                text = f"the arm could not go home: {_still_held(run, error) if run.holding else error.message}"
-                code, text = (failure.code, f"{failure.reason}; {text}") if failure else (error.code, text)
-                raise OpenArmError(code, text) from error
-            run.hand = Hand.FREE if placed is None else Hand.CLEAR
-            run.enter(State.RESET, f"{error.message}; trying another way home")
-
-
-async def _leave(run: Run, grasp: Grasp, placed: Placed | None) -> None:
-    """Free the hand and bring it away from the object on a straight line."""
-    arm, robot, config, T_base_tcp = grasp.arm, run.robot, run.config, grasp.candidate.T_base_tcp
-    if placed is not None:
-        if run.hand is Hand.RELEASED:
-            T_away = se3.make(p=placed.target.retreat_offset) @ placed.target.T_base_tcp
-            await robot.move_linear(arm, T_away, "leave")
-        return
-    at_object = run.hand is not Hand.FREE
-    if run.hand is Hand.HOLDING:
-        T_back = se3.make(p=config.place.release_height * candidates.UP) @ T_base_tcp
-        await robot.move_linear(arm, T_back, "put back")
-        run.hand = Hand.AT_OBJECT
-    await robot.grip(arm, config.hand.opening, "open")
-    await robot.wait(config.timing.after_release)
-    if at_object:
-        await robot.move_linear(arm, se3.make(p=grasp.candidate.approach_offset) @ T_base_tcp, "back off")
-
-
-def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[candidates.Box, ...]:
-    """What the way home keeps clear of; where a lost object lies is not known."""
-    others = candidates.obstacle_boxes(grasp.sighting.others, run.config)
-    if placed is None:
-        return others
-    held = candidates.held_box(grasp.sighting.target, grasp.candidate, run.config)
-    return (*others, candidates.Box(f"placed/{run.label}", placed.target.T_base_tcp @ held.T_frame_box, held.size))
-
-
+# --- verify
 async def verify(run: Run, placed: Placed) -> CameraVerdict:
     """Judge by the camera, from home, whether the object is at its place.
 
@@ -790,11 +742,13 @@ async def verify(run: Run, placed: Placed) -> CameraVerdict:
         except OpenArmError as error:
             reraise_stop(error)
             raise OpenArmError(Code.PLACE_FAILED, f"put down, but not seen since: {error.message}") from error
-        if run.label in labels_in_view(frames):
+        if any(d.label == run.label for frame in frames for d in frame.detections):
             break
         text = f"{run.label!r} is not in view after the place; observing again"
     error = placing_error(run.label, placed.target, frames[-1]) if frames else None
     if error is not None:
         run.task.session.drift.add(*error)
     p_target, yaw = placed.target.position, run.request.place_yaw
-    return verdicts.judge_place(run.label, p_target, frames, config.place.tolerance, yaw, run.height)
+    height, footprint = (None, None) if run.size is None else (float(run.size[2]), run.size[:2])
+    tolerance = config.place.tolerance
+    return verdicts.judge_place(run.label, p_target, frames, tolerance, yaw, height, footprint)

@@ -23,13 +23,14 @@ from openarm_common.robot.description import RobotDescription, Side
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.perception.detections import Sighting, find
+from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.arms import ARMS, arm_order
 from openarm_grasp.planning.candidates import UP, GraspCandidate
 from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
+from openarm_grasp.strategies.confirm import PUSH, agree
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.request import Feasible, GraspOutcome
 from openarm_grasp.strategies.task import Task
@@ -79,13 +80,17 @@ async def push(task: Task) -> GraspOutcome | None:
             return replace(refused, message=f"{refused.message}; after {number - 1} pushes {error.message}")
         if task.request.dry_run:
             return replace(refused, code=Code.OK, message=f"can be done: {planned}", proof=Feasible(str(planned)))
+        standing = (found.target, *found.others)
+        changed = await agree(task, planned.arm, str(planned), [(PUSH, planned.plan)], task.note, standing)
+        if changed:
+            raise OpenArmError(Code.STALE_DATA, f"{changed.removesuffix('; planning anew')}; ask again")
         task.attempts = max(task.attempts, 1)
         try:
-            observed = await carry_out_push(task, planned, found.target.label, number)
+            pushed, observed = await carry_out_push(task, planned, found, number)
         except OpenArmError as error:
             return replace(refused, code=error.code, message=error.message)
         task.displaced = "after the pushes"
-        refused = await pick_and_place(task, replace(task.request, why=observed))
+        refused = await pick_and_place(task, replace(task.request.about(pushed), why=observed))
         if refused.success:
             return replace(refused, message=f"{refused.message}; {observed}")
         if not task.may_go_on(refused) or task.findings.place_refused:
@@ -143,13 +148,13 @@ async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
     raise OpenArmError(Code.UNREACHABLE, f"no hand comes behind it: {'; '.join(faults)}")
 
 
-async def carry_out_push(task: Task, planned: Push, label: str, number: int) -> str:
-    """Push, go home and observe; returns what was observed.
+async def carry_out_push(task: Task, planned: Push, found: Sighting, number: int) -> tuple[Sighting, str]:
+    """Push, go home and observe; returns the object as it was observed, and a sentence.
 
     Args:
         task: That it is a part of.
         planned: The push.
-        label: Of the object.
+        found: The object and its neighbours before.
         number: Of the push, 1-based.
 
     Raises:
@@ -176,16 +181,18 @@ async def carry_out_push(task: Task, planned: Push, label: str, number: int) -> 
     try:
         frames = (await robot.observe_in_base(config.detect.frames)).frames
     except OpenArmError as error:
-        text = f"push {number}: {label!r} was not seen since: {error.message}"
+        text = f"push {number}: {found.target.label!r} was not seen since: {error.message}"
         raise OpenArmError(error.code, text) from error
-    x, y = p = find(frames, label, config.detect).target.p_base[:2]
+    there = replace(found, target=standing_at(found.target, planned.end))
+    pushed = task.request.about(there).find(frames, config.detect)
+    x, y = p = pushed.target.p_base[:2]
     moved, off = (float(np.hypot(*(p - q))) for q in (planned.start, planned.end))
     text = (
         f"push {number} by the {arm} hand moved it {moved * 1e3:.0f} mm to ({x:.3f}, {y:.3f}) m, {off * 1e3:.0f} mm"
         " from its destination"
     )
     task.note(text)
-    return text
+    return pushed, text
 
 
 async def _go_behind(task: Task, planned: Push) -> None:

@@ -3,12 +3,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.config import DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
+from openarm_grasp.perception.detections import Frame, Sighting, find
 from openarm_grasp.planning.arms import arm_order
 from openarm_grasp.planning.options import Option
+from openarm_grasp.strategies.state_times import StateTime
 
 #: What a request may ask for.
 PHASES = ("all", "pick", "place")
@@ -19,28 +25,40 @@ class GraspRequest:
     """A request of a user.
 
     Attributes:
-        label: What to pick; "" takes the detection with the highest score.
+        label: What to pick, in words; "" takes the first detection.
         arm: "auto", "left" or "right".
         place: (2,) or (3,) footprint centre, base frame, m; None lets a free spot be chosen.
         dry_run: Plan and report, do not move.
+        confirm: Show each plan, and execute it when a person has confirmed it.
         phase: "all"; "pick": end with the object in the hand; "place": put down what the hand holds.
         place_yaw: Of the object's x axis about the base z, rad (half a turn makes no difference); None: unconstrained.
         timeout: s of robot time for all of it; 0: none.
-        object_at: (x, y) near which the object is, base frame, m; None: any of that label.
+        object_at: (x, y) near which the object is, base frame, m; None: any that is called so.
         exclude_near: (x, y) of objects that stay where they are, base frame, m.
         why: What it is for, when it is a part of another request.
+        same: The object, when an earlier part of the request was about it: as it was seen or left then.
     """
 
     label: str
     arm: str = "auto"
     place: tuple[float, ...] | None = None
     dry_run: bool = False
+    confirm: bool = False
     phase: str = "all"
     place_yaw: float | None = None
     timeout: float = 0.0
     object_at: tuple[float, ...] | None = None
     exclude_near: tuple[tuple[float, float], ...] = ()
     why: str = ""
+    same: Sighting | None = None
+
+    def about(self, same: Sighting) -> GraspRequest:
+        """The request, for this object alone; it may have moved since."""
+        return replace(self, label=same.target.label, same=same)
+
+    def find(self, frames: Sequence[Frame], limits: DetectConfig) -> Sighting:
+        """The object in frames of the base frame; errors as `perception.detections.find`."""
+        return find(frames, self.label, limits, at=self.object_at, exclude_near=self.exclude_near, same=self.same)
 
     def check(self) -> None:
         """Refuse an arm or a phase that does not exist.
@@ -53,6 +71,30 @@ class GraspRequest:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"phase {self.phase!r} does not exist; valid: {', '.join(PHASES)}"
             )
+
+
+def command(requests: Sequence[GraspRequest]) -> str:
+    """Return the command line that asks for the same again: of one request, or of two at once.
+
+    An option that only one of two requests has is left out, and so are objects that stay where they are: the command
+    line has no words for them.
+    """
+    first = requests[0]
+    words = ["openarm", "pick", *(request.label for request in requests if request.label)]
+    options: dict[str, list[tuple[object, ...] | None]] = {
+        "--arm": [None if first.arm == "auto" and len(requests) == 1 else (request.arm,) for request in requests],
+        "--at": [request.object_at for request in requests],
+        "--place": [request.place and (*request.place, 0.0)[:3] for request in requests],
+        "--yaw": [None if request.place_yaw is None else (math.degrees(request.place_yaw),) for request in requests],
+    }
+    for name, values in options.items():
+        if None not in values:
+            words += [word for value in values for word in (name, *map(str, value or ()))]
+    if first.phase != "all":
+        words += ["--phase", first.phase]
+    if first.timeout:
+        words += ["--time-limit", f"{first.timeout:g}"]
+    return shlex.join([*words, *(["--dry-run"] if first.dry_run else [])])
 
 
 @dataclass(frozen=True)
@@ -99,6 +141,8 @@ class GraspOutcome:
         moved: It is elsewhere than before, and not where it was asked for; the message says where.
         route: How it came to its place: "direct", "hand_over", "push" or another strategy; "" when it did not.
         options: Grasps that were considered for the newest plan, by arm, the preferred first.
+        state_times: Time spent in each state.
+        recording: Path of the flight recording of a failure; "" when there is none.
         proof: Why it may say OK; see `succeeded`.
 
     Raises:
@@ -116,6 +160,8 @@ class GraspOutcome:
     moved: bool = False
     route: str = ""
     options: tuple[Option, ...] = ()
+    state_times: tuple[StateTime, ...] = ()
+    recording: str = ""
     proof: Proof | Feasible | None = None
 
     def __post_init__(self) -> None:
@@ -149,6 +195,7 @@ class PairOutcome:
         message: What happened to each.
         simultaneous: Both arms worked at the same time.
         duration: s of robot time.
+        recording: Path of the flight recording of a failure; "" when there is none.
     """
 
     answers: tuple[GraspOutcome, ...]
@@ -156,6 +203,7 @@ class PairOutcome:
     message: str
     simultaneous: bool = False
     duration: float = 0.0
+    recording: str = ""
 
     @property
     def success(self) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.wanted import fits
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.drift import DriftWatch
 from openarm_grasp.evidence.verdicts import Verdict
@@ -14,7 +15,9 @@ from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.skills import Skills
+from openarm_grasp.strategies.confirm import PlanGate, ShownPlan
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
+from openarm_grasp.strategies.state_times import StateClock
 from openarm_grasp.strategies.states import State
 
 
@@ -45,6 +48,7 @@ class GraspSession:
 
     def __init__(self, context: GraspContext) -> None:
         self.context = context
+        self.gate = PlanGate()
         self.drift = DriftWatch(context.config.drift, context.config.camera)
         #: What hands kept when their requests ended, by arm.
         self.kept: dict[str, Grasp] = {}
@@ -79,7 +83,7 @@ class GraspSession:
         if not kept:
             raise OpenArmError(Code.NOT_READY, "no hand holds anything that was picked; ask for phase pick first")
         for one in kept:
-            if request.label in ("", one.sighting.target.label) and request.arm in ("", "auto", one.arm):
+            if fits(request.label, one.sighting.target) and request.arm in ("", "auto", one.arm):
                 return one
         held = ", ".join(f"the {one.arm} hand that holds {one.sighting.target.label!r}" for one in kept)
         raise OpenArmError(
@@ -105,6 +109,10 @@ class Status:
         candidates: Grasps that the planner chooses from; in PLAN and MOVE_TO_PREGRASP.
         chosen: Id of the one that was chosen, or "".
         refused: Ids of those that were refused.
+        plan: That waits for a person.
+        code: Of the request, when it has ended.
+        budget: Longest time that this state is expected to take, s; 0: none.
+        late: That the state before took longer than expected, or "".
     """
 
     state: State
@@ -118,6 +126,10 @@ class Status:
     candidates: tuple[GraspCandidate, ...] = ()
     chosen: str = ""
     refused: frozenset[str] = frozenset()
+    plan: ShownPlan | None = None
+    code: str = ""
+    budget: float = 0.0
+    late: str = ""
 
 
 Report = Callable[[Status], None]
@@ -159,8 +171,9 @@ class Task:
     def __init__(
         self, session: GraspSession, robot: Skills, request: GraspRequest, report: Report, index: int = 0
     ) -> None:
-        self.session, self.robot, self.request, self.report, self.index = session, robot, request, report, index
+        self.session, self.robot, self.request, self._report, self.index = session, robot, request, report, index
         self.began_ns = robot.now_ns
+        self.clock = StateClock(session.context.config.budget, self.began_ns)
         #: Physical attempts so far.
         self.attempts = 0
         #: What the newest part of the request found out about the object.
@@ -180,9 +193,17 @@ class Task:
         """Robot time since it was asked for, s."""
         return (self.robot.now_ns - self.began_ns) * 1e-9
 
-    def note(self, reason: str) -> None:
-        """Report what is done between two parts of the request."""
-        self.report(Status(State.IDLE, State.IDLE, reason, label=self.request.label, request=self.index))
+    def report(self, status: Status) -> None:
+        """Report a state that was entered, and that the one before took longer than expected."""
+        late = self.clock.enter(status.state, self.robot.now_ns, waits=status.plan is not None)
+        if late:
+            self.robot.warn(late)
+        self._report(replace(status, budget=self.clock.budget(status.state), late=late))
+
+    def note(self, reason: str, plan: ShownPlan | None = None) -> None:
+        """Report what is done between two parts of the request, or a plan that waits there."""
+        label, arm = self.request.label, plan.arm if plan else ""
+        self.report(Status(State.IDLE, State.IDLE, reason, label=label, arm=arm, request=self.index, plan=plan))
 
     def may_go_on(self, outcome: GraspOutcome) -> bool:
         """Whether another strategy may try: planning has refused the object where it is, with any arm."""
@@ -206,7 +227,8 @@ class Task:
     def answer(self, outcome: GraspOutcome, route: str) -> GraspOutcome:
         """The answer to all of the request; of an object that is neither where it was nor where it should be, where."""
         route = route if outcome.success else ""
-        outcome = replace(outcome, attempts=self.attempts, duration=self.seconds, route=route)
+        times = self.clock.times(self.robot.now_ns)
+        outcome = replace(outcome, attempts=self.attempts, duration=self.seconds, route=route, state_times=times)
         if outcome.success or not self.displaced:
             return outcome
         sighting, text = self.findings.sighting, outcome.message

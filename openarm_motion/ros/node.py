@@ -23,10 +23,10 @@ from openarm_common.octree.distance_field import DistanceFieldReader, field_path
 from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix
 from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
-from openarm_motion.collision.solids import Box
 from openarm_motion.config import MotionConfig
 from openarm_motion.ros import convert
 from openarm_motion.ros.robot import NodeRobot
+from openarm_motion.service.faults import PlanFaults
 from openarm_motion.service.motion_service import MotionService, Report, make_arms, table_box
 from openarm_motion.service.requests import ApproachAnswer, MotionAnswer, MoveAnswer, MoveArmsAnswer
 from openarm_motion.timing.trajectory import Trajectory
@@ -47,15 +47,18 @@ class MotionNode(BaseNode[MotionConfig]):
         super().__init__("motion", MotionConfig, **kwargs)
         config = self.config
         self.robot = NodeRobot(self, config)
-        arms = make_arms(config, self.description, table_boxes(config.scene))
+        self._table = load_scene(config.scene).table if config.scene else None
+        arms = make_arms(config, self.description, [table_box(self._table)] if self._table else [])
         field = DistanceFieldReader(field_path(config.map.name or str(self.context.get_domain_id())))
         self.service = MotionService(self.robot, config, arms, field, (BASE_FRAME, self.description.root))
         self._scene = self.create_publisher(MarkerArray, "/motion/scene", QOS_LATCHED)
         self._preview = self.create_publisher(MarkerArray, "/motion/preview", QOS_LATCHED)
         self._attached = self.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
         self.service.on_plan, self.service.on_held = self._show_plan, self._show_held
+        self.accept_changes(self._take)
         self._show_held()
         self._show_scene()
+        self.robot.listener.follow_table(self._take_table)
         self._servers = [
             self._serve(PlanApproach, "/motion/plan_approach", self._on_plan),
             self._serve(MoveArm, "/motion/move", self._on_move),
@@ -68,6 +71,10 @@ class MotionNode(BaseNode[MotionConfig]):
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
         for arm in arms.values():
             self.get_logger().info(f"{arm.name} arm: {', '.join(arm.names)}; inverse kinematics: {arm.inverse.method}")
+
+    def _take(self, config: MotionConfig) -> None:
+        """Inject faults as configured, from the next plan on."""
+        self.service.faults = PlanFaults(config.faults)
 
     async def hold(self) -> None:
         """End all plans and motions; the arms hold where they are."""
@@ -168,6 +175,12 @@ class MotionNode(BaseNode[MotionConfig]):
     def _show_held(self) -> None:
         self._attached.publish(convert.held_markers(self.service.held_on_links()))
 
+    def _take_table(self, height: float) -> None:
+        if self._table is not None and height != self._table.top_z:
+            self._table = self._table.at(height)
+            self.service.fix([table_box(self._table)])
+            self._show_scene()
+
     def _show_scene(self) -> None:
         self._scene.publish(convert.scene_markers(self.service.scene_state().solids, BASE_FRAME))
 
@@ -186,15 +199,6 @@ class MotionNode(BaseNode[MotionConfig]):
 
     def _serve(self, kind: Any, name: str, execute: Callable[[ServerGoalHandle], Any]) -> ActionServer:
         return ActionServer(self, kind, name, execute, cancel_callback=lambda _: CancelResponse.ACCEPT)
-
-
-def table_boxes(scene: str) -> tuple[Box, ...]:
-    """Return the table top of a scene as an obstacle; none for an empty name.
-
-    Raises:
-        OpenArmError: SCENE_INVALID, from the scene.
-    """
-    return (table_box(load_scene(scene).table),) if scene else ()
 
 
 async def _answered(

@@ -28,7 +28,9 @@ _PERIOD = 0.05
 _RESULT = FollowJointTrajectory.Result
 _INVALID = ("INVALID_GOAL", "INVALID_JOINTS", "OLD_HEADER_TIMESTAMP")
 _VIOLATED = ("PATH_TOLERANCE_VIOLATED", "GOAL_TOLERANCE_VIOLATED")
-_FAULTS = {getattr(_RESULT, name): name for name in (*_INVALID, *_VIOLATED)}
+#: What the bridge answers after an emergency stop.
+_STOPPED = -100
+_FAULTS = {getattr(_RESULT, name): name for name in (*_INVALID, *_VIOLATED)} | {_STOPPED: "STOPPED"}
 
 
 class NodeRobot:
@@ -139,7 +141,8 @@ class _Goal:
         result = answer.result
         fault = _FAULTS.get(result.error_code, str(result.error_code))
         reason = f": {result.error_string}" if result.error_string else ""
-        return Outcome(result.error_code == _RESULT.SUCCESSFUL, fault + reason)
+        code = Code.STOPPED if result.error_code == _STOPPED else Code.EXECUTION_FAILED
+        return Outcome(result.error_code == _RESULT.SUCCESSFUL, fault + reason, code)
 
     def cancel(self) -> None:
         self._withdrawn = True

@@ -28,6 +28,11 @@ class PlanningScene:
         """Bodies in addition to the fixed ones, in the order in which they came."""
         return tuple(self._solids.values())
 
+    def fix(self, fixed: Sequence[Box]) -> None:
+        """Take other bodies that can't be changed: the table is elsewhere."""
+        self.fixed = tuple(fixed)
+        self.version += 1
+
     def apply(self, *, clear: bool, remove: Sequence[str], add: Sequence[Solid], expected: int = 0) -> int:
         """Change the bodies, all as asked or nothing.
 

@@ -113,7 +113,8 @@ class TrajectoryFollower:
         if stopping and not success:
             raise OpenArmError(Code.CANCELLED, f"cancelled; the {self._arm.name} arm holds where it is")
         if not success:
-            raise OpenArmError(Code.EXECUTION_FAILED, f"controller of the {self._arm.name} arm: {text}")
+            code = goal.outcome.code if goal.outcome else Code.EXECUTION_FAILED
+            raise OpenArmError(code, f"controller of the {self._arm.name} arm: {text}")
         if stopping and run.cancelled():
             raise OpenArmError(Code.CANCELLED, f"cancelled as the {self._arm.name} arm arrived; it holds there")
 

@@ -33,6 +33,7 @@ from openarm_motion.scene.map_view import FieldSource, MapState, MapView
 from openarm_motion.scene.planning_scene import PlanningScene
 from openarm_motion.service.context import PlanningContext
 from openarm_motion.service.coordination import ArmCoordination
+from openarm_motion.service.faults import PlanFaults
 from openarm_motion.service.requests import (
     ApproachAnswer,
     ArmGoal,
@@ -110,6 +111,7 @@ class MotionService:
         frames: Sequence[str],
     ) -> None:
         self.robot, self.config, self.arms, self._frames = robot, config, arms, tuple(frames)
+        self.faults = PlanFaults(config.faults)
         #: No new motion is begun, and those under way hold.
         self.closing = False
         #: Called with each plan, by arm, before it is executed.
@@ -146,6 +148,7 @@ class MotionService:
             answer = replace(answer, scene_version=prepared.version)
 
             def work() -> ApproachPlan:
+                self.faults.check(arm.name)
                 now = prepared.complete()
                 return explained_approach(lambda: plan_approach(arm, now, wanted, report), arm, now, wanted)
 
@@ -311,6 +314,12 @@ class MotionService:
         self.scene.apply(clear=clear, remove=remove, add=add, expected=expected)
         names = ", ".join(solid.id for solid in self.scene.solids) or "nothing but what is fixed"
         return f"version {self.scene.version}: {names}"
+
+    def fix(self, fixed: Sequence[Box]) -> None:
+        """Plan with other boxes that are always there (the table), base frame, from the next request on."""
+        for arm in self.arms.values():
+            arm.static = tuple(fixed)
+        self.scene.fix(fixed)
 
     def check_map(self) -> str:
         """Return how old the map is, or why it is not used.

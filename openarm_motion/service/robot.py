@@ -30,10 +30,11 @@ _STARVED = 0.1
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a controller ended a trajectory; `text` is its reason after a failure."""
+    """How a controller ended a trajectory; `text` and `code` are its reason after a failure."""
 
     success: bool
     text: str = ""
+    code: Code = Code.EXECUTION_FAILED
 
 
 class TrajectoryGoal(Protocol):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from openarm_common.config import Config
+from openarm_common.detection import Described
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Mask
 
@@ -28,26 +29,26 @@ Policy = Literal["score", "centre"]
 
 
 @dataclass(frozen=True)
-class Detection2D:
+class Detection2D(Described):
     """Something found in an image; pixels.
 
     Attributes:
-        label: What it is.
+        name: As `Described`; so are `color` and `kind`, the shape where the detector knows it.
         score: How certain, 0 to 1.
         centre: (u, v) of the middle of the box.
         size: (width, height) of the box.
         mask: (height, width) bool, the pixels of the box that belong to the object.
         truncated: Whether the border of the image cuts it.
-        kind: What shape it has, where the detector knows: a class of a network; empty otherwise.
     """
 
-    label: str
+    name: str
     score: float
     centre: tuple[float, float]
     size: tuple[int, int]
     mask: Mask
     truncated: bool
     kind: str = ""
+    color: str = ""
 
     @property
     def origin(self) -> tuple[int, int]:
@@ -203,28 +204,22 @@ class ColorDetector:
         truncated = u == 0 or v == 0 or u + width == raw.shape[1] or v + height == raw.shape[0]
         score = fill * agreement * (self.config.truncated_factor if truncated else 1.0)
         centre = (u + (width - 1) / 2.0, v + (height - 1) / 2.0)
-        return Detection2D(label, float(score), centre, (width, height), mask.astype(np.bool_), truncated)
+        box, found = (width, height), mask.astype(np.bool_)
+        return Detection2D("", float(score), centre, box, found, truncated, color=label)
 
 
-def rank(
-    detections: Sequence[Detection2D], policy: Policy, image_size: tuple[int, int], label: str = ""
-) -> tuple[Detection2D, ...]:
+def rank(detections: Sequence[Detection2D], policy: Policy, image_size: tuple[int, int]) -> tuple[Detection2D, ...]:
     """Return detections in the order in which they should be taken.
 
     Args:
         detections: In any order.
         policy: `score`: the most certain first; `centre`: the one nearest to the middle of the image first.
         image_size: (width, height), pixels.
-        label: Only detections of this name; empty takes all.
-
-    Returns:
-        The best first; empty when there is none, or none of that name.
     """
-    chosen = [d for d in detections if label in ("", d.label)]
     if policy == "score":
-        return tuple(sorted(chosen, key=lambda d: -d.score))
+        return tuple(sorted(detections, key=lambda d: -d.score))
     u, v = (image_size[0] - 1) / 2.0, (image_size[1] - 1) / 2.0
-    return tuple(sorted(chosen, key=lambda d: np.hypot(d.centre[0] - u, d.centre[1] - v)))
+    return tuple(sorted(detections, key=lambda d: np.hypot(d.centre[0] - u, d.centre[1] - v)))
 
 
 def _hsv_bounds(color: ColorClass) -> list[tuple[Image, Image]]:

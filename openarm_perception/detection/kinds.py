@@ -5,5 +5,5 @@ from __future__ import annotations
 
 from typing import Literal
 
-#: Their colour, a network, both checking each other, or depth alone.
-DetectorKind = Literal["color", "network", "both", "anything"]
+#: Their colour, a network, both checking each other, a tag on them, or depth alone.
+DetectorKind = Literal["color", "network", "both", "tag", "anything"]

@@ -35,6 +35,8 @@ from openarm_perception.geometry.patch import Patch, cut
 _SIDE_POINTS = 150
 #: What is robot to a larger share is no object on the table.
 _MOSTLY = 0.5
+#: Fewer pixels, without their border, are the fringe of the robot or of what it holds.
+_STICKS_OUT = 6
 
 
 class LocalizerConfig(Config):
@@ -115,8 +117,11 @@ class Localizer:
         found = patch.found
         if found.truncated:
             raise _refusal(found, Code.BAD_IMAGE, " is cut by the border of the image; its size is unknown")
-        if found.label in self._heights and self._valid(patch).sum() < self.config.min_points:
-            return self.locate_on_plane(found, self._heights[found.label], patch.intrinsics, patch.T_base_camera)
+        height = next((self._heights[each] for each in found.attributes if each in self._heights), None)
+        if height is not None and self._valid(patch).sum() < self.config.min_points:
+            return self.locate_on_plane(found, height, patch.intrinsics, patch.T_base_camera)
+        if (share := _share_of_robot(patch)) > _MOSTLY:
+            raise _robot(found, share)
         solid = self._solid(patch)
         top = self._top_height(patch.points[..., 2][solid], patch.band)
         face = self._top_face(patch, top)
@@ -134,19 +139,28 @@ class Localizer:
             raise _refusal(found, error.code, f": {error.message}") from error
         return self._detection(found, shape, top, int(np.count_nonzero(solid)), visible)
 
-    def enclose(self, patch: Patch) -> LocatedObject:
+    def enclose(self, patch: Patch, withheld: OpenArmError | None = None) -> LocatedObject:
         """Enclose what is visible of a detection that cannot be measured, an obstacle. It is marked as not measured.
 
-        Errors as for `locate`; what is hidden or beyond the border of the image is not in the box.
+        Errors as for `locate`, but what sticks out of the robot and of what it holds is enclosed: an object that has
+        slipped in the hand does. What is hidden or beyond the border of the image is not in the box.
+
+        Args:
+            patch: Of the detection.
+            withheld: Why nothing of the frame may be measured: where table and objects seem to be says nothing then.
         """
-        solid = self._solid(patch)
+        solid = self._solid(patch) if withheld is None else self._on_object(patch)
         # at its borders a real sensor reports any depth
         inner = cv2.erode(solid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        share = _share_of_robot(patch)
+        if share > _MOSTLY and (withheld is not None or np.count_nonzero(inner) < _STICKS_OUT):
+            raise _robot(patch.found, share)
         points = patch.points[inner if inner.any() else solid]
         top = self._top_height(points[:, 2], patch.band)
         shape = footprint.bound(points[:, :2], 3.0 * float(np.median(patch.z[solid])) / patch.intrinsics.fx)
         around = self._detection(patch.found, shape, top, len(points), 0.0)
-        return replace(around, score=patch.found.score, kind=kind_of(patch.found.kind, around.size), measured=False)
+        kind, code = kind_of(patch.found.kind, around.size), withheld.code if withheld else around.code
+        return replace(around, score=patch.found.score, kind=kind, measured=False, code=code)
 
     def locate_on_plane(
         self, found: Detection2D, height: float, intrinsics: Intrinsics, T_base_camera: Array
@@ -185,6 +199,7 @@ class Localizer:
         return np.asarray(patch.mask & np.isfinite(patch.z))
 
     def _on_object(self, patch: Patch) -> Mask:
+        """Return points of the object, or of the table around it."""
         found, valid = patch.found, self._valid(patch)
         count = int(np.count_nonzero(valid))
         if count < self.config.min_points:
@@ -195,17 +210,12 @@ class Localizer:
 
     def _solid(self, patch: Patch) -> Mask:
         """Return points of the object above the table."""
-        found = patch.found
-        share = float(np.count_nonzero(patch.robot & patch.coloured)) / found.area
-        if share > _MOSTLY:
-            text = f" is to {share:.0%} the robot or what it holds; it does not stand on the table"
-            raise _refusal(found, Code.NOTHING_DETECTED, text)
         solid = self._on_object(patch) & (patch.points[..., 2] > self.table_height + self.config.table_margin)
         count = int(np.count_nonzero(solid))
         if count < self.config.min_points:
             text = f" has {count} points above the table at {self.table_height:.3f} m, expected at least"
             text += f" {self.config.min_points}; is it flat, or is the table height wrong?"
-            raise _refusal(found, Code.NOTHING_DETECTED, text)
+            raise _refusal(patch.found, Code.NOTHING_DETECTED, text)
         return solid
 
     @staticmethod
@@ -258,7 +268,8 @@ class Localizer:
     def _detection(
         self, found: Detection2D, shape: footprint.Footprint, top: float, count: int, visible: float
     ) -> LocatedObject:
-        height = top - self.table_height
+        # lower only where heights say nothing
+        height = max(top - self.table_height, self.config.table_margin)
         R = se3.rot_z(shape.yaw)
         T = se3.make(R, (*shape.centre, self.table_height + height / 2.0))
         std = np.maximum([*shape.centre_std, 0.5 * self.config.std_floor], self.config.std_floor)
@@ -268,7 +279,7 @@ class Localizer:
         size = np.array([*shape.size, height])
         kind = kind_of(_shape(found, shape.kind), size)
         return LocatedObject(
-            found.label, found.score * visible, T, size, shape.kind == "circle", kind,
+            found.name, found.score * visible, T, size, shape.kind == "circle", kind, color=found.color,
             source=found, covariance=covariance, points=count, visible=visible, method=shape.kind,
         )  # fmt: skip
 
@@ -278,6 +289,15 @@ def _shape(found: Detection2D, method: footprint.Kind) -> str:
     outline = {"rectangle": "box", "circle": "cylinder"}.get(method, "")
     # no box has a round outline; that of a cylinder that lies is a rectangle
     return outline if found.kind == "" or (found.kind, outline) == ("box", "cylinder") else found.kind
+
+
+def _share_of_robot(patch: Patch) -> float:
+    return float(np.count_nonzero(patch.robot & patch.coloured)) / patch.found.area
+
+
+def _robot(found: Detection2D, share: float) -> OpenArmError:
+    text = f" is to {share:.0%} the robot or what it holds; it does not stand on the table"
+    return _refusal(found, Code.NOTHING_DETECTED, text)
 
 
 def _refusal(found: Detection2D, code: Code, text: str) -> OpenArmError:

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from openarm_common.config import Config, RunTimeField, load_yaml
+from openarm_common.config import Config, RunTimeField, brief, load_yaml
+from openarm_common.detection import KINDS
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import models_dir
 from openarm_perception.detection.boxes import Candidates, Letterbox, blob, decode
@@ -27,6 +28,8 @@ from openarm_perception.detection.detector import Detection2D, Image, require_rg
 _BORDER = 2.0
 #: What the file is read with; the rest of the configuration filters its boxes.
 _OF_THE_FILE = {"model", "names", "width", "height"}
+#: Longest text of the names of all classes in a file: it takes a hundred times as much memory while it is parsed.
+_MAX_NAMES = 2**16
 _LAYOUT = "expected the layout of YOLOv8: input (1, 3, h, w), output (1, 4 + classes, n)"
 
 
@@ -115,7 +118,9 @@ class NetworkDetector:
             centre = ((left + right - 1) / 2.0, (top + bottom - 1) / 2.0)
             size = (right - left, bottom - top)
             mask = np.ones((size[1], size[0]), np.bool_)
-            out.append(Detection2D(self.names[kind], float(score), centre, size, mask, bool(cut)))
+            what = self.names[kind]
+            name, shape = ("", what) if what in KINDS else (what, "")
+            out.append(Detection2D(name, float(score), centre, size, mask, bool(cut), shape))
         return tuple(sorted(out, key=lambda d: -d.area))
 
     def candidates(self, rgb: Image, threshold: float) -> Candidates:
@@ -225,21 +230,24 @@ def _open(path: Path) -> Any:
 
 def _names_of(path: Path, metadata: Mapping[str, str]) -> tuple[tuple[str, ...], str]:
     """Names of the classes and their source: the metadata of the file (a Python or JSON mapping or list), or a YAML."""
-    names: Any = None
-    where = "its metadata"
     if "names" in metadata:
-        try:
-            names = ast.literal_eval(metadata["names"])
-        except (ValueError, SyntaxError) as error:
-            raise OpenArmError(
-                Code.CONFIG_INVALID,
-                f"network {path}: its metadata has names {metadata['names']!r}; expected {{0: 'a', 1: 'b', …}} or"
-                " a list",
-            ) from error
+        where, text = "its metadata", metadata["names"]
     elif path.with_suffix(".yaml").is_file():
-        where = path.with_suffix(".yaml").name
-        names = load_yaml(path.with_suffix(".yaml")).get("names")
-    if isinstance(names, dict):
-        by_number = {int(key): str(value) for key, value in cast(dict[Any, Any], names).items()}
-        return tuple(by_number[key] for key in sorted(by_number)), where
-    return tuple(str(name) for name in cast(list[Any], names or [])), where
+        where, text = path.with_suffix(".yaml").name, ""
+    else:
+        return (), "its metadata"
+    names: Any = None
+    try:
+        if len(text) > _MAX_NAMES:
+            raise ValueError("too long")
+        names = ast.literal_eval(text) if text else load_yaml(path.with_suffix(".yaml")).get("names")
+        if isinstance(names, dict):
+            by_number = {int(key): value for key, value in cast(dict[Any, Any], names).items()}
+            names = [by_number[key] for key in sorted(by_number)]
+        return tuple(str(name) for name in cast(list[Any], names or [])), where
+    # a text of many brackets is refused by the parser of Python with errors of memory or recursion
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as error:
+        raise OpenArmError(
+            Code.CONFIG_INVALID,
+            f"network {path}: {where} has names {brief(text or names)}; expected {{0: 'a', 1: 'b', …}} or a list",
+        ) from error

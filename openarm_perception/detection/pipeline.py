@@ -2,9 +2,9 @@
 """From one frame of a camera to objects in the base frame: detect, rank, locate.
 
 Objects are detected by colour, by a network whose boxes are cut out by depth, by both checking each other, or as
-clusters of depth. A network knows shapes and no colours, the colour detector knows colours and no shapes: they fail
-independently. Labels are colours wherever an object has one of the palette, whichever detector found it; its shape is
-its `kind`.
+clusters of depth, all of them or those that show a tag. A network knows shapes and no colours, the colour detector
+knows colours and no shapes: they fail independently. An object has the colour of the palette that most of it has,
+whichever detector found it. The class of a network is its name, or its shape where it names one.
 """
 
 from __future__ import annotations
@@ -19,10 +19,13 @@ from numpy.typing import NDArray
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.depth_view import DepthImage, check_size, unit_scale
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.wanted import describe, fits
 from openarm_perception.detection.detector import ColorDetector, Detection2D, Detector, Image, Mask, Policy, rank
+from openarm_perception.detection.faults import DetectionFaults
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer, LocatedObject
 from openarm_perception.detection.network import NetworkConfig, NetworkDetector
+from openarm_perception.detection.tags import TagConfig, TagDetector
 from openarm_perception.geometry.depth import View
 from openarm_perception.geometry.table import TableMeasurement, measure_table, of_block
 
@@ -53,6 +56,7 @@ class Perceived:
         refused: Why the others could not be, one sentence each.
         unmeasured: Boxes around what is visible of those: obstacles, but no targets.
         robot: (h, w) pixels that show the robot or what it holds; None when it was not searched for.
+        withheld: Why none of them may be a target.
     """
 
     found: tuple[Detection2D, ...]
@@ -60,6 +64,7 @@ class Perceived:
     refused: tuple[str, ...]
     robot: Mask | None = None
     unmeasured: tuple[LocatedObject, ...] = ()
+    withheld: OpenArmError | None = None
 
     @property
     def boxes(self) -> tuple[LocatedObject, ...]:
@@ -75,13 +80,15 @@ class Pipeline:
         detector: Finds them in the colour image.
         localizer: Finds where they are.
         policy: Which comes first.
-        label: Only objects of this name; empty takes all.
+        label: Only objects that these words fit; empty takes all.
+        faults: Objects that are missed, by fault injection.
     """
 
     detector: Detector
     localizer: Localizer
     policy: Policy = "score"
     label: str = ""
+    faults: DetectionFaults = field(default_factory=DetectionFaults)
 
     def run(
         self,
@@ -90,6 +97,8 @@ class Pipeline:
         intrinsics: Intrinsics,
         T_base_camera: NDArray[np.float64],
         robot: Mask | None = None,
+        withheld: OpenArmError | None = None,
+        t_ns: int = 0,
     ) -> Perceived:
         """Detect and locate the objects of a frame.
 
@@ -99,6 +108,8 @@ class Pipeline:
             intrinsics: Of both, from the CameraInfo.
             T_base_camera: (4, 4) optical frame in the base frame, at the stamp of the image.
             robot: (h, w) pixels that show the robot or what it holds; they belong to no object.
+            withheld: Why no object of the frame may be a target, from `CameraWatch`.
+            t_ns: Stamp of the frame, by which injected faults are drawn.
 
         Raises:
             OpenArmError: BAD_IMAGE, when colour, depth and intrinsics do not belong together.
@@ -109,21 +120,33 @@ class Pipeline:
         size = (intrinsics.width, intrinsics.height)
         view = View(rgb, depth, intrinsics, T_base_camera, robot)
         detected = self.detect(view)
-        found = rank(detected.found, self.policy, size, self.label)
+        found = rank(self.faults.seen(detected.found, t_ns), self.policy, size)
+        doubts = self.faults.seen(detected.doubts, t_ns)
         located: list[LocatedObject] = []
         refused: list[str] = []
         unmeasured: list[LocatedObject] = []
-        for detection, doubt in [*((one, "") for one in found), *((one.found, one.why) for one in detected.doubts)]:
+        for detection, doubt in [*((one, "") for one in found), *((one.found, one.why) for one in doubts)]:
             patch = self.localizer.cut(detection, view)
             try:
                 if doubt:
                     raise OpenArmError(Code.NOTHING_DETECTED, doubt)
-                located.append(self.localizer.locate(patch))
+                place = self.localizer.locate(patch)
+                if withheld is None:
+                    located.append(place)
+                else:
+                    refused.append(f"{detection.label} is no target")
+                    unmeasured.append(replace(place, measured=False, code=withheld.code))
             except OpenArmError as error:
                 refused.append(error.message)
                 with contextlib.suppress(OpenArmError):  # flat on the table, or the robot: it is no obstacle
-                    unmeasured.append(self.localizer.enclose(patch))
-        return Perceived(found, tuple(located), tuple(refused), robot, tuple(unmeasured))
+                    unmeasured.append(self.localizer.enclose(patch, withheld))
+        if self.policy == "score":  # what is partly hidden is less certain than it seemed in the image
+            located.sort(key=lambda place: -place.score)
+        if self.label:
+            located, unmeasured = ([p for p in places if fits(self.label, p)] for places in (located, unmeasured))
+            kept = {id(place.source) for place in (*located, *unmeasured)}
+            found = tuple(one for one in found if id(one) in kept)
+        return Perceived(found, tuple(located), tuple(refused), robot, tuple(unmeasured), withheld)
 
     def measure_table(self, view: View, block_height: float = 0.0, label: str = "") -> TableMeasurement:
         """Measure the height of the table, by its surface or under a block of known height.
@@ -131,22 +154,20 @@ class Pipeline:
         Args:
             view: The frame.
             block_height: Of the block, m; 0: by the surface.
-            label: Of the block; empty: the only one in view.
+            label: Words for the block; empty: the only one in view.
 
         Raises:
             OpenArmError: NOTHING_DETECTED, when there is no such surface, or not one such block; INVALID_ARGUMENT, for
                 a height that no block has; BAD_IMAGE, when depth and intrinsics do not fit.
         """
         if block_height == 0.0:
-            depth = view.depth if view.robot is None else np.where(view.robot, view.depth.dtype.type(0), view.depth)
-            limits, height = self.localizer.limits, self.localizer.table_height
-            return measure_table(depth, view.intrinsics, view.T_base_camera, limits, height)
+            return measure_table(view, self.localizer.limits, self.localizer.table_height)
         found = self.run(view.rgb, view.depth, view.intrinsics, view.T_base_camera, view.robot).located
-        blocks = [place for place in found if label in ("", place.label) and place.from_depth]
+        blocks = [place for place in found if fits(label, place) and place.from_depth]
         if len(blocks) != 1:
-            shown = ", ".join(place.label for place in found) or "nothing"
             raise OpenArmError(
-                Code.NOTHING_DETECTED, f"expected one block {label!r} in view, which shows {shown}; give its label"
+                Code.NOTHING_DETECTED,
+                f"expected one block {label!r} in view, which shows {describe(found)}; give its label",
             )
         return of_block(blocks[0], block_height)
 
@@ -155,7 +176,7 @@ class Pipeline:
         return ImageDetections(self.detector.detect(view.rgb))
 
 
-#: Label of what is found without knowing what it is.
+#: Name of what is found without knowing what it is.
 ANYTHING = "anything"
 #: Pixels around a box of a network that are examined: its sides are that exact.
 _MARGIN = 4
@@ -190,13 +211,8 @@ class NetworkPipeline(Pipeline):
         kept: list[Detection2D] = []
         for detection in sorted((d for d in found if d is not None), key=lambda d: -d.score):
             if not any(same(detection, other) for other in kept):
-                kept.append(self._named(detection, view.rgb))
+                kept.append(with_colour(detection, view.rgb, self.colors))
         return tuple(sorted(kept, key=lambda d: -d.area))
-
-    def _named(self, detection: Detection2D, rgb: Image) -> Detection2D:
-        (u, v), (w, h) = detection.origin, detection.size
-        color, share = self.colors.name(np.ascontiguousarray(rgb[v : v + h, u : u + w]), detection.mask)
-        return replace(detection, label=color if share >= _COLOURED else detection.kind)
 
 
 class CheckedPipeline(NetworkPipeline):
@@ -205,26 +221,60 @@ class CheckedPipeline(NetworkPipeline):
     def detect(self, view: View) -> ImageDetections:
         """Return what both detect; the rest is in doubt, unless it has none of the configured colours."""
         by_shape, by_colour = list(self._by_network(view)), self.colors.detect(view.rgb)
-        palette = {item.label for item in self.colors.config.classes}
         found: list[Detection2D] = []
         doubts: list[Doubt] = []
         for coloured in by_colour:
             shaped = next((d for d in by_shape if same(coloured, d)), None)
             if shaped is None:
-                doubts.append(Doubt(coloured, _doubt(coloured, coloured.label, "the network detects nothing there")))
+                doubts.append(Doubt(coloured, _doubt(coloured, coloured.color, "the network detects nothing there")))
                 continue
             by_shape.remove(shaped)
-            if shaped.label != coloured.label and shaped.label in palette:
-                doubts.append(Doubt(coloured, _doubt(coloured, coloured.label, f"most of it is {shaped.label}")))
+            if shaped.color not in ("", coloured.color):
+                doubts.append(Doubt(coloured, _doubt(coloured, coloured.color, f"most of it is {shaped.color}")))
             else:
                 score = (coloured.score + shaped.score) / 2.0
-                found.append(replace(coloured, kind=shaped.kind, score=score))
+                found.append(replace(coloured, name=shaped.name, kind=shaped.kind, score=score))
         for shaped in by_shape:
-            if shaped.label in palette:
-                doubts.append(Doubt(shaped, _doubt(shaped, shaped.kind, f"by colour nothing {shaped.label} is there")))
+            if shaped.color:
+                why = _doubt(shaped, shaped.name or shaped.kind, f"by colour nothing {shaped.color} is there")
+                doubts.append(Doubt(shaped, why))
             else:
                 found.append(shaped)
         return ImageDetections(tuple(sorted(found, key=lambda d: -d.area)), tuple(doubts))
+
+
+@dataclass(eq=False)
+class TagPipeline(Pipeline):
+    """Detects what stands on the table and shows a tag, which names it; depth says which pixels are its.
+
+    Args:
+        detector: Names the colours.
+        tags: Finds the tags; one that is flat on the table, or on the robot, is on no object.
+    """
+
+    detector: ColorDetector  # pyright: ignore[reportIncompatibleVariableOverride] - never replaced
+    tags: TagDetector = field(kw_only=True)
+
+    def detect(self, view: View) -> ImageDetections:
+        """Return what shows one tag; what shows different ones is in doubt."""
+        found: list[Detection2D] = []
+        doubts: list[Doubt] = []
+        masks = {tag: tag.mask(view.depth.shape) for tag in self.tags.detect(view.rgb)}
+        for cluster in clusters(view, self.localizer) if masks else ():
+            (u, v), (w, h) = cluster.origin, cluster.size
+            shown = {tag: np.count_nonzero(mask[v : v + h, u : u + w] & cluster.mask) for tag, mask in masks.items()}
+            on_it = [tag for tag, count in shown.items() if 2 * count > np.count_nonzero(masks[tag])]
+            names = sorted({tag.name for tag in on_it})
+            if not names:
+                continue
+            one = with_colour(replace(cluster, name=names[0]), view.rgb, self.detector)
+            why = "they touch, or are on one object" if len(names) > 1 else ""
+            why = why or next(filter(None, (self.tags.doubt(tag, view, self.localizer.limits) for tag in on_it)), "")
+            if why:
+                doubts.append(Doubt(one, _doubt(one, " and ".join(names), why)))
+            else:
+                found.append(one)
+        return ImageDetections(tuple(found), tuple(doubts))
 
 
 class ClusterPipeline(Pipeline):
@@ -243,6 +293,7 @@ def make_pipeline(
     policy: Policy = "score",
     label: str = "",
     before: Pipeline | None = None,
+    tags: TagConfig = TagConfig(),  # noqa: B008 - frozen
 ) -> Pipeline:
     """Make the pipeline of a kind; the network is read only by those that use it.
 
@@ -252,8 +303,9 @@ def make_pipeline(
         network: Which network, and what counts as found.
         localizer: Finds where objects are.
         policy: Which comes first.
-        label: Only objects of this name; empty takes all.
+        label: Only objects that these words fit; empty takes all.
         before: The pipeline that it takes the place of, whose network is not read again where it is the same.
+        tags: Which tags are read, and what counts as one.
 
     Raises:
         OpenArmError: CONFIG_INVALID or INVALID_ARGUMENT, from the network.
@@ -262,6 +314,8 @@ def make_pipeline(
         loaded = before.detector.changed(network) if isinstance(before, NetworkPipeline) else NetworkDetector(network)
         made = NetworkPipeline if kind == "network" else CheckedPipeline
         return made(loaded, localizer, policy, label, colors=colors)
+    if kind == "tag":
+        return TagPipeline(colors, localizer, policy, label, tags=TagDetector(tags))
     if kind == "anything":
         return ClusterPipeline(colors, localizer, policy, label)
     return Pipeline(colors, localizer, policy, label)
@@ -276,7 +330,7 @@ def cut_out(box: Detection2D, view: View, localizer: Localizer) -> Detection2D |
         localizer: Has the height of the table.
 
     Returns:
-        The detection with mask and box of those pixels, its class as `kind`; None when hardly any are left.
+        The detection with mask and box of those pixels; None when hardly any are left.
     """
     height, width = view.rgb.shape[:2]
     (u, v), (w, h) = box.origin, box.size
@@ -299,7 +353,14 @@ def cut_out(box: Detection2D, view: View, localizer: Localizer) -> Detection2D |
     plain = np.count_nonzero(alike & core) >= 0.5 * np.count_nonzero(core)
     # what is of many colours is separated from the background by depth alone
     mask = _largest(standing & alike if plain else standing)
-    return _detection(mask, (columns.start, rows.start), (width, height), box.label, box.score, kind=box.label)
+    return _detection(mask, (columns.start, rows.start), (width, height), box.name, box.score, box.kind)
+
+
+def with_colour(detection: Detection2D, rgb: Image, colors: ColorDetector) -> Detection2D:
+    """Return the detection with the colour that most of it has, where one has."""
+    (u, v), (w, h) = detection.origin, detection.size
+    color, share = colors.name(np.ascontiguousarray(rgb[v : v + h, u : u + w]), detection.mask)
+    return replace(detection, color=color) if share >= _COLOURED else detection
 
 
 def clusters(view: View, localizer: Localizer) -> tuple[Detection2D, ...]:
@@ -367,7 +428,7 @@ def _largest(mask: Mask) -> Mask:
 
 
 def _detection(
-    mask: Mask, origin: tuple[int, int], image: tuple[int, int], label: str, score: float, kind: str = ""
+    mask: Mask, origin: tuple[int, int], image: tuple[int, int], name: str, score: float, kind: str = ""
 ) -> Detection2D | None:
     rows, columns = np.nonzero(mask.any(axis=1))[0], np.nonzero(mask.any(axis=0))[0]
     if np.count_nonzero(mask) < _PIXELS:
@@ -376,7 +437,7 @@ def _detection(
     u, v, w, h = int(origin[0] + left), int(origin[1] + top), int(right - left), int(bottom - top)
     cut = u == 0 or v == 0 or u + w == image[0] or v + h == image[1]
     centre = (u + (w - 1) / 2.0, v + (h - 1) / 2.0)
-    return Detection2D(label, score, centre, (w, h), mask[top:bottom, left:right].copy(), cut, kind)
+    return Detection2D(name, score, centre, (w, h), mask[top:bottom, left:right].copy(), cut, kind)
 
 
 def _doubt(found: Detection2D, name: str, other: str) -> str:

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Node `cloud`: depth images to point clouds in the optical frame; each camera only while its cloud has subscribers.
+"""Node `cloud`: depth images to point clouds, each camera only while someone subscribes to a cloud of it.
 
-A cloud is published without the robot, or not at all, where `self_filter` is on.
+The cloud of a camera is in its optical frame, the merged one of all cameras in the base frame. They are published
+without the robot, or not at all, where `self_filter` is on.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,79 +21,89 @@ from openarm_common.camera.stream import Frame
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import cloud_from_points, depth_image, intrinsics_from_info, rgb_image
-from openarm_common.ros.node import QOS_SENSOR, BaseNode, run
+from openarm_common.ros.node import BASE_FRAME, QOS_SENSOR, BaseNode, run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_perception.config import CloudNodeConfig
 from openarm_perception.detection.robot import RobotFinder
-from openarm_perception.geometry.depth import Deprojector, DepthLimits
+from openarm_perception.geometry.depth import Deprojector, DepthLimits, Points
 from openarm_perception.geometry.filters import CloudFilter
+from openarm_perception.geometry.merge import CloudMerger
 
 
 class _Camera:
-    """The cloud of one camera.
+    """The points of one camera, for its own cloud or for the merged one.
 
     Args:
-        node: That publishes it.
+        node: That publishes them.
         name: Of the camera.
-        states: Of the robot; None: it stays in the cloud.
-        finder: Finds it in images.
+        finder: Finds the robot in images; None: it stays in the cloud.
+        publish: Takes each frame and its points; what raises is reported.
+        merged: Whether they are for the merged cloud: valid points, and the pose of the camera is needed.
     """
 
     def __init__(
-        self, node: CloudNode, name: str, states: RobotStateListener | None, finder: RobotFinder | None
+        self,
+        node: CloudNode,
+        name: str,
+        finder: RobotFinder | None,
+        publish: Callable[[Frame[Any], Points], None],
+        *,
+        merged: bool = False,
     ) -> None:
         camera, config = depth_camera(name), node.config
-        self._node, self._name, self._finder = node, name, finder
+        self._node, self._name, self._finder, self._publish = node, name, finder, publish
         self._deprojector = Deprojector(DepthLimits(near=camera.near, far=camera.far))
-        self._filter = CloudFilter(config.filter)
-        color = {"color": config.color_topic} if config.color else {}
+        self._deproject = (
+            self._deprojector.organised if config.organised and not merged else self._deprojector.valid_points
+        )
+        color = {"color": config.color_topic} if config.color and not merged else {}
         topics = camera_topics(name, depth=config.depth_topic, info=config.info_topic, **color)
+        moving = merged and any(joint.type != "fixed" for joint in node.description.chain(camera.parent))
         self.stream = CameraStream(
-            node, states, topics, camera.optical_frame, joints="required" if finder else "none",
-            on_frame=self._publish, on_refusal=self._refuse,
+            node, node.states if finder or merged else None, topics, camera.optical_frame,
+            joints="required" if finder else "optional" if moving else "none",
+            max_rate=config.merged_rate if merged else 0.0, on_frame=self._take, on_refusal=self._refuse,
         )  # fmt: skip
-        self._points = node.create_publisher(PointCloud2, config.points_topic.format(camera=name), QOS_SENSOR)
         self._removed: dict[str, int] = {}
         self._frames = 0
         self._elapsed_ms = 0.0
         self.fault = ""
 
-    def follow_demand(self) -> None:
-        """Subscribe to the camera while its cloud is subscribed to."""
+    def follow_demand(self, wanted: bool) -> None:
+        """Subscribe to the camera while its points are wanted."""
         self.stream.poll()
-        self.stream.listen(self._points.get_subscription_count() > 0)
+        self.stream.listen(wanted)
         self.fault = self.fault if self.stream.listening else ""
 
-    def _publish(self, frame: Frame[Any]) -> None:
+    def _take(self, frame: Frame[Any]) -> None:
         try:
             started = time.perf_counter()
-            pixels, rgb = self._filter.depth(depth_image(frame.items["depth"])), None
+            pixels = self._node.filter.depth(depth_image(frame.items["depth"]))
             intrinsics = intrinsics_from_info(frame.items["info"])
             if self._finder is not None:
                 limits = self._deprojector.limits
                 view = DepthView(pixels, intrinsics, frame.posture.T_base_frame, limits.near, limits.far)
                 robot, self._removed = self._finder.find(view, frame.posture.joints, frame.posture.held)
                 pixels = np.where(robot, pixels.dtype.type(0), pixels)
-            deproject = self._deprojector.organised if self._node.config.organised else self._deprojector.valid_points
-            points = self._filter.points(deproject(pixels, intrinsics))
-            if "color" in frame.items:
-                rgb = _colors(frame.items["color"], points.shape)
+            self._publish(frame, self._deproject(pixels, intrinsics))
             self._elapsed_ms = (time.perf_counter() - started) * 1e3
         except OpenArmError as error:
             self._refuse(error)
             return
-        self._points.publish(cloud_from_points(points, frame.frame_id, frame.t_ns, rgb))
         self.fault = ""
         self._frames += 1
 
     def _refuse(self, error: OpenArmError) -> None:
-        reason = error.message if error.code is Code.BAD_IMAGE else f"the robot cannot be cut out: {error.message}"
+        reason = error.message
+        if error.code is not Code.BAD_IMAGE:
+            need = "the robot cannot be cut out" if self._finder else "its pose in the base frame is not known"
+            reason = f"{need}: {reason}"
         self.fault = f"{self._name}: frame refused: {reason}"
         self._node.get_logger().warning(self.fault, throttle_duration_sec=5.0)
 
-    def values(self) -> dict[str, object]:
+    def values(self, prefix: str = "") -> dict[str, object]:
         """Return the values for /diagnostics."""
-        name = self._name
+        name = prefix + self._name
         removed = {f"{name}_removed/{link}": n for link, n in self._removed.items()}
         given_up = {f"{name}_{key}": n for key, n in self.stream.frames.given_up().items()}
         return {f"{name}_frames": self._frames, f"{name}_ms": f"{self._elapsed_ms:.2f}", **given_up, **removed}
@@ -112,31 +124,62 @@ class CloudNode(BaseNode[CloudNodeConfig]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("cloud", CloudNodeConfig, **kwargs)
-        config, states, finder = self.config, None, None
-        if config.self_filter.enabled:
-            states = RobotStateListener(
-                self,
-                self.description,
-                joints=False,
-                depth=100,
-                wait=config.transform_wait,
-                held_topic=config.held_topic,
-            )
-            finder = RobotFinder(self.description, config.self_filter)
-        self._cameras = {name: _Camera(self, name, states, finder) for name in config.cameras}
+        config = self.config
+        self.filter = CloudFilter(config.filter)
+        finder = RobotFinder(self.description, config.self_filter) if config.self_filter.enabled else None
+        self.states = RobotStateListener(
+            self,
+            self.description,
+            joints=False,
+            depth=100,
+            wait=config.transform_wait,
+            held_topic=config.held_topic if finder else "",
+        )
+        self._merged = self.create_publisher(PointCloud2, config.merged_topic, QOS_SENSOR)
+        self._merger = CloudMerger(config.cameras, config.merged_age)
+        self._points = {
+            name: self.create_publisher(PointCloud2, config.points_topic.format(camera=name), QOS_SENSOR)
+            for name in config.cameras
+        }
+        self._cameras = {name: _Camera(self, name, finder, self._publisher(name)) for name in config.cameras}
+        self._parts = {name: _Camera(self, name, finder, self._adder(name), merged=True) for name in config.cameras}
         self.create_timer(0.1, self._follow_demand, clock=self.steady_clock)
+
+    def _publisher(self, name: str) -> Callable[[Frame[Any], Points], None]:
+        def publish(frame: Frame[Any], points: Points) -> None:
+            points = self.filter.points(points)
+            rgb = _colors(frame.items["color"], points.shape) if "color" in frame.items else None
+            self._points[name].publish(cloud_from_points(points, frame.frame_id, frame.t_ns, rgb))
+
+        return publish
+
+    def _adder(self, name: str) -> Callable[[Frame[Any], Points], None]:
+        def add(frame: Frame[Any], points: Points) -> None:
+            merged = self._merger.add(name, frame.t_ns, points, frame.posture.T_base_frame)
+            if merged is not None:
+                t_ns, cloud = merged
+                self._merged.publish(cloud_from_points(self.filter.points(cloud), BASE_FRAME, t_ns))
+
+        return add
 
     def waiting_ns(self, camera: str) -> int | None:
         """Return the stamp of the newest frame of a camera that waits for the posture of the robot."""
         return self._cameras[camera].stream.frames.waiting_ns
 
     def _follow_demand(self) -> None:
-        for camera in self._cameras.values():
-            camera.follow_demand()
-        faults = [camera.fault for camera in self._cameras.values() if camera.fault]
+        merged = self._merged.get_subscription_count() > 0
+        if not merged:
+            self._merger.clear()
+        for name, camera in self._cameras.items():
+            camera.follow_demand(self._points[name].get_subscription_count() > 0)
+            self._parts[name].follow_demand(merged)
+        faults = list(dict.fromkeys(c.fault for c in (*self._cameras.values(), *self._parts.values()) if c.fault))
         active = [name for name, camera in self._cameras.items() if camera.stream.listening]
+        active += [self.config.merged_topic] if merged else []
         message = "; ".join(faults) or (f"clouds of {', '.join(active)}" if active else "idle: no subscribers")
         values = {key: value for camera in self._cameras.values() for key, value in camera.values().items()}
+        if merged:
+            values |= {key: value for part in self._parts.values() for key, value in part.values("merged_").items()}
         self.diagnose(not faults, message, **values)
 
 

@@ -14,7 +14,7 @@ from vision_msgs.msg import Detection2D as Detection2DMsg
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.ros.convert import header, matrix_to_pose, vector
-from openarm_common.ros.detections import hypothesis, numbered
+from openarm_common.ros.detections import hypothesis, ids
 from openarm_perception.detection.detector import Detection2D
 from openarm_perception.detection.localize import LocatedObject
 from openarm_perception.detection.pipeline import Perceived
@@ -24,7 +24,7 @@ MARKER_LIFETIME = 2.0
 
 
 def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Detection2DArray:
-    """Boxes by their centre, pixels: the label, and what a network calls its shape; a box in an image has no pose.
+    """Boxes by their centre, pixels; a box in an image has no pose, and no shape but that which a network knows.
 
     Args:
         found: In the image.
@@ -32,11 +32,10 @@ def detections_2d(found: Sequence[Detection2D], frame_id: str, t_ns: int) -> Det
         t_ns: Stamp.
     """
     message = Detection2DArray(header=header(frame_id, t_ns))
-    for name, detection in zip(numbered([d.label for d in found]), found, strict=True):
+    for name, detection in zip(ids(found), found, strict=True):
         box = BoundingBox2D(size_x=float(detection.size[0]), size_y=float(detection.size[1]))
         box.center.position.x, box.center.position.y = detection.centre
-        also = (detection.kind,) if detection.kind not in ("", detection.label) else ()
-        results = [hypothesis(name, detection.score) for name in (detection.label, *also)]
+        results = [hypothesis(attribute, detection.score) for attribute in detection.attributes]
         message.detections.append(Detection2DMsg(header=message.header, results=results, bbox=box, id=name))
     return message
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from openarm_interfaces.srv import MeasureTable
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 from vision_msgs.msg import Detection2DArray, Detection3DArray
 from visualization_msgs.msg import MarkerArray
 
@@ -29,7 +29,7 @@ from openarm_common.ros.answers import answering
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import array_to_image, depth_image, intrinsics_from_info, rgb_image
 from openarm_common.ros.detections import detections_to_msg
-from openarm_common.ros.node import BASE_FRAME, QOS_SENSOR, BaseNode, reliable, run
+from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, QOS_SENSOR, BaseNode, reliable, run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_perception.config import DetectNodeConfig
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
@@ -38,12 +38,15 @@ from openarm_perception.detection.localize import Localizer
 from openarm_perception.detection.pipeline import Perceived, Pipeline, make_pipeline
 from openarm_perception.detection.robot import RobotFinder
 from openarm_perception.geometry.depth import DepthLimits, View
+from openarm_perception.geometry.watch import CameraWatch
 from openarm_perception.ros import convert
 
 #: A measurement is made of an image that is not older than this, s.
 _FRESH = 1.0
+#: A stream that is silent for so long while others come is reported, s.
+_PATIENCE = 2.0
 #: What /diagnostics counts.
-_COUNTS = ("frames", "skipped", "uncut", "refused_frames", "refused_objects")
+_COUNTS = ("frames", "skipped", "uncut", "refused_frames", "refused_objects", "withheld")
 
 
 class DetectNode(BaseNode[DetectNodeConfig]):
@@ -60,6 +63,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         limits = DepthLimits(near=camera.near, far=camera.far)
         self._colors = ColorDetector(load_config(colors, ColorDetectorConfig))
         self._localizer = Localizer(config.localizer, limits, config.table_top_z())
+        self._watch = CameraWatch(config.watch, limits, camera.intrinsics)
         self._pipeline = self._first_pipeline()
         self.accept_changes(self._take)
         #: Without depth it is unknown which pixels are the robot.
@@ -75,6 +79,8 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             self, self.description, joints=False, depth=100, wait=config.transform_wait,
             held_topic=config.held_topic if cuts else "",
         )  # fmt: skip
+        if config.table_height is None:
+            states.follow_table(self._take_table)
         # without a depth topic, objects of known height are located by colour alone
         depth = {"depth": config.depth_topic} if config.depth_topic else {}
         topics = camera_topics(config.camera, color=config.color_topic, info=config.info_topic, **depth)
@@ -82,9 +88,11 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             self, states, topics, camera.optical_frame, joints=need,
             max_rate=config.max_rate, on_frame=self._on_frame, on_refusal=self._refuse,
         )  # fmt: skip
+        calibrated = config.calibrated_topic.format(camera=config.camera)
+        self.create_subscription(CameraInfo, calibrated, self._take_calibrated, QOS_LATCHED)
         #: The newest frame whose camera pose is known, and when it came.
         self._newest: View | None = None
-        self._newest_at = self._asked_until = 0.0
+        self._newest_at = self._asked_until = self._listens_since = 0.0
         self._counts = Counter(dict.fromkeys(_COUNTS, 0))
         self._began: deque[float] = deque(maxlen=20)
 
@@ -98,9 +106,18 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         self.create_service(MeasureTable, "~/measure_table", answering(self._measure_table))
 
     def _make(self, config: DetectNodeConfig, before: Pipeline | None = None) -> Pipeline:
-        return make_pipeline(
-            config.detector, self._colors, config.network, self._localizer, config.policy, config.label, before
+        made = make_pipeline(
+            config.detector,
+            self._colors,
+            config.network,
+            self._localizer,
+            config.policy,
+            config.label,
+            before,
+            config.tag,
         )
+        made.faults = config.faults
+        return made
 
     def _first_pipeline(self) -> Pipeline:
         """Make the configured pipeline; a network that cannot be used leaves the work to the colour detector."""
@@ -113,9 +130,10 @@ class DetectNode(BaseNode[DetectNodeConfig]):
 
     def _take(self, config: DetectNodeConfig) -> None:
         """Detect as configured from the next frame on."""
-        if (config.detector, config.network) == (self.config.detector, self.config.network):
+        if all(getattr(config, name) == getattr(self.config, name) for name in ("detector", "network", "tag")):
             # valid too while colours replace a network that cannot be used
             self._pipeline.policy, self._pipeline.label = config.policy, config.label
+            self._pipeline.faults = config.faults
             return
         self._pipeline = self._make(config, self._pipeline)
         self._fallback = ""
@@ -126,9 +144,24 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         return self._stream.frames.waiting_ns
 
     @property
+    def table_height(self) -> float:
+        """What the table is taken for, base frame, m."""
+        return self._localizer.table_height
+
+    @property
     def measurable(self) -> bool:
         """Whether there is an image that the table can be measured in."""
         return self._newest is not None and time.monotonic() - self._newest_at <= _FRESH
+
+    def _take_table(self, height: float) -> None:
+        self._localizer.table_height = height
+
+    def _take_calibrated(self, info: CameraInfo) -> None:
+        """Compare with these intrinsics from now on; none: those of the calibration are not known."""
+        try:
+            self._watch.calibrated = intrinsics_from_info(info) if info.width else None
+        except OpenArmError as error:
+            self.get_logger().warning(f"intrinsics of the calibration are ignored: {error.message}")
 
     def _follow_demand(self) -> None:
         self._stream.poll()
@@ -137,8 +170,16 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         wanted = asked or any(output.get_subscription_count() for output in outputs)
         if wanted != self._stream.listening:
             self._stream.listen(wanted)
+            self._listens_since = time.monotonic()
             message = f"waiting for images of {self.config.camera}" if wanted else "idle: no subscribers"
             self.diagnose(True, message, **self._counts)
+        elif wanted and self._stream.frames.silent == ["depth"] and time.monotonic() > self._listens_since + _PATIENCE:
+            topic = self.config.depth_topic.format(camera=self.config.camera)
+            message = (
+                f"colour images come, but no depth on {topic}; with a camera that has none set depth_topic to ''"
+                " and localizer.heights (as `openarm up no_depth` does)"
+            )
+            self.diagnose(False, message, **self._counts)
 
     def _on_frame(self, frame: Frame[Any]) -> None:
         posture = frame.posture
@@ -149,7 +190,8 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             robot = self._find_robot(depth, intrinsics, posture)
             self._newest = View(rgb, depth, intrinsics, posture.T_base_frame, robot)
             self._newest_at = time.monotonic()
-            perceived = self._pipeline.run(rgb, depth, intrinsics, posture.T_base_frame, robot)
+            withheld = self._watch.look(frame.t_ns, self._newest, self.table_height)
+            perceived = self._pipeline.run(rgb, depth, intrinsics, posture.T_base_frame, robot, withheld, frame.t_ns)
         except OpenArmError as error:
             self._refuse(error)
             return
@@ -193,7 +235,13 @@ class DetectNode(BaseNode[DetectNodeConfig]):
             message += f"; the robot is taken for an object: {self._uncut}"
         else:
             values |= {f"removed/{name}": n for name, n in self._removed.items()}
-        self.diagnose(not self._fallback, message + self._fallback, **values)
+        if perceived.withheld is not None:
+            self._counts["withheld"] += 1
+            message = f"no object is a target: {perceived.withheld}; {message}"
+            self.get_logger().error(str(perceived.withheld), throttle_duration_sec=5.0)
+        alarm = self._watch.alarm
+        values["code"] = Code.OK if alarm is None else alarm.code
+        self.diagnose(not self._fallback and alarm is None, message + self._fallback, **values)
 
     def _rate(self) -> str:
         """Return the frames a second of the wall clock, over the last twenty."""
@@ -211,12 +259,7 @@ class DetectNode(BaseNode[DetectNodeConfig]):
         table = self._pipeline.measure_table(self._newest, request.block_height, request.label)
         response.height, response.std, response.tilt = table.height, table.std, table.tilt
         response.points = table.points
-        before = self._localizer.table_height
-        message = f"the table is {table.height:.4f} m high; the detector took it for {before:.4f} m"
-        if request.apply:
-            self._localizer.table_height = table.height
-            message += ", and takes what was measured now"
-        return message
+        return f"the table is {table.height:.4f} m high; the detector takes it for {self.table_height:.4f} m"
 
     def _refuse(self, error: OpenArmError) -> None:
         late = error.code in (Code.STALE_DATA, Code.NO_TRANSFORM)

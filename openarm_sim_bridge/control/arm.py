@@ -127,6 +127,11 @@ class TrajectoryFollower(Follower):
         """See `Follower.abort`."""
         self._finish(End.ABORTED, TrajectoryResult.INVALID_GOAL, why)
 
+    def stop(self, why: str) -> None:
+        """See `Follower.stop`."""
+        self._finish(End.ABORTED, TrajectoryResult.STOPPED, why)
+        super().stop(why)
+
     def start(
         self, trajectory: Trajectory, t_ns: int, measured: Array, done: Callable[[TrajectoryOutcome], None]
     ) -> None:

@@ -121,6 +121,12 @@ class RobotController:
         for follower, at in self._followers:
             follower.reset(state.position[at])
 
+    def stop(self, why: str) -> None:
+        """Hold all joints at once; hands keep what they hold, goals that run are aborted."""
+        self._commanded_ns.clear()
+        for follower, _ in self._followers:
+            follower.stop(why)
+
     def abort(self, why: str) -> None:
         """Give up all goals, because the physics diverged."""
         for follower, _ in self._followers:

@@ -105,6 +105,11 @@ class Follower(ABC):
             effort: (k,) N m or N.
         """
 
+    def stop(self, why: str) -> None:
+        """Give up a running goal and hold the present command, without a ramp: the emergency stop."""
+        self.abort(why)
+        self._hold(self._command.position)
+
     def reset(self, position: ArrayLike) -> None:
         """Hold another position, because the world was reset; a running goal is aborted."""
         self.abort("the simulated world was reset")

@@ -32,6 +32,8 @@ class TrajectoryResult(IntEnum):
     OLD_HEADER_TIMESTAMP = -3
     PATH_TOLERANCE_VIOLATED = -4
     GOAL_TOLERANCE_VIOLATED = -5
+    #: The emergency stop; the number is of this suite, control_msgs has none.
+    STOPPED = -100
 
 
 class TrajectoryError(OpenArmError):

@@ -12,10 +12,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-import yaml
 from pydantic import Field
 
-from openarm_common.config import Config, validate
+from openarm_common.config import Config, brief, parse_yaml, validate
 from openarm_common.errors import Code, OpenArmError
 
 ParametersT = TypeVar("ParametersT", bound=Config)
@@ -201,13 +200,11 @@ def parse_fault(name: str, text: str, seed: int = 0) -> Fault:
     Raises:
         OpenArmError: INVALID_ARGUMENT, as `checked_fault`, or when the text is no YAML mapping.
     """
-    try:
-        data: Any = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"parameters of {name!r} are not YAML: {error}") from error
+    data: Any = parse_yaml(text, f"parameters of {brief(name)}", Code.INVALID_ARGUMENT)
     if data is not None and not isinstance(data, dict):
         raise OpenArmError(
-            Code.INVALID_ARGUMENT, f"parameters of {name!r} are {text!r}, expected a YAML mapping such as {{key: 1.0}}"
+            Code.INVALID_ARGUMENT,
+            f"parameters of {name!r} are {brief(text)}, expected a YAML mapping such as {{key: 1.0}}",
         )
     parameters: dict[str, Any] = {} if data is None else data
     return checked_fault(name, parameters, seed)

@@ -77,6 +77,7 @@ class GripperServer(ControllerServer[GripperOutcome]):
         return self._type.result_of(outcome, self._joint)
 
     def _start(self, goal: GripperGoal, done: Callable[[GripperOutcome], None]) -> None:
+        self._simulation.check_able()
         state = self._simulation.world.read_joints()
         self._gripper.start(goal, float(state.position[self._column]), float(state.effort[self._column]), done)
 

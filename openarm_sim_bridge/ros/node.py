@@ -19,12 +19,13 @@ from typing import Any
 import mujoco
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
 
 from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.ros.node import QOS_COMMAND, BaseNode, reliable, run
-from openarm_common.scene.scene import Scene, load_scene
+from openarm_common.scene.scene import load_scene
 from openarm_sim_bridge.cameras.camera_feed import CameraFeed
 from openarm_sim_bridge.cameras.handover import CameraSetup
 from openarm_sim_bridge.config import BridgeConfig
@@ -33,8 +34,8 @@ from openarm_sim_bridge.priority import use_fifo
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.ros.camera_publisher import topic_names
 from openarm_sim_bridge.ros.fault_server import FaultServer
-from openarm_sim_bridge.ros.force_publisher import ForcePublisher
 from openarm_sim_bridge.ros.gripper_server import GripperServer
+from openarm_sim_bridge.ros.sensor_publisher import SensorPublisher
 from openarm_sim_bridge.ros.simulation_server import SimulationServer
 from openarm_sim_bridge.ros.state_publisher import StatePublisher, until_shutdown
 from openarm_sim_bridge.ros.trajectory_server import TrajectoryServer
@@ -78,7 +79,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._states = StatePublisher(
             self, self.description, world.joint_names, config.tf_rate, config.ground_truth_rate
         )
-        self._forces = ForcePublisher(self)
+        self._sensors = SensorPublisher(self)
         self._images = self._camera_feed(cameras, world.snapshot()) if config.images else None
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
 
@@ -88,7 +89,9 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             GripperServer(self, side, gripper, self._simulation, config.gripper_action)
             for side, gripper in controller.grippers.items()
         ]
-        self._sim_services = SimulationServer(self, stage, scene, self._simulation, self._on_scene)
+        self.create_service(Trigger, "/stop", self._on_stop)
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self._sim_services = SimulationServer(self, stage, scene, self._simulation)
 
         self._faults = FaultServer(
             self, self._simulation, cameras if self._images is not None else (), self._set_camera_faults
@@ -104,7 +107,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             self.create_timer(WATCH_PERIOD_S, self._images.poll, clock=self.steady_clock)
             if not self._images.wait_ready(WARM_UP_S):
                 self.get_logger().warning(f"no image yet after {WARM_UP_S:.0f} s; the simulation begins without")
-        self._on_scene(scene)
+        self._states.publish_static(self.description)
         self._simulation.start()
         self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation is running")
 
@@ -129,7 +132,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         with until_shutdown(self.context):
             joints = self._simulation.faults.publishes_joints(state.t_ns)
             self._states.publish(state, self._simulation.world, joints=joints)
-            self._forces.publish(self._simulation.world)
+            self._sensors.publish(self._simulation.world)
             if self._images is not None:
                 self._images.tick(self._simulation.world)
 
@@ -153,8 +156,20 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             logger.warning(f"/joint_commands: {names} follow a goal; ignored until it ends", throttle_duration_sec=1.0)
         self._simulation.call(lambda: self._controller.command(command))
 
-    def _on_scene(self, scene: Scene) -> None:
-        self._states.publish_static(self.description, scene.table.top_z)
+    async def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Emergency stop; the answer says that the joints hold."""
+        await self.awaitable(self._simulation.call(self._simulation.stop_motion))
+        response.success, response.message = True, "arms and hands hold; release them with /mujoco_bridge/reset"
+        self.get_logger().error(f"emergency stop: {response.message}")
+        return response
+
+    async def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Release the emergency stop."""
+        stopped = self._simulation.stopped
+        self._simulation.stopped = False
+        response.success, response.message = True, "the emergency stop is released" if stopped else "it was not latched"
+        self.get_logger().warning(response.message)
+        return response
 
     def _camera_feed(self, cameras: Mapping[str, CameraConfig], first: Snapshot) -> CameraFeed:
         topics = [name for camera in cameras.values() for name in topic_names(camera)]
@@ -196,7 +211,8 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         images = self._images
         drawn, before = images.rendered if images is not None else {}, self._drawn
         self._drawn = drawn
-        fault = simulation.fault or (images.fault if images is not None else "")
+        stopped = "the emergency stop is latched" if simulation.stopped else ""
+        fault = simulation.fault or stopped or (images.fault if images is not None else "")
         slow = not simulation.paused and config.speed > 0.0 and period.n > 100 and factor < _SLOW * config.speed
         if not fault and slow:
             fault = f"slower than requested: {factor:.2f} simulated seconds per second, expected {config.speed:g}"

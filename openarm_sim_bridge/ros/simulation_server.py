@@ -74,7 +74,6 @@ class SimulationServer:
         stage: Makes worlds.
         scene: The scene that is simulated.
         simulation: Whose world it is.
-        on_scene: Called (in a worker thread) with a scene that was loaded.
     """
 
     def __init__(
@@ -83,13 +82,11 @@ class SimulationServer:
         stage: Stage,
         scene: Scene,
         simulation: Simulation,
-        on_scene: Callable[[Scene], None],
     ) -> None:
         self._node = node
         self._stage = stage
         self._loaded = self._present = scene
         self._simulation = simulation
-        self._on_scene = on_scene
         self._changing = threading.Lock()
         serve(node, StepSimulation, "/sim/step", self._step)
         for kind, name, work in (
@@ -115,7 +112,6 @@ class SimulationServer:
                 change = partial(world.exchange, self._stage.compile(world, scene), joints, objects)
             between_ticks(self._simulation, lambda: self._simulation.restart(change))
             self._loaded = self._present = scene
-        self._on_scene(scene)
         return f"scene {scene.name!r} with {len(scene.objects)} objects"
 
     def _start_of(self, request: ResetWorld.Request, scene: Scene) -> tuple[dict[str, float], dict[str, Array]]:

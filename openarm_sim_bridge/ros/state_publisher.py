@@ -20,7 +20,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from openarm_common import se3
 from openarm_common.robot.description import BASE_LINK, SIDES, RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, matrix_to_transform, ns_to_stamp, vector
 from openarm_common.ros.node import QOS_CLOCK, QOS_LATCHED, QOS_TF, reliable
@@ -70,6 +69,8 @@ class StatePublisher:
         self._tf_static = node.create_publisher(TFMessage, "/tf_static", QOS_LATCHED)
         self._description = node.create_publisher(String, "/robot_description", QOS_LATCHED)
         self._objects = node.create_publisher(ObjectStateArray, "/sim/ground_truth/objects", reliable(5))
+        #: Time by the ticks that are published, which are fewer than there are when simulated time is fast.
+        self._published_ns = self._newest_ns = 0
         self._tf_ticks = RateDivider(tf_rate)
         self._object_ticks = RateDivider(ground_truth_rate)
         self._edges = MovingEdges(description, joint_names)
@@ -87,12 +88,11 @@ class StatePublisher:
         )
         self._description.publish(String(data=description.urdf))
 
-    def publish_static(self, description: RobotDescription, table_top_z: float) -> None:
-        """Publish the fixed edges of the description and the aliases; again when the table has changed."""
+    def publish_static(self, description: RobotDescription) -> None:
+        """Publish the fixed edges of the description and the aliases."""
         edges = [(j.parent, j.child, j.T_parent_joint) for j in description.joints.values() if j.type == "fixed"]
         edges.append((BASE_LINK, "base_link", np.eye(4)))
         edges += [(f"openarm_{side}_link0", f"{side}_arm_base", np.eye(4)) for side in SIDES]
-        edges.append((BASE_LINK, "table", se3.make(None, (0.0, 0.0, table_top_z))))
         self._tf_static.publish(TFMessage(transforms=[matrix_to_transform(*edge, 0) for edge in edges]))
 
     def publish(self, state: JointReadout, world: World, *, joints: bool = True) -> None:
@@ -103,6 +103,9 @@ class StatePublisher:
             world: The world then.
             joints: Whether the joint state is published.
         """
+        if state.t_ns != self._newest_ns:  # else it is paused
+            self._newest_ns = state.t_ns
+            self._published_ns += world.period_ns
         stamp = ns_to_stamp(state.t_ns)
         self._clock_message.clock = stamp
         self._clock.publish(self._clock_message)
@@ -112,9 +115,9 @@ class StatePublisher:
         self._effort[:] = state.effort
         if joints:
             self._joint_states.publish(self._joint_message)
-        if self._tf_ticks.due(state.t_ns):
+        if self._tf_ticks.due(self._published_ns):
             self._publish_tf(state)
-        if self._object_ticks.due(state.t_ns) and self._objects.get_subscription_count():
+        if self._object_ticks.due(self._published_ns) and self._objects.get_subscription_count():
             self._publish_objects(state.t_ns, world.objects())
 
     def _publish_tf(self, state: JointReadout) -> None:

@@ -15,7 +15,7 @@ from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action.server import ServerGoalHandle
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from openarm_common.errors import OpenArmError
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_common.types import Array
@@ -78,7 +78,9 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
             self._feedback_timer.reset()
             outcome = await self._follow(handle, lambda done: self._start(trajectory, done))
         except OpenArmError as error:
-            result = error.result if isinstance(error, TrajectoryError) else TrajectoryResult.INVALID_GOAL
+            stopped = error.code is Code.STOPPED
+            refused = TrajectoryResult.STOPPED if stopped else TrajectoryResult.INVALID_GOAL
+            result = error.result if isinstance(error, TrajectoryError) else refused
             outcome = TrajectoryOutcome(End.ABORTED, result, f"{error.code}: {error.message}")
         if self._running is handle:
             self._running = None

@@ -24,7 +24,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES, RobotDescription, Side
 from openarm_common.scene.scene import Scene
 from openarm_sim_bridge.world import scenery
-from openarm_sim_bridge.world.touch import add_wrist_sensor, hand_link
+from openarm_sim_bridge.world.touch import add_hand_sensors, hand_link
 from openarm_sim_bridge.world.world import compiled_model
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -206,7 +206,7 @@ def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: Side,
         joint.armature = physics.arm_armature[i]
         joint.actfrclimited = False  # one limit is enough: the actuator's
         _add_servo(spec, description, name, physics.arm_kp[i], physics.arm_kv[i], effort)
-    add_wrist_sensor(spec, hand_link(side))
+    add_hand_sensors(spec, hand_link(side))
     tcp = description.tcp_link(side)
     spec.body(tcp).add_site(name=tcp, size=(0.004, 0.004, 0.004), group=4)
 

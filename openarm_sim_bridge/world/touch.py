@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated force sensors: the wrench at a wrist, and the contact force on a finger pad.
+"""Simulated sensors: the wrench at a wrist, an IMU on the hand, and the contact force on a finger pad.
 
-Forces are N, torques N m, in the frame of the body that carries the sensor.
+Forces are N, torques N m, accelerations m/s2, rates rad/s, in the frame of the body that carries the sensor.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from openarm_common.types import Array
 
 
 def hand_link(side: str) -> str:
-    """Return the link that carries the wrist's force-torque sensor."""
+    """Return the link that carries the wrist's force-torque sensor, and an IMU in its origin."""
     return f"openarm_{side}_hand"
 
 
@@ -22,11 +22,19 @@ def pad_links(side: str) -> tuple[str, str]:
     return f"openarm_{side}_left_finger", f"openarm_{side}_right_finger"
 
 
-def add_wrist_sensor(spec: mujoco.MjSpec, body: str) -> None:
-    """Add a force-torque sensor to a body: `{body}_force` and `{body}_torque`."""
-    site = f"{body}_wrench"
+_HAND_SENSORS = {
+    "force": mujoco.mjtSensor.mjSENS_FORCE,
+    "torque": mujoco.mjtSensor.mjSENS_TORQUE,
+    "gyro": mujoco.mjtSensor.mjSENS_GYRO,
+    "accelerometer": mujoco.mjtSensor.mjSENS_ACCELEROMETER,
+}
+
+
+def add_hand_sensors(spec: mujoco.MjSpec, body: str) -> None:
+    """Add a force-torque sensor and an IMU to a body: sensors `{body}_force`, `_torque`, `_gyro`, `_accelerometer`."""
+    site = f"{body}_sensors"
     spec.body(body).add_site(name=site, size=(0.004, 0.004, 0.004), group=4)
-    for kind, what in ((mujoco.mjtSensor.mjSENS_FORCE, "force"), (mujoco.mjtSensor.mjSENS_TORQUE, "torque")):
+    for what, kind in _HAND_SENSORS.items():
         spec.add_sensor(name=f"{body}_{what}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site)
 
 
@@ -35,9 +43,19 @@ def wrist_wrench(data: mujoco.MjData, body: str) -> tuple[Array, Array]:
 
     Args:
         data: The state after a step.
-        body: With a wrist sensor.
+        body: With hand sensors.
     """
     return data.sensor(f"{body}_force").data.copy(), data.sensor(f"{body}_torque").data.copy()
+
+
+def imu(data: mujoco.MjData, body: str) -> tuple[Array, Array]:
+    """Return rate of turn and acceleration (3,) of a body in its frame; at rest, 9.81 m/s2 upwards as a real IMU.
+
+    Args:
+        data: The state after a step.
+        body: With hand sensors.
+    """
+    return data.sensor(f"{body}_gyro").data.copy(), data.sensor(f"{body}_accelerometer").data.copy()
 
 
 def contact_wrench(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> tuple[Array, Array]:

@@ -25,7 +25,7 @@ from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import SceneObject
 from openarm_common.types import Array
-from openarm_sim_bridge.world.touch import contact_wrench, wrist_wrench
+from openarm_sim_bridge.world.touch import contact_wrench, imu, wrist_wrench
 
 Index = NDArray[np.intp]
 
@@ -187,6 +187,10 @@ class World:
     def wrist_wrench(self, body: str) -> tuple[Array, Array]:
         """Return the force and torque (3,) of the wrist sensor of a body, in its frame; as `touch.wrist_wrench`."""
         return wrist_wrench(self.data, body)
+
+    def imu(self, body: str) -> tuple[Array, Array]:
+        """Return rate of turn and acceleration (3,) of the IMU of a body, in its frame; as `touch.imu`."""
+        return imu(self.data, body)
 
     def pad_wrench(self, link: str) -> tuple[Array, Array]:
         """Return contact force and torque (3,) on the pad of a finger link, in its frame: a simulated sensor."""

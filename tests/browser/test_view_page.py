@@ -37,7 +37,7 @@ class StandIns:
         from octomap_msgs.msg import Octomap
         from openarm_interfaces.action import Pick
         from openarm_interfaces.msg import GraspStatus
-        from openarm_interfaces.srv import ResetWorld
+        from openarm_interfaces.srv import ConfirmPlan, ResetWorld
         from rclpy.action import ActionServer, CancelResponse
         from rclpy.callback_groups import ReentrantCallbackGroup
         from rclpy.context import Context
@@ -54,6 +54,7 @@ class StandIns:
 
         self.picks: list[Any] = []
         self.resets: list[Any] = []
+        self.answers: list[tuple[str, bool]] = []
         self._context = Context()
         rclpy.init(context=self._context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
         self._node = node = rclpy.create_node("stand_ins", context=self._context)
@@ -91,6 +92,7 @@ class StandIns:
         self.detections = sent[2][1]
         node.create_timer(0.1, lambda: [out.publish(message) for out, message in sent])
         group = ReentrantCallbackGroup()
+        node.create_service(ConfirmPlan, "/grasp/confirm", self._confirm)
         node.create_service(ResetWorld, "/sim/reset_world", self._reset)
         self._action = ActionServer(
             *(node, Pick, "/grasp/pick", self._pick),
@@ -101,8 +103,11 @@ class StandIns:
         self._thread = threading.Thread(target=self._executor.spin, daemon=True)
         self._thread.start()
 
-    def say(self, state: str, reason: str, attempt: int = 0, *, label: str = "blue", arm: str = "left") -> None:
-        self._status.publish(self._step(state=state, reason=reason, attempt=attempt, label=label, arm=arm))
+    def say(
+        self, state: str, reason: str, attempt: int = 0, *, label: str = "blue", arm: str = "left", plan_id: str = ""
+    ) -> None:
+        step = self._step(state=state, reason=reason, attempt=attempt, label=label, arm=arm, plan_id=plan_id)
+        self._status.publish(step)
 
     def close(self) -> None:
         self._executor.shutdown()
@@ -113,6 +118,11 @@ class StandIns:
     def _reset(self, request: Any, response: Any) -> Any:
         self.resets.append(request)
         response.success, response.message = True, "the world is as it was"
+        return response
+
+    def _confirm(self, request: Any, response: Any) -> Any:
+        self.answers.append((request.plan_id, request.accept))
+        response.success, response.message = request.accept, "" if request.accept else "no plan waits"
         return response
 
     def _pick(self, goal: Any) -> Any:
@@ -255,6 +265,7 @@ def test_the_page_shows_the_graph_and_asks_it(stand_ins: StandIns, open_tab: Any
         await tab.until("document.querySelector('#pick').textContent === 'Pick blue'")
         await tab.click("#arms label:nth-of-type(2)")
         await tab.click(".switch")
+        await tab.click(".switch:nth-of-type(2)")
         await tab.click("#pick")
         await tab.until("document.querySelector('#state').textContent === 'Lift'")
         assert await tab.js("document.querySelector('#pick').disabled")
@@ -263,6 +274,17 @@ def test_the_page_shows_the_graph_and_asks_it(stand_ins: StandIns, open_tab: Any
         await tab.until("document.querySelector('#outcome').textContent.startsWith('CANCELLED: cancelled while')")
         await tab.click("#shuffle")
         await tab.until("document.querySelector('#world-answer').textContent === 'the world is as it was'")
+
+        # a plan that waits is confirmed or rejected; it needs no other request
+        await tab.until("document.querySelector('#confirm').hidden")
+        for button in ("run", "reject"):
+            stand_ins.say("PLAN", f"grasp blue; plan '{button}' waits", 1, plan_id=button)
+            await tab.until(f"document.querySelector('#reason').textContent.includes({button!r})")
+            await shoot(tab, f"confirm_{button}")
+            await tab.click(f"#{button}")
+        await tab.until("document.querySelector('#confirm-answer').textContent === 'REFUSED: no plan waits'")
+        stand_ins.say("IDLE", "rejected", label="blue")
+        await tab.until("document.querySelector('#confirm').hidden")
 
         # of two at once each step says whose it is
         stand_ins.say("PLACE", "carrying", 1, label="red", arm="right")
@@ -284,5 +306,6 @@ def test_the_page_shows_the_graph_and_asks_it(stand_ins: StandIns, open_tab: Any
         assert tab.complaints == []
 
     with_page(open_tab, walk)
-    assert [(pick.label, pick.arm, pick.dry_run) for pick in stand_ins.picks] == [("blue", "left", True)]
+    assert [(p.label, p.arm, p.dry_run, p.confirm) for p in stand_ins.picks] == [("blue", "left", True, True)]
+    assert stand_ins.answers == [("run", True), ("reject", False)]
     assert [reset.scene for reset in stand_ins.resets] == ["random"]

@@ -36,6 +36,10 @@ class Asked(Generic[T]):
         except BaseException as error:
             self._future.set_exception(error)
 
+    def done(self) -> bool:
+        """Return whether there is an answer."""
+        return self._future.done()
+
     def result(self, timeout: float) -> T:
         """Return the answer."""
         return self._future.result(timeout)

@@ -17,7 +17,8 @@ from typing import Any
 import psutil
 import pytest
 
-from openarm_bringup.supervision.runs import RunRecord, state_dir
+from openarm_bringup.supervision.runs import RunRecord
+from openarm_bringup.supervision.state import state_dir
 from openarm_common.domain import reserve_domain
 
 ROOT = Path(__file__).parents[2]

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import resource
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import psutil
 import pytest
 import rclpy
 from control_msgs.action import ParallelGripperCommand
@@ -89,6 +91,32 @@ def test_step_1_robot_alone_publishes_its_joints_and_moves_a_gripper(robot: Any)
         result = act(node, executor, ParallelGripperCommand, "/left_gripper_controller/gripper_cmd", goal)
         assert result.reached_goal
         assert result.state.position[0] == pytest.approx(0.04, abs=0.002)
+
+
+@pytest.mark.requirement("R-26")
+def test_commands_cost_little_next_to_the_graph_and_work_when_their_daemon_has_died(robot: Any) -> None:
+    def daemons() -> list[psutil.Process]:
+        children = psutil.Process(robot.process.pid).children()
+        return [child for child in children if "openarm_bringup.daemon" in child.cmdline()]
+
+    def cpu_s(*words: str) -> float:
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        done = robot.openarm(*words)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout
+        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+    looks = ("topic list", "topic echo /joint_states -n 1", "param get mujoco_bridge scene", "tf echo world wrist_link")
+    # CPU time, not the clock: tests run next to other work. One that joins the graph takes 2 s.
+    answered = [min(cpu_s(*look.split()) for _ in range(3)) for look in looks]
+    assert max(answered) < 0.6
+    (daemon,) = daemons()
+    daemon.kill()
+    for look in looks:
+        assert cpu_s(*look.split()) > 0.0
+    assert robot.record()["ready"]
+    assert daemon.pid not in [other.pid for other in daemons()]
 
 
 @pytest.mark.requirement("P-34")

@@ -77,7 +77,16 @@ def _settled(node: Node) -> dict[str, list[str]]:
 
 def _stated_publishers() -> dict[str, list[str]]:
     rows = [(name, rest.split("|")[1].strip()) for name, kind, rest in ROW.findall(INTERFACES) if "/msg/" in kind]
-    everyone = ["calibration_publisher", "cloud", "detector", "grasp", "motion", "mujoco_bridge", "octomap"]
+    everyone = [
+        "calibration_publisher",
+        "cloud",
+        "detector",
+        "flight_recorder",
+        "grasp",
+        "motion",
+        "mujoco_bridge",
+        "octomap",
+    ]
     everyone.append("wrist_detector")
     return {name: everyone if who == "all" else sorted(w.strip() for w in who.split(",")) for name, who in rows}
 
@@ -149,6 +158,16 @@ def test_parameters_exist_at_their_nodes(graph: Node) -> None:
         rclpy.spin_until_future_complete(graph, answer, timeout_sec=20.0)
         assert answer.done(), f"no answer of {node}"
         assert names <= set(answer.result().result.names), node
+
+
+@pytest.mark.requirement("P-31")
+def test_who_takes_images_unasked_is_a_lifecycle_node(graph: Node) -> None:
+    _settled(graph)
+    managed = {node for name, (kind, node) in _services(graph).items() if kind == "lifecycle_msgs/srv/ChangeState"}
+    assert managed == {"octomap", "flight_recorder"}
+    for topic in ("/overhead/color/image_raw", "/overhead/depth/image_raw", "/wrist/depth/image_raw"):
+        taking = {info.node_name for info in graph.get_subscriptions_info_by_topic(topic)}
+        assert taking <= managed, topic
 
 
 @pytest.mark.requirement("A-73")

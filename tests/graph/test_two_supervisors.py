@@ -66,9 +66,14 @@ def test_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_hold
         for arm in ("left", "right"):
             assert motion.move_to_named(arm, "home").success, "the arms are under control"
 
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 40.0
         while vision.record()["health"] != "degraded, without detector, wrist_detector":
             assert time.monotonic() < deadline, vision.record()
+        assert result.recording, "a failed grasp leaves a recording"
+        recording = Path(result.recording)
+        while not recording.is_dir():  # it is written after the answer
+            assert time.monotonic() < deadline, f"{recording} was not written"
+            time.sleep(0.1)
         observer.forget()
         observer.wait(lambda: observer.joints() or None, 20.0, "joint states")
         doctor = pool.submit(control.openarm, "doctor", "--json")
@@ -82,6 +87,8 @@ def test_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_hold
         assert len(positions) > 50
     assert np.abs(positions - positions[0]).max() < 0.01
     assert "node detector" in [finding["name"] for finding in findings if finding["level"] == "error"]
+    listed = [finding for finding in findings if finding["name"] == "recordings" and finding["level"] == "note"]
+    assert recording.name in listed[0]["observed"], "what the failed grasp has left"
     states = {name: node["state"] for name, node in vision.record()["nodes"].items()}
     assert {name for name, state in states.items() if state != "ready"} == {"detector", "wrist_detector"}
     assert vision.stop() == 0

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader
 from type_description_interfaces.srv import GetTypeDescription
 
 from openarm_bringup.bags.bag import BagWriter
-from openarm_bringup.bags.ros.recorder import from_profile
+from openarm_bringup.bags.ros.listener import from_profile
 from openarm_common.ros.node import QOS_SENSOR
 
 _MESSAGES = {

@@ -19,8 +19,9 @@ from openarm_perception.ros.cloud_node import CloudNode
 from tests.nodes.octomap_bench import FRAME, JOINTS, ROBOT, Bench, sheet
 
 MS = 1_000_000
-#: The left arm moves by so much, rad, from 3 ms before the stamp of the image to 12 ms after it.
+#: The left arm moves by so much, rad, from 3 ms before the stamp of the image to 12 ms after it, at so many rad/s.
 SWEEP = 0.5
+SPEED = SWEEP / 0.015
 
 
 class Arm(Bench):
@@ -39,7 +40,8 @@ class Arm(Bench):
     def state_at(self, offset_ms: int, q: float) -> None:
         """A joint state next to the stamp of the image."""
         position = [q if name == "openarm_left_joint1" else 0.0 for name in JOINTS]
-        state = JointState(name=list(JOINTS), position=position)
+        velocity = [SPEED if name == "openarm_left_joint1" else 0.0 for name in JOINTS]
+        state = JointState(name=list(JOINTS), position=position, velocity=velocity)
         state.header.stamp = ns_to_stamp(self.t_ns + offset_ms * MS)
         self.joints.publish(state)
 

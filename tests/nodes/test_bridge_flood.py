@@ -83,7 +83,7 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp
     try:
         ros.spin_until(lambda: published and diagnostics, 30.0, "the bridge")
         flood = run("-c", FLOOD, "4000")
-        ros.spin_until(lambda: int(status().get("commands_per_s", 0)) > 1000, 20.0, "the flood to be counted")
+        ros.spin_until(lambda: int(status().get("commands_per_s", 0)) > 300, 20.0, "the flood to be counted")
         published.clear()
         ros.spin_until(lambda: len(published) > 400, 20.0, "four seconds of joint states")
         periods = np.diff(published) * 1e-6

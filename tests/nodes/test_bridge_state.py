@@ -10,6 +10,7 @@ import sys
 import time
 
 import numpy as np
+import psutil
 import pytest
 from builtin_interfaces.msg import Duration
 from control_msgs.action import FollowJointTrajectory
@@ -19,7 +20,7 @@ from rclpy.action import ActionClient
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Image, JointState
+from sensor_msgs.msg import Image, Imu, JointState
 from std_msgs.msg import Float64, String
 from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -28,6 +29,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import (
     stamp_to_ns,
     transform_to_matrix,
+    xyz,
 )
 from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, QOS_STATIC_TF, QOS_TF, reliable
 from openarm_sim_bridge.ros.state_publisher import JOINT_STATE_DEADLINE
@@ -92,12 +94,14 @@ def test_names_types_and_qos(seeing) -> None:
 @pytest.mark.requirement("A-18", "A-19")
 def test_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
     factors = bench.collect(Float64, "/sim/real_time_factor", 5)
+    reports = bench.collect(DiagnosticArray, "/diagnostics", QOS_COMMAND)
     clocks = bench.collect(Clock, "/clock", QOS_CLOCK)
     bench.spin_sim(1.0)  # discovery is over
+    psutil.cpu_percent()  # from here on
     first, wall = bench.t_ns, time.monotonic()
     bench.spin_sim(3.0)
     ratio = (bench.t_ns - first) * 1e-9 / (time.monotonic() - wall)
-    assert ratio == pytest.approx(1.0, abs=0.1)
+    assert ratio == pytest.approx(1.0, abs=0.02)
     steps = np.diff([stamp_to_ns(m.header.stamp) for m in bench.joints])
     assert np.mean(steps == 10_000_000) > 0.98  # a tick each; a starved probe may miss some
     assert np.all(steps % 10_000_000 == 0)
@@ -105,7 +109,39 @@ def test_hundred_hertz_in_step_with_the_wall_clock(bench) -> None:
     assert factors
     assert factors[-1].data == pytest.approx(1.0, abs=0.1)
     assert len(clocks) > 300
-    assert np.median(np.diff(bench.joint_arrivals[-300:])) == pytest.approx(0.01, abs=0.0015)
+
+    def in_time() -> bool:
+        """Of the last three seconds as they arrived, on two cores; where others take both, the bridge must say so."""
+        intervals = np.diff(bench.joint_arrivals[-300:])
+        if np.mean(intervals) == pytest.approx(0.01, rel=0.02) and np.percentile(intervals, 99) < 0.015:
+            return True
+        late = any("late: " in status.message for report in reports[-10:] for status in report.status)
+        return late and psutil.cpu_percent() > 90.0
+
+    bench.ros.spin_until(in_time, 30.0, "100 Hz, and p99 below 15 ms")
+
+
+@pytest.mark.requirement("A-24")
+def test_the_imu_of_a_hand_publishes_gravity_at_rest_and_the_rate_of_a_turning_joint(bench) -> None:
+    imus: list[Imu] = bench.collect(Imu, "/right_imu_sensor_broadcaster/imu", QOS_SENSOR)
+    bench.ros.spin_until(lambda: imus, 20.0, "the IMU")
+    at_rest = imus[-1]
+    assert at_rest.header.frame_id == "openarm_right_hand"
+    assert at_rest.orientation_covariance[0] == -1.0
+    R = bench.tcp_pose()[:3, :3]  # the TCP is not turned against the hand
+    np.testing.assert_allclose(R @ xyz(at_rest.linear_acceleration), [0.0, 0.0, 9.81], atol=0.1)
+    imus.clear()
+    away = [*bench.HOME[:6], 1.0]
+    handle, future = bench.follow(bench.goal((1.0, away)))
+    assert handle.accepted
+    bench.ros.result(future, 30.0)
+    joint, rates = bench.joints[-1].name.index("openarm_right_joint7"), {}
+    for state in bench.joints:
+        rates[stamp_to_ns(state.header.stamp)] = state.velocity[joint]
+    pairs = [(xyz(m.angular_velocity), rates.get(stamp_to_ns(m.header.stamp))) for m in imus]
+    turned = [(np.linalg.norm(gyro), abs(rate)) for gyro, rate in pairs if rate is not None and abs(rate) > 0.3]
+    assert len(turned) > 20
+    np.testing.assert_allclose(*np.transpose(turned), atol=0.05)
 
 
 @pytest.mark.requirement("A-04")
@@ -151,9 +187,9 @@ def test_the_tree_of_frames_is_complete_and_has_no_gaps(bench) -> None:
         ("base_link", "openarm_body_link0"),
         ("left_arm_base", "openarm_left_link0"),
         ("right_arm_base", "openarm_right_link0"),
-        ("table", "openarm_body_link0"),
     ):
         assert parents[alias] == parent
+    assert "table" not in parents, "where it is simulated is no node's business"
     assert set(parents.values()) - set(parents) == {"world"}  # one root
     stamps = np.array([stamp_to_ns(m.transforms[0].header.stamp) for m in moving]) * 1e-9
     assert np.diff(stamps).max() <= 0.1

@@ -88,17 +88,35 @@ def test_filtered_points_from_metres(ros) -> None:
     assert bench.clouds[0].is_dense
 
 
-@pytest.mark.requirement("A-50", "A-51")
-def test_filters_thin_the_cloud(ros) -> None:
-    """One point a centimetre, flying pixels gone."""
-    bench = Bench(ros, organised=False, **{"filter.voxel": 0.01, "filter.flying": 0.03, "filter.median": 3})
+@pytest.mark.requirement("A-50")
+def test_one_point_a_centimetre_after_the_voxel_filter(ros) -> None:
+    """No two in a cell, every cell of the surface has one."""
+    bench = Bench(ros, organised=False, **{"filter.voxel": 0.01})
     bench.watch()
-    depth = flat()
-    depth[100, 100] = 900
-    bench.pump(depth, "16UC1", lambda: bench.clouds, "a cloud")
-    points = points_from_cloud(bench.clouds[0])
-    assert 5000 < len(points) < 12000
+    bench.pump(flat(), "16UC1", lambda: bench.clouds, "a cloud")
+    points = points_from_cloud(bench.clouds[0]).astype(np.float64)
+    cells = np.unique(np.floor(points[:, :2] / 0.01 + 1e-6), axis=0)
+    assert len(cells) >= 0.999 * len(points)
+    width, height = 640 / K.fx * 0.7, 480 / K.fy * 0.7
+    assert len(points) == pytest.approx(width * height / 1e-4, rel=0.05)
     np.testing.assert_allclose(points[:, 2], 0.7, atol=1e-3)
+
+
+@pytest.mark.parametrize("dropped", [False, True])
+@pytest.mark.requirement("A-51")
+def test_flying_pixels_are_dropped_as_statistical_outliers(ros, dropped: bool) -> None:
+    """With k = 20 and 2 sigma pixels between the near and the far surface go, the surfaces stay."""
+    depth, rng = np.zeros((480, 640), np.uint16), np.random.default_rng(3)
+    depth[120:360, 160:480], depth[180:300, 220:420] = 700, 600
+    v, u = rng.choice(np.arange(180, 300), 60, replace=False), rng.choice((219, 420), 60)
+    depth[v, u] = rng.integers(630, 670, 60)
+    bench = Bench(ros, organised=False, **{"filter.outliers": dropped})
+    bench.watch()
+    bench.pump(depth, "16UC1", lambda: bench.clouds, "a cloud")
+    z = points_from_cloud(bench.clouds[0])[:, 2]
+    flying = np.count_nonzero((z > 0.61) & (z < 0.69))
+    assert flying <= 3 if dropped else flying == 60
+    assert np.count_nonzero(z >= 0.69) + np.count_nonzero(z <= 0.61) >= 0.97 * (240 * 320 - 60)
 
 
 def test_colour_comes_with_the_points_when_asked_for(ros) -> None:
@@ -124,7 +142,7 @@ def test_colour_comes_with_the_points_when_asked_for(ros) -> None:
     "params", [{"filter.voxel": 0.01}, {"filter.outliers": True}, {"color": True, "organised": False}]
 )
 def test_what_takes_points_away_is_not_organised(ros, params) -> None:
-    with pytest.raises(OpenArmError, match="organised"):
+    with pytest.raises(OpenArmError, match=r"set organised to (false as well .--set cloud|true, or color)"):
         CloudNode(parameter_overrides=[Parameter(k, value=v) for k, v in params.items()])
 
 

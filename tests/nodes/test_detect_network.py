@@ -11,11 +11,13 @@ import pytest
 from rclpy.parameter import Parameter
 
 from openarm_bringup.ros.object_client import DetectionListener
+from openarm_common import se3
 from openarm_common.ros.convert import pose_to_matrix, stamp_to_ns
-from openarm_common.ros.detections import UNKNOWN
-from openarm_perception.detection.attributes import parse, resolve
-from tests.nodes.detect_bench import TABLE, Bench, FakeCamera
+from openarm_common.ros.detections import UNKNOWN, detections_from_msg
+from openarm_common.wanted import select
+from tests.nodes.detect_bench import TABLE, TOP, Bench, FakeCamera
 from tests.openarm_perception.onnx_file import boxes, write_network
+from tests.tag_paint import paint
 
 
 @pytest.fixture
@@ -55,11 +57,15 @@ def becomes(bench: Bench, *expected: list[str]) -> None:
         ("color", ["red", "box"]),
         ("network", ["red", "box"]),
         ("both", ["red", "box"]),
+        ("tag", ["tag_7", "red", "box"]),
         ("anything", ["anything", "box"]),
     ],
 )
 @pytest.mark.requirement("P-17")
 def test_every_detector_finds_the_box_behind_the_same_topic(ros, camera, model, detector, called) -> None:
+    if detector == "tag":
+        T_camera_top = se3.inverse(camera.T_base_optical) @ se3.make(se3.rot_z(0.3), (0.30, -0.20, TOP))
+        paint(camera.rgb, camera.depth, camera.K, T_camera_top, 7, 0.024)
     bench = Bench(ros, camera=camera, detector=detector, **{"network.model": model})
     (found,) = bench.detect().detections
     assert [r.hypothesis.class_id for r in found.results] == called
@@ -87,7 +93,7 @@ def test_the_detector_is_switched_while_it_runs(ros, camera, model, tmp_path) ->
     assert not refused.successful
     assert "there is no network nothing.onnx; models: " in refused.reason
     (refused,) = change(bench, detector="hearing")
-    assert "'color', 'network', 'both' or 'anything'" in refused.reason
+    assert "'color', 'network', 'both', 'tag' or 'anything'" in refused.reason
     (refused,) = change(bench, network__threshold=1.5)
     assert "less than 1" in refused.reason
     (refused,) = change(bench, network__classes=["pear"])
@@ -150,6 +156,28 @@ def test_what_only_colour_sees_is_reported_but_not_given_to_be_grasped(ros, came
     bench.said("the network detects nothing there; it is observed again")
 
 
+@pytest.mark.requirement("R-18", "B-18")
+@pytest.mark.parametrize("detector", ["network", "both"])
+def test_classes_of_a_users_own_network_are_told_from_colour_and_shape(ros, camera, tmp_path, detector) -> None:
+    """Plain class ids for any consumer; the id says which is which; the order is the same in the image and in space."""
+    rows, columns = camera.patch
+    box = (columns.start, rows.start, columns.stop, rows.stop, 1, 0.8)
+    names = str(["mug", "Coca Cola 1/2"])
+    path = write_network(tmp_path / "own.onnx", boxes(box), (1, 3, 480, 640), names)
+    bench = Bench(ros, camera=camera, detector=detector, **{"network.model": str(path)})
+    (found,) = bench.detect().detections
+    assert [r.hypothesis.class_id for r in found.results] == ["Coca Cola 1/2", "red", "box"]
+    assert found.id == "Coca Cola 1%2F2/red/box"
+    (thing,) = detections_from_msg(bench.watch.got[-1])
+    assert (thing.name, thing.color, thing.kind) == ("Coca Cola 1/2", "red", "box")
+    for words in ("coca cola 1/2", "red", "box", "red Coca Cola 1/2 box"):
+        assert select(words, [thing]) == (thing,)
+    assert change(bench, label="mug")[0].successful
+    becomes(bench)
+    assert change(bench, label="red coca cola 1/2")[0].successful
+    becomes(bench, ["Coca Cola 1/2", "red", "box"])
+
+
 def test_requests_in_words_are_answered_by_the_running_detector(ros, camera, model) -> None:
     """`openarm detector find`: labels and shapes of the hypotheses, places and extents of the boxes."""
     bench = Bench(ros, camera=camera, detector="both", **{"network.model": model})
@@ -157,7 +185,7 @@ def test_requests_in_words_are_answered_by_the_running_detector(ros, camera, mod
         answer = pool.submit(listener.next, 20.0)
         bench.pump(answer.done, "the listener hears the detector")
     things = answer.result()
-    found = resolve(parse("the leftmost red box", [thing.label for thing in things]), things)
+    found = select("the leftmost red box", things)[0]
     assert (found.label, found.kind) == ("red", "box")
     np.testing.assert_allclose(found.p_base, (0.30, -0.20, TABLE + 0.025), atol=0.002)
     np.testing.assert_allclose(found.size, (0.04, 0.06, 0.05), atol=0.0025)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from openarm_common.ros.convert import (
     pose_to_matrix,
     stamp_to_ns,
 )
-from openarm_common.ros.node import BASE_FRAME, QOS_SENSOR
+from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, QOS_SENSOR
 from openarm_perception.ros.detector_node import DetectNode
 from tests.nodes.detect_bench import MS, TABLE, TOP, Bench, FakeCamera, Watch
 
@@ -41,7 +42,7 @@ def test_a_box_is_found_where_it_stands(bench) -> None:
     assert message.header.frame_id == BASE_FRAME
     assert stamp_to_ns(message.header.stamp) % (200 * MS) == 0
     (found,) = message.detections
-    assert found.id == "red"
+    assert found.id == "/red/box"
     assert found.results[0].hypothesis.class_id == "red"
     assert 0.5 < found.results[0].hypothesis.score <= 1.0
     T = pose_to_matrix(found.bbox.center)
@@ -51,6 +52,36 @@ def test_a_box_is_found_where_it_stands(bench) -> None:
     size = found.bbox.size
     np.testing.assert_allclose((size.x, size.y, size.z), (0.04, 0.06, 0.05), atol=0.0015)
     assert found.results[0].pose.covariance[0] > 0.0
+
+
+@pytest.mark.requirement("N-03")
+def test_objects_are_missed_by_injection_while_the_node_runs(bench) -> None:
+    """All of them, or a share of the frames; the same seed and stamps miss the same."""
+    assert len(bench.detect().detections) == 1
+
+    def set_faults(**values: float) -> bool:
+        answers = bench.node.set_parameters([Parameter(f"faults.{k}", value=v) for k, v in values.items()])
+        return all(answer.successful for answer in answers)
+
+    def becomes(count: int) -> None:
+        """An answer to a frame from before the change may still be on its way."""
+        bench.pump(lambda: len(bench.watch.got[-1].detections) == count, f"frames with {count} objects")
+
+    assert set_faults(miss_share=1.0)
+    becomes(0)
+    assert not set_faults(miss_share=-0.5)
+    assert set_faults(miss_share=0.5, seed=3)
+    bench.watch.got.clear()
+    bench.detect()
+    bench.pump(lambda: {len(m.detections) for m in bench.watch.got} == {0, 1}, "frames with the object and without")
+    faults = bench.node.config.faults
+    for message in bench.watch.got[1:]:
+        expected = len(faults.seen(["red"], stamp_to_ns(message.header.stamp)))
+        assert len(message.detections) == expected
+    assert set_faults(miss_share=0.0)
+    bench.watch.got.clear()
+    bench.detect()
+    becomes(1)
 
 
 @pytest.mark.requirement("B-31", "B-62")
@@ -64,8 +95,16 @@ def test_without_a_depth_topic_an_object_of_known_height_is_found_by_its_silhoue
     np.testing.assert_allclose((size.x, size.y, size.z), (0.04, 0.06, 0.05), atol=0.0015)
 
 
+@pytest.mark.requirement("B-31")
+def test_a_camera_without_depth_is_named_with_what_to_do(ros) -> None:
+    camera = FakeCamera(ros)
+    bench = Bench(ros, camera=camera)
+    ros.node.destroy_publisher(camera.pubs.pop("depth"))
+    bench.said("no depth on /overhead/depth/image_raw; with a camera that has none set depth_topic")
+
+
 @pytest.mark.requirement("B-63")
-def test_the_height_of_the_table_is_measured_from_its_surface_or_a_block_and_applied(ros, bench) -> None:
+def test_the_height_of_the_table_is_measured_from_its_surface_or_a_block(ros, bench) -> None:
     """The detector is configured with 0.41 m; the camera sees 0.40 m."""
     camera = FakeCamera(ros)
     camera.publish_mount()
@@ -90,11 +129,10 @@ def test_the_height_of_the_table_is_measured_from_its_surface_or_a_block_and_app
     assert surface.tilt < 0.002
     assert surface.std < 0.001
     assert surface.points > 10_000
-    block = ask(block_height=0.048, label="red", apply=True)  # the block is given 2 mm too low
+    block = ask(block_height=0.048, label="red")  # the block is given 2 mm too low
     assert block.success, block.message
     assert block.height == pytest.approx(TOP - 0.048, abs=0.0005)
-    assert "takes what was measured now" in block.message
-    assert ask(block_height=0.048).message.count(f"{block.height:.4f}") == 2
+    assert f"{block.height:.4f} m high; the detector takes it for 0.4100 m" in block.message
     for fields, text in (({"block_height": 3.0}, "0.005 .. 0.5"), ({"block_height": 0.05, "label": "blue"}, "'blue'")):
         assert text in ask(**fields).message
 
@@ -206,8 +244,39 @@ def test_positions_follow_the_camera_info(bench) -> None:
     """Twice the focal length in the CameraInfo, half the size: the node has no other source."""
     whole = bench.detect().detections[0].bbox.size.y
     K = bench.camera.K
-    bench.camera.K = type(K)(K.width, K.height, 2.0 * K.fx, 2.0 * K.fy, K.cx, K.cy)
+    bench.camera.K = replace(K, fx=2.0 * K.fx, fy=2.0 * K.fy)
     assert bench.detect().detections[0].bbox.size.y == pytest.approx(whole / 2.0, rel=0.05)
+
+
+@pytest.mark.requirement("A-32", "R-15")
+def test_what_is_seen_with_wrong_intrinsics_is_an_obstacle_but_no_target_and_diagnostics_say_why(ros, bench) -> None:
+    """Those of the configuration are loosely compared; those of the calibration to five pixels, while there are any."""
+    calibrated = ros.node.create_publisher(CameraInfo, "/calibration/overhead/camera_info", QOS_LATCHED)
+    right = bench.camera.K
+
+    def variances() -> float:
+        (found,) = bench.detect().detections
+        return found.results[0].pose.covariance[0]
+
+    def status() -> tuple[int, str]:
+        (status,) = (s for s in bench.diagnostics.got[-1].status if s.name == "detector: status")
+        return int.from_bytes(status.level), {v.key: v.value for v in status.values}["code"]
+
+    assert variances() > 0.0
+    bench.camera.K = replace(right, fx=1.1 * right.fx, fy=1.1 * right.fy)
+    assert variances() == -1.0, "one frame is no alarm"
+    bench.said("INTRINSICS_MISMATCH: camera_info (fx 457.3, fy 457.3, cx 319.5, cy 239.5) is up to 40 pixels off")
+    assert variances() == -2.0
+    ros.spin_until(lambda: status() == (2, "INTRINSICS_MISMATCH"), 10.0, "diagnostics with the code")
+    bench.camera.K = replace(right, cx=right.cx + 8.0)
+    assert variances() > 0.0
+    calibrated.publish(info_from_intrinsics(right, bench.camera.frame, 0))
+    bench.said("that its mount was calibrated with")
+    bench.camera.K = right
+    assert variances() > 0.0
+    calibrated.publish(CameraInfo())
+    bench.camera.K = replace(right, cx=right.cx + 8.0)
+    bench.pump(lambda: bench.watch.got[-1].detections[0].results[0].pose.covariance[0] > 0.0, "no record, no refusal")
 
 
 @pytest.mark.requirement("B-33", "B-60")
@@ -220,10 +289,12 @@ def test_without_a_mount_the_frame_is_skipped_with_a_warning(ros) -> None:
     assert bench.detect().detections
 
 
-def arm(t_ns: int, q: float) -> JointState:
+def arm(t_ns: int, q: float, speed: float = 0.0) -> JointState:
     """A joint state of the right arm with joint 1 at `q`."""
     state = JointState(
-        name=[f"openarm_right_joint{i}" for i in range(1, 8)], position=[q, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+        name=[f"openarm_right_joint{i}" for i in range(1, 8)],
+        position=[q, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6],
+        velocity=[speed] + [0.0] * 6,
     )
     state.header.stamp = ns_to_stamp(t_ns)
     return state
@@ -253,7 +324,7 @@ def test_a_camera_on_the_arm_waits_for_the_joints_at_the_stamp(ros) -> None:
     frame_waits(bench)
     t = bench.node.waiting_ns
     for offset, q in ((-8, 0.46), (12, 0.56), (400, 1.2)):
-        bench.camera.joints.publish(arm(t + offset * MS, q))
+        bench.camera.joints.publish(arm(t + offset * MS, q, 5.0))
     ros.spin_until(lambda: bench.watch.got, 20.0, "the detection of the frame that waited")
     assert stamp_to_ns(bench.watch.got[0].header.stamp) == t
     (found,) = bench.watch.got[0].detections
@@ -266,11 +337,11 @@ def test_a_joint_state_just_before_the_image_is_not_enough_while_the_next_is_to_
     bench = on_arm(ros, transform_wait=5.0)
     frame_waits(bench)
     t = bench.node.waiting_ns
-    bench.camera.joints.publish(arm(t - 3 * MS, 0.47))
+    bench.camera.joints.publish(arm(t - 3 * MS, 0.47, 10.0))
     looks_again = time.monotonic() + 0.3
     ros.spin_until(lambda: bench.watch.got or time.monotonic() > looks_again, 20.0, "time to look again")
     assert not bench.watch.got
-    bench.camera.joints.publish(arm(t + 12 * MS, 0.62))
+    bench.camera.joints.publish(arm(t + 12 * MS, 0.62, 10.0))
     ros.spin_until(lambda: bench.watch.got, 20.0, "the detection of the frame that waited")
     (found,) = bench.watch.got[0].detections
     np.testing.assert_allclose(pose_to_matrix(found.bbox.center)[:3, 3], (0.30, -0.20, TABLE + 0.025), atol=0.0015)

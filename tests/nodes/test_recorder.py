@@ -15,8 +15,9 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 from openarm_bringup.bags.bag import open_bag
+from openarm_bringup.bags.ros.listener import Thinner
 from openarm_bringup.bags.ros.player import Player
-from openarm_bringup.bags.ros.recorder import Recorder, Thinner
+from openarm_bringup.bags.ros.recorder import Recorder
 from openarm_bringup.commands.record import replay
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import array_to_image
@@ -39,7 +40,7 @@ def record(ros, path: Path, count: int, patterns: tuple[str, ...] = (".*",)) -> 
         publishers = [chatter, latched, images] if patterns == (".*",) else [chatter]
         ros.spin_until(lambda: all(p.get_subscription_count() for p in publishers), what="the recorder subscribes")
         # A best-effort message is lost while its reader has not met the publisher, though that has met the reader.
-        readers = [subscription for subscription, _ in recorder._readers]
+        readers = recorder._listener.readers
         ros.spin_until(lambda: all(reader.get_publisher_count() for reader in readers), what="it meets the publishers")
         for i in range(count):
             chatter.publish(String(data=str(i)))
@@ -106,8 +107,8 @@ def test_a_full_disk_ends_the_recording_and_leaves_a_bag(ros, tmp_path: Path, mo
     class Usage:
         free = 10**12
 
-    monkeypatch.setattr("openarm_bringup.bags.ros.recorder.shutil.disk_usage", lambda _: Usage)
-    monkeypatch.setattr("openarm_bringup.bags.ros.recorder._SPARE_BYTES", 2**20)
+    monkeypatch.setattr("openarm_bringup.bags.bag.shutil.disk_usage", lambda _: Usage)
+    monkeypatch.setattr("openarm_bringup.bags.bag.SPARE_BYTES", 2**20)
     images = ros.node.create_publisher(Image, "/overhead/color/image_raw", QOS_COMMAND)
     picture = np.random.default_rng(0).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     with Recorder(int(os.environ["ROS_DOMAIN_ID"]), tmp_path / "bag", ("/overhead/.*",), {}) as recorder:

@@ -8,7 +8,9 @@ import os
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -100,6 +102,67 @@ def test_topics_are_listed_echoed_measured_and_published(heard: list[str], capsy
     assert (alone.success, alone.code) == (False, Code.NOT_READY)
 
 
+@pytest.mark.requirement("A-16")
+def test_an_arm_moves_by_a_stream_of_commands(bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As docs/interfaces.md says: one command is held for half a second, a stream until it ends."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    joint, far = "openarm_right_joint4", 2.3
+    fields = f"{{name: [{joint}], position: [{far}]}}"
+    ended: list[bool] = []
+
+    def publish(*words: str) -> int:
+        code = cli.run(["topic", "pub", "/joint_commands", fields, *words])
+        ended.append(True)
+        return code
+
+    with ThreadPoolExecutor() as threads:
+        alone = threads.submit(publish, "--once")
+        bench.ros.spin_until(lambda: ended, 30.0, "the end of one command")
+        assert alone.result() == 0
+        bench.spin_sim(0.7)
+        assert bench.HOME[3] < bench.position(joint) < far - 0.1, "it stopped where the command ended"
+        ended.clear()
+        stream = threads.submit(publish, "--rate", "50", "--duration", "2")
+        bench.ros.spin_until(lambda: ended, 60.0, "the end of the stream")
+        assert stream.result() == 0
+    assert bench.position(joint) == pytest.approx(far, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("words", "most", "hertz"),
+    [
+        ({}, 1.0, 10.0),
+        ({"once": True}, 1.0, 10.0),
+        ({"rate": 50.0}, float("inf"), 50.0),
+        ({"rate": 50.0, "duration": 2.0}, 100.0, 50.0),
+        ({"duration": 2.0}, 20.0, 10.0),
+        ({"count": 7}, 7.0, 10.0),
+        ({"rate": 50.0, "duration": 2.0, "count": 7}, 7.0, 50.0),
+    ],
+)
+def test_what_a_stream_is(words: dict[str, Any], most: float, hertz: float) -> None:
+    every = {"rate": None, "duration": None, "count": None, "once": False}
+    assert ros2._stream(**{**every, **words}) == (most, hertz)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--rate", "0"),
+        ("--rate", "-5"),
+        ("--rate", "nan"),
+        ("--rate", "inf"),
+        ("--duration", "-1"),
+        ("--count", "0"),
+        ("--once", "--rate", "5"),
+        ("--once", "--count", "5"),
+    ],
+)
+def test_a_stream_that_cannot_be_is_refused(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["topic", "pub", "/talk", "{data: a}", *words]) == 2
+    assert words[-2] in capsys.readouterr().err
+
+
 def test_services_and_actions_are_called_and_the_exit_code_follows_the_answer(heard: list[str]) -> None:
     listed = ros2.service_list().data["services"]
     assert (listed["/pause"], "/probe/set_parameters" in listed) == ("openarm_interfaces/srv/SetPause", False)
@@ -121,7 +184,7 @@ def test_mistakes_are_met_with_a_suggestion(heard: list[str]) -> None:
         (lambda: ros2.echo("/statsu"), "did you mean /status"),
         (lambda: ros2.call("/paus"), "did you mean /pause"),
         (lambda: ros2.call("/pause", "{pause: true}"), "did you mean paused"),
-        (lambda: ros2.call("/pause", "{"), "is not YAML"),
+        (lambda: ros2.call("/pause", "{"), "is not valid YAML"),
         (lambda: ros2.send("/pikc"), "did you mean /pick"),
         (lambda: ros2.param_get("prob", "height"), "did you mean /probe"),
         (lambda: ros2.param_get("probe", "heigth"), "did you mean height"),

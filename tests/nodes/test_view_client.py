@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -117,6 +118,55 @@ def test_what_hangs_on_a_link_and_the_way_of_a_plan_are_shown(ros, looking: Look
     ros.node.create_timer(0.05, lambda: joints.publish(message))
     looking.wait("robot")
     looking.wait("fault:robot", lambda text: json.loads(text)["text"] == "")
+
+
+@pytest.mark.requirement("P-20", "R-25")
+def test_the_plan_that_waits_is_shown_in_place_of_newer_ones_and_answered(ros, looking: Looking) -> None:
+    from geometry_msgs.msg import Point
+    from openarm_interfaces.msg import GraspStatus
+    from openarm_interfaces.srv import ConfirmPlan
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    from openarm_bringup.view.server import Confirmation
+    from openarm_common.ros.node import QOS_LATCHED
+
+    def way(ns: str, x: float) -> MarkerArray:
+        line = Marker(ns=ns, type=Marker.LINE_STRIP, points=[Point(x=x), Point(x=x + 0.1)])
+        return MarkerArray(markers=[Marker(action=Marker.DELETEALL), line])
+
+    answers: list[tuple[str, bool]] = []
+
+    def answer(request: ConfirmPlan.Request, response: ConfirmPlan.Response) -> ConfirmPlan.Response:
+        answers.append((request.plan_id, request.accept))
+        response.success, response.message = request.accept, "heard"
+        return response
+
+    previews, grasps = (
+        ros.node.create_publisher(MarkerArray, topic, QOS_LATCHED) for topic in ("/motion/preview", "/grasp/markers")
+    )
+    status = ros.node.create_publisher(GraspStatus, "/grasp/status", QOS_LATCHED)
+    ros.node.create_service(ConfirmPlan, "/grasp/confirm", answer)
+    status.publish(GraspStatus(state="PLAN", plan_id="4adc"))
+    grasps.publish(way("plan/transfer", 0.5))
+    previews.publish(way("right/way", 0.1))
+    looking.view.want(frozenset({"plan", "states"}))
+    assert json.loads(looking.wait("grasp"))["steps"][-1]["plan_id"] == "4adc"
+    looking.wait("plan", lambda text: json.loads(text)["ways"] == [[[0.5, 0, 0], [0.6, 0, 0]]])
+    previews.publish(way("right/way", 0.2))
+    grasps.publish(way("plan/transfer", 0.7))
+    looking.wait("plan", lambda text: json.loads(text)["ways"][0][0][0] == 0.7)
+    grasps.publish(way("approach", 0.0))  # none waits any more
+    ros.node.create_timer(0.1, lambda: previews.publish(way("right/way", 0.3)))
+    looking.wait("plan", lambda text: json.loads(text)["ways"][0][0][0] == 0.3)
+    replies: list[tuple[bool, str]] = []
+    thread = threading.Thread(
+        target=lambda: replies.extend(
+            looking.view.confirm(Confirmation(plan_id="4adc", accept=accept)) for accept in (True, False)
+        )
+    )
+    thread.start()
+    ros.spin_until(lambda: not thread.is_alive(), 20.0, "the answers")
+    assert (replies, answers) == ([(True, "heard"), (False, "heard")], [("4adc", True), ("4adc", False)])
 
 
 def test_a_message_that_can_t_be_shown_is_said_and_the_rest_goes_on(ros, looking: Looking) -> None:

@@ -12,8 +12,8 @@ from std_msgs.msg import String
 from openarm_bringup.bags.bag import BagWriter, open_bag
 from openarm_bringup.bags.definitions import definition
 from openarm_bringup.bags.mcap import whole_chunks
+from openarm_bringup.bags.ros.listener import from_profile
 from openarm_bringup.bags.ros.player import to_profile
-from openarm_bringup.bags.ros.recorder import from_profile
 from openarm_bringup.messages import interface
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR

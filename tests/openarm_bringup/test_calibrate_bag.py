@@ -17,7 +17,7 @@ from tf2_msgs.msg import TFMessage
 
 from openarm_bringup import cli
 from openarm_bringup.bags.bag import BagWriter
-from openarm_bringup.bags.ros.recorder import from_profile
+from openarm_bringup.bags.ros.listener import from_profile
 from openarm_calibration.handeye.refine import mount_error
 from openarm_calibration.sampling.samples import load_session
 from openarm_calibration.store.store import CalibrationStore
@@ -162,7 +162,7 @@ def test_a_bag_with_too_few_stands_says_so_and_shows_them(capsys, known, tmp_pat
         (["--camera", "overhead"], 2, "no images of camera 'overhead'; cameras: wrist"),
         (["--camera", "../wrist"], 2, "no images of camera '../wrist'; cameras: wrist"),
         (["--board", "{kind: dots}"], 2, "boards: circles, charuco"),
-        (["--board", "{rows: [}"], 2, "is not YAML"),
+        (["--board", "{rows: [}"], 2, "is not valid YAML"),
         (["--board", "charuco"], 2, "expected keys and values"),
         (["--board", "{rows: 9}"], 1, "too few poses"),
         (["--mount-seed", "-2"], 2, "expected 0 or more"),

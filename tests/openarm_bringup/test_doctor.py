@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import json
+import threading
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from openarm_bringup import cli
+from openarm_bringup.commands import doctor
 from openarm_bringup.doctor import checks
 from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.shm import check_shm, shm_need_mib
@@ -51,6 +54,35 @@ def test_wrong_versions_are_errors_with_the_wanted_range(name: str, version: str
 def test_missing_package_is_an_error() -> None:
     findings = checks.check_versions({k: v for k, v in GOOD.items() if k != "pin"})
     assert [f.name for f in findings if f.level == "error"] == ["pin"]
+
+
+DEBIAN = {"ID": "debian", "VERSION_ID": "12", "PRETTY_NAME": "Debian GNU/Linux 12 (bookworm)"}
+UBUNTU = {"ID": "ubuntu", "VERSION_ID": "24.04", "PRETTY_NAME": "Ubuntu 24.04.3 LTS", "ID_LIKE": "debian"}
+MINT = {"ID": "linuxmint", "VERSION_ID": "22", "PRETTY_NAME": "Linux Mint 22", "ID_LIKE": "ubuntu debian"}
+
+
+@pytest.mark.parametrize(
+    ("os_release", "libc", "level", "words"),
+    [
+        (DEBIAN, ("glibc", "2.36"), "ok", "Debian GNU/Linux 12 (bookworm), glibc 2.36: supported"),
+        (UBUNTU, ("glibc", "2.39"), "ok", "Ubuntu 24.04.3 LTS, glibc 2.39: supported"),
+        (DEBIAN | {"VERSION_ID": "13"}, ("glibc", "2.41"), "note", "not among the tested ones"),
+        (DEBIAN | {"VERSION_ID": "24.04"}, ("glibc", "2.41"), "note", "not among the tested ones"),
+        (MINT, ("glibc", "2.39"), "note", "Linux Mint 22, glibc 2.39: not among the tested ones"),
+        ({"ID": "arch"}, ("glibc", "2.42"), "note", "arch, glibc 2.42: not among the tested ones"),
+        ({}, ("glibc", "2.40"), "note", "unknown, glibc 2.40: not among the tested ones"),
+        ({"ID": "centos", "VERSION_ID": "7"}, ("glibc", "2.17"), "error", "centos, glibc 2.17"),
+        ({"ID": "alpine", "VERSION_ID": "3.20"}, ("", ""), "error", "alpine, unknown C library"),
+    ],
+)
+@pytest.mark.requirement("B-08")
+def test_the_operating_system_is_supported_untested_or_unusable(
+    os_release: dict[str, str], libc: tuple[str, str], level: str, words: str
+) -> None:
+    finding = checks.check_system(os_release, libc)
+    assert (finding.name, finding.level) == ("system", level)
+    assert words in finding.observed
+    assert bool(finding.advice) == (level != "ok")
 
 
 @pytest.mark.parametrize(
@@ -111,6 +143,20 @@ def test_too_little_shared_memory_is_an_error_with_what_to_do() -> None:
         check_shm(load_graph("sim"), free_mib=20.0)
     assert caught.value.code == Code.ENVIRONMENT
     assert "20 MiB are free" in caught.value.message
+
+
+@pytest.mark.requirement("R-26")
+def test_checks_that_wait_do_so_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    together = threading.Barrier(4)
+
+    def meet(result: object, *_: object) -> object:
+        together.wait(60.0)  # broken, when one of them waits for another
+        return result
+
+    for name, result in (("_opencv_links_gl", False), ("_render_time", 12.0), ("_graph_findings", [])):
+        monkeypatch.setattr(doctor, name, partial(meet, result))
+    assert doctor.gather("sim")[0].name.startswith("mujoco")
+    assert not together.broken
 
 
 @pytest.mark.requirement("A-10")

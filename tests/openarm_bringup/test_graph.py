@@ -140,7 +140,7 @@ def test_faults_name_the_key_and_what_is_valid(tmp_path: Path, old: str, new: st
         ("arm", "expected node.param=value"),
         ("arm=3", "expected node.param=value"),
         ("leg.speed=3", "has no node 'leg'; its nodes are bridge, arm, hand"),
-        ("arm.x=[1", "is not a value in YAML"),
+        ("arm.x=[1", "the value is not valid YAML"),
     ],
 )
 def test_wrong_set_is_refused(tmp_path: Path, item: str, words: str) -> None:

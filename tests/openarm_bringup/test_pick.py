@@ -1,23 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm pick`: requests in words, and what a dry run prints of the candidates."""
+"""`openarm pick`: what a dry run prints of the candidates, and the refusal without a grasp node."""
 
 from __future__ import annotations
 
+import io
 import json
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import psutil
 import pytest
+from openarm_interfaces.msg import GraspStatus
 
 from openarm_bringup.commands import connect, pick
-from openarm_bringup.ros import object_client
 from openarm_bringup.supervision import runs
-from openarm_common import se3
-from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import Option
+from openarm_grasp.ros.client import GraspResult
 
 OPTIONS = (
     Option("red/x+/tilt0", "left", 0.05, {"tilt": -0.0, "width": 0.05}, 0.5, Code.OK, "chosen"),
@@ -35,22 +34,6 @@ def test_each_candidate_has_a_line_with_parts_margin_and_reason() -> None:
     assert refused.endswith("IN_COLLISION: [hand] meets blue")
     assert wide.split() == ["red/y", "left", "TOO_WIDE:", "90", "mm", "wide"]
     assert pick._options_table(()) == ""
-
-
-def test_words_select_the_object_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-
-    def find(requests: Sequence[str]) -> list[Detection]:
-        asked.extend(requests)
-        return [Detection("red", 0.9, se3.make(None, (0.3, -0.2, 0.42)), np.full(3, 0.05), kind="box")]
-
-    monkeypatch.setattr(object_client, "find", find)
-    labels, spots = pick._resolve(("blue", "red cube left of the can"), ((0.1, 0.2), None))
-    assert (labels, spots) == (["blue", "red"], [(0.1, 0.2), (0.3, -0.2)])
-    assert asked == ["red cube left of the can"]
-    assert pick._resolve(("blue",), (None,)) == (("blue",), (None,))
-    with pytest.raises(OpenArmError, match="leave --at out"):
-        pick._resolve(("red cube",), ((0.3, -0.2),))
 
 
 def test_a_graph_without_grasping_is_named_with_one_that_has_it(
@@ -92,3 +75,67 @@ def test_json_has_no_number_for_a_margin_that_is_not_known() -> None:
     chosen, refused, _ = json.loads(json.dumps([pick._option_row(option) for option in OPTIONS], allow_nan=False))
     assert (chosen["limit_margin"], chosen["code"]) == (0.5, "OK")
     assert (refused["limit_margin"], refused["parts"]) == (None, {"tilt": 0.0, "width": 0.05})
+
+
+class Client:
+    """Stands in for the client of the grasp node: one plan waits, and is answered."""
+
+    def __init__(self) -> None:
+        self.asked: dict[str, Any] = {}
+        self.accepted: bool | None = None
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def pick(self, **asked: Any) -> GraspResult:
+        self.asked = asked
+        plan = GraspStatus(
+            state="PLAN", plan_id="4adc", reason="grasp red; 12.0 s of motion; plan '4adc' waits for /grasp/confirm"
+        )
+        if asked["confirm"]:
+            asked["on_feedback"](plan)
+        self.accepted = callable(asked["confirm"]) and asked["confirm"](plan)
+        return GraspResult(True, Code.OK, "done", "SUCCESS", "red", "right", 1, (0.0, 0.0, 0.4), 1.0)
+
+
+class Stdin(io.StringIO):
+    def __init__(self, text: str, *, terminal: bool) -> None:
+        super().__init__(text)
+        self.isatty = lambda: terminal  # type: ignore[method-assign]
+
+
+@pytest.mark.requirement("P-20", "R-25")
+@pytest.mark.parametrize(
+    ("typed", "accepted"), [("y\n", True), ("YES\n", True), ("\n", False), ("n\n", False), ("", False)]
+)
+def test_a_plan_is_shown_on_the_terminal_and_confirmed_by_yes_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], typed: str, accepted: bool
+) -> None:
+    client = Client()
+    monkeypatch.setattr("openarm_grasp.ros.client.GraspClient", lambda: client)
+    monkeypatch.setattr(pick, "join_graph", lambda domain: None)
+    monkeypatch.setattr("sys.stdin", Stdin(typed, terminal=True))
+    assert pick.pick("red", confirm=True).success
+    assert client.accepted is accepted
+    lines = [line.strip() for line in capsys.readouterr().err.splitlines()]
+    assert lines[-4:] == ["plan 4adc:", "grasp red", "12.0 s of motion", "run this plan? [y/N]"]
+
+
+@pytest.mark.requirement("P-20", "R-25")
+def test_without_a_terminal_a_plan_waits_for_the_service(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    client = Client()
+    monkeypatch.setattr("openarm_grasp.ros.client.GraspClient", lambda: client)
+    monkeypatch.setattr(pick, "join_graph", lambda domain: None)
+    monkeypatch.setattr("sys.stdin", Stdin("y\n", terminal=False))
+    pick.pick("red", confirm=True)
+    assert client.asked["confirm"] is True
+    assert 'openarm service call /grasp/confirm "{plan_id: 4adc, accept: true}"' in capsys.readouterr().err
+    pick.pick("red")
+    assert client.asked["confirm"] is False
+    with pytest.raises(OpenArmError, match="of one object"):
+        pick.pick("red", "blue", confirm=True)

@@ -18,7 +18,7 @@ import pytest
 from aiohttp import web
 
 from openarm_bringup.view.guard import Guard
-from openarm_bringup.view.server import PAGE, Item, Order, Reset, ViewServer
+from openarm_bringup.view.server import PAGE, Confirmation, Item, Order, Reset, ViewServer
 from openarm_common.errors import Code, OpenArmError
 
 
@@ -38,6 +38,10 @@ class Graph:
         self.asked.append(order)
         self.go_on.wait(10.0)
         return {"success": True, "code": "OK", "message": "placed"}
+
+    def confirm(self, answer: Confirmation) -> tuple[bool, str]:
+        self.asked.append(answer)
+        return answer.accept, f"plan {answer.plan_id!r}"
 
     def cancel(self) -> tuple[bool, str]:
         self.asked.append("cancel")
@@ -290,6 +294,9 @@ def test_a_pick_is_asked_once_at_a_time_and_its_outcome_is_shown() -> None:
         ("/pick", {"label": "red", "arm": "third"}, "arm"),
         ("/pick", {"label": "x" * 65}, "label"),
         ("/pick", {"speed": 9}, "speed"),
+        ("/pick", {"confirm": "perhaps"}, "confirm"),
+        ("/confirm", {"plan_id": "4adc"}, "accept"),
+        ("/confirm", {"plan_id": "x" * 65, "accept": True}, "plan_id"),
         ("/reset", {"scene": "../../etc/passwd"}, "scene"),
         ("/reset", {"seed": -1}, "seed"),
     ],
@@ -300,6 +307,21 @@ def test_a_wrong_request_is_refused_by_the_name_of_what_is_wrong(path: str, body
         assert (status, answer["code"]) == (400, "INVALID_ARGUMENT")
         assert f"{path}:{why}" in answer["message"]
         assert bench.graph.asked == []
+
+    with_bench(test)
+
+
+@pytest.mark.requirement("P-20", "R-25")
+def test_the_plan_that_waits_is_confirmed_or_rejected_from_the_page() -> None:
+    async def test(bench: Bench) -> None:
+        await bench.post("/pick", {"label": "red", "confirm": True})
+        await until(lambda: bench.graph.asked)
+        status, answer = await bench.post("/confirm", {"plan_id": "4adc", "accept": True})
+        assert (status, answer) == (200, {"success": True, "code": "OK", "message": "plan '4adc'"})
+        assert not (await bench.post("/confirm", {"plan_id": "4adc", "accept": False}))[1]["success"]
+        assert (await bench.post("/confirm", {"plan_id": "4adc", "accept": True}, token="no"))[0] == 403
+        answers = [Confirmation(plan_id="4adc", accept=accept) for accept in (True, False)]
+        assert bench.graph.asked == [Order(label="red", confirm=True), *answers]
 
     with_bench(test)
 

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import re
+import tracemalloc
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -215,3 +218,46 @@ def test_an_unknown_link_in_a_session_lists_the_links(session) -> None:
     head = known.samples.head.model_copy(update={"carrier": "nowhere"})
     with pytest.raises(OpenArmError, match=r"no link 'nowhere'; links: .*openarm_right_link7"):
         type(known.samples)(head, known.description)
+
+
+def _archive(path: Path, **members: bytes) -> Path:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(f"{name}.npy", data)
+    return path
+
+
+def _array(shape: str) -> bytes:
+    head = f"{{'descr': '|u1', 'fortran_order': False, 'shape': {shape}, }}"
+    head = head.ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head.encode()
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_refused_unread(tmp_path: Path) -> None:
+    """Seventy million zeros are 70 kB packed; a header may claim any size."""
+    zeros = _array("(70000000,)") + bytes(70_000_000)
+    for path, part in (
+        (_archive(tmp_path / "a.npz", head=zeros), r"unpacks to 67 MiB.*64 MiB"),
+        (_archive(tmp_path / "b.npz", head=_array("(8, 10000000000)")), r"shape \(8, 10000000000\) in 128 bytes"),
+        (_archive(tmp_path / "c.npz", head=b"no array"), "magic string is not correct"),
+    ):
+        tracemalloc.start()
+        with pytest.raises(OpenArmError, match=part) as caught:
+            load_session(path, RobotDescription.load())
+        assert caught.value.code is Code.CONFIG_INVALID
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 20e6
+
+
+def test_an_altered_session_is_read_or_refused_in_a_sentence(tmp_path: Path, session) -> None:
+    path, rng = tmp_path / "s.npz", np.random.default_rng(7)
+    session(count=4).samples.save(path)
+    sound = path.read_bytes()
+    for _ in range(150):
+        data = bytearray(sound)
+        for _ in range(int(rng.integers(1, 6))):
+            data[int(rng.integers(len(data)))] = int(rng.integers(256))
+        path.write_bytes(data[: len(data) - int(rng.integers(2) * rng.integers(len(data)))])
+        with contextlib.suppress(OpenArmError):
+            load_session(path, RobotDescription.load())

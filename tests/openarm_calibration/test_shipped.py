@@ -51,12 +51,12 @@ def test_the_first_calibration_of_the_mounts_in_use_is_taken(tmp_path: Path) -> 
     own.save(stored(0.1, 3))
     found, warnings = of_these_mounts(places(tmp_path, 7), "wrist", "hand", 7)
     assert found is not None
-    assert found.calibration.position[0] == 0.2
+    assert found.record.position[0] == 0.2
     assert "of mount seed 3, the mounts in use are of mount seed 7" in warnings[0]
     own.save(stored(0.1, 7))
     found, warnings = of_these_mounts(places(tmp_path, 7), "wrist", "hand", 7)
     assert found is not None
-    assert (found.calibration.position[0], warnings) == (0.1, ())
+    assert (found.record.position[0], warnings) == (0.1, ())
     assert of_these_mounts(places(tmp_path, 7), "wrist", "foot", 7)[0] is None
 
 
@@ -64,6 +64,6 @@ def test_the_suite_s_own_is_for_its_seed_and_link_alone(tmp_path: Path) -> None:
     camera = load_cameras()["wrist"]
     found, _ = of_these_mounts(places(tmp_path, 1), "wrist", camera.parent, 1)
     assert found is not None
-    np.testing.assert_allclose(found.calibration.T_parent_link, true_mount(camera, 1), atol=1e-4)
+    np.testing.assert_allclose(found.record.T_parent_link, true_mount(camera, 1), atol=1e-4)
     assert of_these_mounts(places(tmp_path, 2), "wrist", camera.parent, 2)[0] is None
     assert of_these_mounts(places(tmp_path, None), "wrist", camera.parent, None)[0] is None

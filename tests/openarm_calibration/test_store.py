@@ -10,6 +10,7 @@ import pytest
 
 from openarm_calibration.store.store import CalibrationStore, StoredCalibration, of_these_mounts
 from openarm_common import se3
+from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import Code, OpenArmError
 
 
@@ -28,8 +29,23 @@ def test_a_saved_mount_comes_back_exactly(tmp_path: Path) -> None:
     path = store.save(saved)
     assert store.load("wrist") == saved
     np.testing.assert_allclose(store.load("wrist").T_parent_link, saved.T_parent_link, atol=1e-15)
-    assert store.cameras() == ("wrist",)
+    assert store.names() == ("wrist",)
     assert [p.name for p in path.parent.iterdir() if p.name.startswith(".")] == []
+
+
+@pytest.mark.requirement("A-32", "R-15")
+def test_intrinsics_are_kept_and_hashed_and_a_file_of_old_without_them_is_good(tmp_path: Path) -> None:
+    store, optics = CalibrationStore(tmp_path), Intrinsics(640, 480, 415.7, 415.7, 319.5, 239.5)
+    path = store.save(calibration(intrinsics=optics))
+    assert store.load("wrist").intrinsics == optics
+    path.write_text(path.read_text().replace("fx: 415.7", "fx: 425.7"))
+    with pytest.raises(OpenArmError, match="was edited"):
+        store.load("wrist")
+    of_old = calibration()
+    assert "intrinsics" not in store.save(of_old).read_text()
+    assert of_old.digest() == "3cc517fe953ead421cfa9c408191ac2e654289da5f452c8b3301a03cbff3907e"
+    with pytest.raises(OpenArmError, match="focal lengths above 0"):
+        calibration(intrinsics=Intrinsics(640, 480, 0.0, 415.7, 319.5, 239.5))
 
 
 def test_an_edited_or_cut_file_is_refused_and_the_last_good_one_stays(tmp_path: Path) -> None:
@@ -44,7 +60,7 @@ def test_an_edited_or_cut_file_is_refused_and_the_last_good_one_stays(tmp_path: 
         assert caught.value.code == Code.CONFIG_INVALID
         found = store.find("wrist")
         assert found is not None
-        assert found.calibration.position[0] == 0.2
+        assert found.record.position[0] == 0.2
         assert "last good one" in found.warning
 
 
@@ -63,7 +79,7 @@ def test_yaml_that_would_run_something_is_refused(tmp_path: Path) -> None:
 def test_names_with_path_tricks_are_refused(tmp_path: Path, name: str) -> None:
     store = CalibrationStore(tmp_path)
     for use in (store.load, store.find, store.history, store.rollback, store.path):
-        with pytest.raises(OpenArmError, match="camera name"):
+        with pytest.raises(OpenArmError, match="expected lower-case letters"):
             use(name)
     with pytest.raises(OpenArmError, match="camera"):
         StoredCalibration.of_mount(name, "p", np.eye(4))
@@ -95,7 +111,7 @@ def test_a_calibration_of_another_mount_seed_is_refused(tmp_path: Path) -> None:
 def test_a_missing_camera_lists_those_there_are(tmp_path: Path) -> None:
     store = CalibrationStore(tmp_path)
     store.save(calibration())
-    with pytest.raises(OpenArmError, match=r"no calibration of 'overhead' in .*; stored cameras: wrist"):
+    with pytest.raises(OpenArmError, match=r"no calibration of 'overhead' in .*; stored are: wrist"):
         store.load("overhead")
 
 

@@ -11,23 +11,40 @@ from vision_msgs.msg import Detection3D
 
 from openarm_common import se3
 from openarm_common.detection import Detection
-from openarm_common.ros.detections import UNKNOWN, class_ids, detections_from_msg, detections_to_msg
+from openarm_common.errors import Code
+from openarm_common.ros.detections import UNKNOWN, detections_from_msg, detections_to_msg, hypothesis
 
 T = se3.make(se3.rot_z(0.3), (0.3, -0.2, 0.43))
-CUBE = Detection("red", 0.9, T, np.array([0.050, 0.051, 0.052]), kind="cube")
-CAN = Detection("blue", 0.8, T, np.array([0.066, 0.066, 0.115]), True, "can")
+CUBE = Detection("", 0.9, T, np.array([0.050, 0.051, 0.052]), kind="cube", color="red")
+CAN = Detection("cola", 0.8, T, np.array([0.066, 0.066, 0.115]), True, "can", color="blue")
 NONE = [np.eye(6) * 1e-6]
 
 
-@pytest.mark.parametrize("detection", [CUBE, CAN, replace(CUBE, kind="")])
+@pytest.mark.requirement("R-18")
+@pytest.mark.parametrize(
+    "detection",
+    [
+        CUBE,
+        CAN,
+        replace(CUBE, kind=""),
+        replace(CUBE, color=""),
+        replace(CAN, color="", kind=""),
+        replace(CAN, name="Coca Cola 50%"),
+        replace(CAN, name="Käse/Brot #2", color="gelb/grün"),
+        replace(CAN, name="orange", color="orange", kind="sphere"),
+        replace(CAN, name="100%/2F"),
+    ],
+)
 def test_an_object_is_read_as_it_was_written(detection: Detection) -> None:
-    message = detections_to_msg([detection], NONE, "base", 7_000_000_009)
-    (found,) = detections_from_msg(message)
+    message = detections_to_msg([detection, detection], NONE * 2, "base", 7_000_000_009)
     assert (message.header.frame_id, message.header.stamp.nanosec) == ("base", 9)
-    assert (found.label, found.score, found.measured) == (detection.label, pytest.approx(detection.score), True)
-    assert (found.round, found.kind) == (detection.round, detection.kind or detection.label)
-    np.testing.assert_allclose(found.T_base_object, detection.T_base_object, atol=1e-12)
-    np.testing.assert_allclose(found.size, detection.size)
+    assert message.detections[0].id != message.detections[1].id
+    for found in detections_from_msg(message):
+        assert (found.name, found.color, found.kind) == (detection.name, detection.color, detection.kind)
+        assert (found.score, found.measured) == (pytest.approx(detection.score), True)
+        assert found.round == (detection.round and bool(detection.kind))
+        np.testing.assert_allclose(found.T_base_object, detection.T_base_object, atol=1e-12)
+        np.testing.assert_allclose(found.size, detection.size)
 
 
 def test_an_object_that_was_not_measured_stays_so_and_keeps_its_score() -> None:
@@ -37,14 +54,43 @@ def test_an_object_that_was_not_measured_stays_so_and_keeps_its_score() -> None:
     assert (found.score, found.measured) == (pytest.approx(CUBE.score), False)
 
 
-def test_equal_labels_are_numbered_and_detections_without_a_class_left_out() -> None:
+def test_what_is_described_alike_is_numbered_and_detections_without_a_class_left_out() -> None:
     message = detections_to_msg([CUBE, CAN, CUBE, CUBE], NONE * 4, "base", 0)
-    assert [item.id for item in message.detections] == ["red", "blue", "red_2", "red_3"]
+    assert [item.id for item in message.detections] == ["/red/cube", "cola/blue/can", "/red/cube#2", "/red/cube#3"]
     message.detections.append(Detection3D())
     assert len(detections_from_msg(message)) == 4
 
 
-def test_classes_go_from_the_label_to_the_wider_kind() -> None:
-    assert class_ids(CAN) == ("blue", "can", "cylinder")
-    assert class_ids(replace(CUBE, label="box")) == ("box", "cube")
-    assert class_ids(replace(CUBE, kind="sphere")) == ("red", "sphere")
+@pytest.mark.parametrize("code", [Code.INTRINSICS_MISMATCH, Code.TABLE_MISMATCH, Code.NOTHING_DETECTED])
+@pytest.mark.requirement("R-15")
+def test_why_an_object_was_not_measured_is_read_again(code: Code) -> None:
+    message = detections_to_msg([replace(CUBE, measured=False, code=code)], NONE, "base", 0)
+    (found,) = detections_from_msg(message)
+    assert (found.measured, found.code) == (False, code)
+
+
+@pytest.mark.requirement("R-18")
+def test_any_consumer_reads_class_colour_shape_and_wider_shape_in_this_order() -> None:
+    (item,) = detections_to_msg([CAN], NONE, "base", 0).detections
+    assert [result.hypothesis.class_id for result in item.results] == ["cola", "blue", "can", "cylinder"]
+    assert len({result.hypothesis.score for result in item.results}) == 1
+    assert replace(CUBE, color="", kind="box").attributes == ("box",)
+    assert replace(CUBE, kind="sphere").attributes == ("red", "sphere")
+    assert (CAN.label, CUBE.label, replace(CUBE, color="").label) == ("cola", "red", "box")
+
+
+@pytest.mark.parametrize(
+    ("classes", "expected"),
+    [
+        (("mug", "red", "cylinder"), ("mug", "red", "cylinder")),
+        (("can", "blue"), ("blue", "", "can")),
+        (("box",), ("", "", "box")),
+    ],
+)
+def test_a_message_of_another_detector_needs_no_id_of_that_form(classes, expected) -> None:
+    message = detections_to_msg([CUBE], NONE, "base", 0)
+    (item,) = message.detections
+    for item.id in ("", "17", "a/b/c"):
+        item.results = [hypothesis(name, 0.9 - 0.1 * i) for i, name in enumerate(classes)]
+        (found,) = detections_from_msg(message)
+        assert (found.name, found.color, found.kind) == expected

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -120,7 +121,7 @@ def test_points_and_spheres(tmp_path: Path) -> None:
 
 def test_no_room_and_other_files_are_named(tmp_path: Path) -> None:
     huge = Lattice(0.02, (0, 0, 0), (40000, 40000, 40000))
-    with pytest.raises(OpenArmError, match="no room for a distance field"):
+    with pytest.raises(OpenArmError, match=r"a distance field of .* MiB can't be made"):
         DistanceFieldWriter(tmp_path / "f", huge, 0.4, "base", [])
     with pytest.raises(OpenArmError, match="room for 8"):
         DistanceFieldWriter(tmp_path / "f", LATTICE, 0.4, "base", [f"c{i}" for i in range(9)])
@@ -129,3 +130,44 @@ def test_no_room_and_other_files_are_named(tmp_path: Path) -> None:
         (tmp_path / "g").write_bytes(content)
         with pytest.raises(OpenArmError, match="NOT_READY"):
             DistanceFieldReader(tmp_path / "g").latest()
+
+
+def test_a_field_of_another_user_or_that_others_may_write_is_refused_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "f"
+    publish(writer(path), 0.1, 5 * S, "overhead")
+    (tmp_path / "link").symlink_to(path)
+    with pytest.raises(OpenArmError, match="can't be opened"):
+        DistanceFieldReader(tmp_path / "link").latest()
+    with pytest.raises(OpenArmError, match=r"can't be opened|belongs to"):
+        DistanceFieldReader(tmp_path).latest()
+    path.chmod(0o666)
+    with pytest.raises(OpenArmError, match=r"-rw-rw-rw-.*only user"):
+        DistanceFieldReader(path).latest()
+    path.chmod(0o600)
+    assert DistanceFieldReader(path).latest().version == 1
+    monkeypatch.setattr(os, "getuid", lambda: os.geteuid() + 1)
+    with pytest.raises(OpenArmError, match=f"belongs to user {os.geteuid()} .*only user {os.geteuid() + 1}") as caught:
+        DistanceFieldReader(path).latest()
+    assert caught.value.code is Code.ENVIRONMENT
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("resolution", np.nan), ("reach", -1.0), ("shape", (10**6, 10**6, 10**6)), ("shape", (-1, 1, 1)), ("current", 7)],
+)
+def test_a_header_that_does_not_fit_the_file_is_refused(tmp_path: Path, name: str, value: object) -> None:
+    path = tmp_path / "f"
+    w = writer(path)
+    publish(w, 0.1, 5 * S, "overhead")
+    w._head[name] = value
+    with pytest.raises(OpenArmError, match="is no distance field"):
+        DistanceFieldReader(path).latest()
+
+
+def test_a_field_from_the_future_is_stale(tmp_path: Path) -> None:
+    publish(writer(tmp_path / "f"), 0.1, 50 * S, "overhead", "wrist")
+    with pytest.raises(OpenArmError, match=r"45\.0 s in the future") as caught:
+        DistanceFieldReader(tmp_path / "f").latest().require_fresh(5 * S, 3.0)
+    assert caught.value.code is Code.STALE_DATA

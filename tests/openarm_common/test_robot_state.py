@@ -3,15 +3,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
+from collections.abc import Callable
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.types import Array
+from openarm_motion.config import LimitsConfig
+from openarm_motion.timing.trajectory import JointLimits, time_polyline
 
 MS = 1_000_000
 URDF = """<robot name="two">
@@ -31,9 +38,114 @@ def buffer() -> RobotStateBuffer:
 @pytest.mark.requirement("A-44")
 def test_interpolates_between_two_that_bracket(t_ns: int) -> None:
     buffer = RobotStateBuffer(RobotDescription.from_urdf(URDF))
-    buffer.add_joint_state(0, ["lift"], [0.0])
-    buffer.add_joint_state(10 * MS, ["lift"], [0.1])
-    assert buffer.joints_at(t_ns)["lift"] == pytest.approx(0.1 * t_ns / (10 * MS))
+    for t in range(-30, 11, 10):
+        buffer.add_joint_state(t * MS, ["lift"], [0.3 + 0.01 * t])
+    assert buffer.joints_at(t_ns)["lift"] == pytest.approx(0.3 + 0.01 * t_ns / MS)
+
+
+ROBOT = RobotDescription.load()
+ARM, HAND = ROBOT.arm_joints("right"), ROBOT.tcp_link("right")
+LOW, HIGH = ROBOT.limits(ARM)
+
+
+def fill(motion: Callable[[Array], Array], rate: float, seconds: float, measured: bool) -> RobotStateBuffer:
+    """The joint states of a motion (n,) s -> (n, 7) rad, with velocities where they are measured."""
+    buffer = RobotStateBuffer(ROBOT, capacity=10_000)
+    t_ns = np.arange(0.0, seconds * 1e9, 1e9 / rate).astype(np.int64)
+    t, step = t_ns * 1e-9, 1e-5
+    v = (motion(t + step) - motion(t - step)) / (2.0 * step)
+    for stamp, positions, velocities in zip(t_ns.tolist(), motion(t), v, strict=True):
+        buffer.add_joint_state(stamp, ARM, positions, velocities if measured else ())
+    return buffer
+
+
+def off(buffer: RobotStateBuffer, motion: Callable[[Array], Array], t_ns: int) -> float:
+    """Error of a lookup at the hand, m."""
+    true = ROBOT.link_pose(HAND, dict(zip(ARM, motion(np.array([t_ns * 1e-9]))[0], strict=True)))
+    return float(np.linalg.norm(buffer.lookup(ROBOT.root, HAND, t_ns)[:3, 3] - true[:3, 3]))
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(8.0, 200.0), st.booleans(), st.sampled_from(["waves", "strokes"]))
+@settings(max_examples=80, deadline=None)
+@pytest.mark.requirement("A-44", "A-72")
+def test_what_is_accepted_is_within_a_millimetre_at_the_hand(seed: int, rate: float, measured: bool, kind: str) -> None:
+    """Smooth random motions of any size and speed: waves up to 3 Hz, strokes from rest to rest."""
+    rng = np.random.default_rng(seed)
+    home, size = rng.uniform(LOW, HIGH), 10.0 ** rng.uniform(-3.0, 0.0, 7)
+    if kind == "waves":
+        hertz, phase = rng.uniform(0.1, 3.0, (3, 7)), rng.uniform(0.0, 2.0 * math.pi, (3, 7))
+
+        def motion(t: Array) -> Array:
+            return home + (size * np.sin(2.0 * math.pi * hertz * t[:, None, None] + phase)).sum(axis=1)
+    else:
+        start, seconds = rng.uniform(0.2, 0.6, 7), rng.uniform(0.2, 1.5, 7)
+
+        def motion(t: Array) -> Array:
+            x = np.clip((t[:, None] - start) / seconds, 0.0, 1.0)
+            return home + size * x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+
+    buffer = fill(motion, rate, 1.5, measured)
+    for t_ns in rng.integers(0, 1_505_000_000, 20).tolist():
+        with contextlib.suppress(OpenArmError):
+            assert off(buffer, motion, t_ns) <= 1e-3, f"{off(buffer, motion, t_ns) * 1e3:.2f} mm at {t_ns} ns"
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.requirement("A-44", "A-72")
+def test_ten_hertz_serve_an_arm_at_rest_and_not_one_that_accelerates(measured: bool) -> None:
+    """The refusal states what would be wrong, and the bound; 50 Hz serve the arm that moves slowly."""
+
+    def accelerating(rate: float, acceleration: float) -> tuple[RobotStateBuffer, Callable[[Array], Array]]:
+        def motion(t: Array) -> Array:
+            return np.array([0.1, 0.2, 0.0, 1.0, 0.0, 0.0, 0.0]) + 0.5 * acceleration * t[:, None] ** 2 * np.eye(7)[0]
+
+        return fill(motion, rate, 1.0, measured), motion
+
+    buffer, _ = accelerating(10.0, 6.0)
+    with pytest.raises(
+        OpenArmError, match=r"100\.0 ms apart.*openarm_right_joint1 .* (\d+\.\d) mm off.* 1\.0 mm"
+    ) as caught:
+        buffer.lookup(ROBOT.root, HAND, 650 * MS)
+    assert caught.value.code is Code.STALE_DATA
+    for rate, acceleration in ((10.0, 0.0), (50.0, 2.0)):
+        buffer, motion = accelerating(rate, acceleration)
+        assert all(off(buffer, motion, t * MS) <= 1e-3 for t in range(50, 890, 7))
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.requirement("A-72")
+def test_a_hundred_hertz_serve_the_fastest_motions_of_the_planner(measured: bool) -> None:
+    config, rng = LimitsConfig(), np.random.default_rng(0)
+    limits = JointLimits(*(np.array(values) for values in (config.velocity, config.acceleration, config.jerk)))
+    for _ in range(5):
+        path = time_polyline(ARM, rng.uniform(LOW, HIGH, (2, 7)), limits)
+        buffer = fill(path.states, 100.0, path.duration + 0.05, measured)
+        for t_ns in rng.integers(0, int(path.duration * 1e9), 30).tolist():
+            assert off(buffer, path.states, t_ns) < 0.3e-3
+
+
+@pytest.mark.requirement("A-44", "A-72")
+def test_within_five_milliseconds_of_the_end_an_arm_that_moves_fast_is_refused(buffer: RobotStateBuffer) -> None:
+    for speed, accepted in ((0.1, True), (0.5, False)):
+        buffer.clear()
+        for t in range(0, 101, 10):
+            buffer.add_joint_state(t * MS, ["lift"], [speed * t * 1e-3], [speed])
+        if accepted:
+            assert buffer.joints_at(104 * MS)["lift"] == pytest.approx(0.01)
+        else:
+            with pytest.raises(OpenArmError, match=r"-4\.0 ms away and lift moves, .* 2\.0 mm off"):
+                buffer.joints_at(104 * MS)
+
+
+@pytest.mark.requirement("A-44")
+def test_velocities_that_no_driver_measures_are_not_used(buffer: RobotStateBuffer) -> None:
+    """Zeros of a moving joint, or NaN; two publishers of one stamp make one state."""
+    for velocity in (0.0, math.nan):
+        buffer.clear()
+        for t in range(0, 101, 10):
+            buffer.add_joint_state(t * MS, ["lift"], [1e-3 * t], [velocity])
+            buffer.add_joint_state(t * MS, ["other"], [1.0], [velocity])
+        assert buffer.joints_at(75 * MS) == {"lift": pytest.approx(0.075), "other": 1.0}
 
 
 @pytest.mark.parametrize(("offset_ms", "accepted"), [(-5, True), (5, True), (6, False), (-6, False), (20, False)])

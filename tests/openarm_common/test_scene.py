@@ -85,7 +85,7 @@ def test_mass_follows_from_the_volume_where_none_is_given() -> None:
     [
         ({"shape": "ball"}, "objects.0.shape: Input should be 'box', 'cylinder' or 'sphere', got 'ball'"),
         ({"shape": "sphere", "size": [0.05, 0.05, 0.06]}, "objects.0: .*a sphere has one diameter"),
-        ({"color": "pink"}, "objects.0.color: .*colours: red, orange, yellow, green, blue, purple, got 'pink'"),
+        ({"color": "pink"}, "objects.0.color: .*colours: red, orange, yellow, green, blue, purple, grey, got 'pink'"),
         ({"size": [0.05, 0.05, 0.31]}, "objects.0.size.2: .*less than or equal to 0.3, got 0.31"),
         ({"size": [0.05, 0.05, 0.001]}, "objects.0.size.2: .*greater than or equal to 0.01"),
         ({"size": [0.05, 0.05]}, r"objects.0.size"),

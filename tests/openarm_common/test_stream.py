@@ -116,11 +116,12 @@ def test_a_frame_waits_for_the_joint_state_after_its_stamp(frame: str, joints: J
     """However near the one before is; and is then between the two."""
     eye = Eye(frame=frame, joints=joints)
     assert eye.image(103) is None
-    eye.at(100, 0.0)
-    assert eye.take() is None
-    eye.at(110, 0.1)
+    for t in (70, 80, 90, 100):
+        eye.at(t, 1e-3 * t)
+        assert eye.take() is None
+    eye.at(110, 0.11)
     found = eye.take().posture
-    between = dict.fromkeys(ARM, 0.03)
+    between = dict.fromkeys(ARM, 0.103)
     np.testing.assert_allclose(found.T_base_frame, ROBOT.link_pose(frame, between), atol=1e-12)
     assert found.joints == (pytest.approx(between) if joints != "none" else {})
     assert eye.stream.waiting_ns is None

@@ -35,6 +35,23 @@ def test_the_robot_in_process_has_the_motion_service_and_a_map_that_shows_the_ob
     field.require_fresh(robot.t_ns, 2.0)
 
 
+@pytest.mark.requirement("B-63", "R-15")
+def test_a_table_15_mm_higher_than_believed_is_refused_and_right_when_it_was_measured() -> None:
+    demo = load_scene("demo")
+    scene = demo.model_copy(update={"table": demo.table.at(demo.table.top_z + 0.015)})
+    believed, measured = (SimRobot(scene, SimulatedSenses(), table=table) for table in (demo.table, scene.table))
+    for robot, code in ((believed, Code.TABLE_MISMATCH), (measured, None)):
+        robot.pass_time(0.1)
+        frames = [robot.detect("overhead") for _ in range(3)]
+        assert frames[-1] is not None
+        assert {d.label for d in frames[-1].detections} == {item.label for item in scene.objects}
+        assert {None if d.measured else d.code for d in frames[-1].detections} == {code}
+        assert robot.motion.scene.fixed[0].T[2, 3] == pytest.approx(robot.table.top_z - robot.table.thickness / 2.0)
+    heights = {item.label: item.size[2] for item in scene.objects}
+    for seen in frames[-1].detections:
+        assert seen.size[2] == pytest.approx(heights[seen.label], abs=0.003)
+
+
 @pytest.mark.requirement("R-27")
 def test_parameters_are_those_that_the_supervisor_gives_the_nodes_and_set_changes_both(tmp_path: Path) -> None:
     sets = ("motion.planning.seed=7", "motion.map.use=required")

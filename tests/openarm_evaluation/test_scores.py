@@ -44,7 +44,6 @@ def test_one_of_two_found_is_half() -> None:
     assert result.confusion.tolist() == [[1, 1], [0, 0]]
 
 
-@pytest.mark.requirement("B-24")
 def test_the_centre_error_is_that_of_right_boxes_and_overlap_counts() -> None:
     """3 pixels aside: overlap 7/13 = 0.54, right at 0.5 and wrong from 0.55 on."""
     result = score([candidates((0, 0.9, 3, 0))], [truth((0, 0, 0))], 1)

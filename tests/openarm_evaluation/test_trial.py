@@ -13,7 +13,7 @@ from openarm_common.scene.scene import Scene, load_scene
 from openarm_evaluation.judging.judge import Sample, judge
 from openarm_evaluation.judging.provenance import machine, scene_hash, versions
 from openarm_evaluation.judging.statistics import interval, summarise
-from openarm_evaluation.judging.trial import Step, Trial, choose_target, shows
+from openarm_evaluation.judging.trial import Step, Trial, choose_targets, shows
 from openarm_grasp.ros.client import GraspResult
 
 
@@ -32,10 +32,10 @@ def standing(scene: Scene, shift: float = 0.0, speed: float = 0.0) -> dict[str, 
 
 def test_target_is_the_first_object_or_the_labelled_one() -> None:
     scene = load_scene("demo")
-    assert choose_target(scene, None) == scene.objects[0]
-    assert choose_target(scene, "blue").label == "blue"
-    with pytest.raises(OpenArmError, match="no object 'pink'; it has red") as caught:
-        choose_target(scene, "pink")
+    assert choose_targets(scene, "") == scene.objects
+    assert choose_targets(scene, "blue")[0].label == "blue"
+    with pytest.raises(OpenArmError, match=r"no object 'pink'; it has .*red") as caught:
+        choose_targets(scene, "pink")
     assert caught.value.code == Code.UNKNOWN_OBJECT
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -94,6 +94,10 @@ Call = Follow | MoveLinear | GoHome | Grip | Measure | Wait | Observe | ToBase |
 Fault = Callable[[Call], OpenArmError | None]
 
 
+class Path(str):
+    """A trajectory: of two with the same name each is itself."""
+
+
 def standing(label: str, x: float, y: float, size: float = 0.05, z: float = 0.4) -> Detection:
     return Detection(label, 0.9, se3.make(p=(x, y, z + size / 2.0)), np.array([size, size, size]))
 
@@ -103,6 +107,9 @@ class World(Skills):
 
     Attributes:
         slips: Closes that get nothing.
+        scene, q: Version of the planning scene, joints.
+        near_off: How far off the camera on the hand sees objects, m.
+        followed: Trajectories, in their order.
         far: The arms grasp nothing that is further away than this, m; a hand may push it from there.
         follows: Share of a push that the object follows.
     """
@@ -119,6 +126,8 @@ class World(Skills):
         self.tcp_error = self.place_error = self.frame_age = 0.0
         self.far, self.follows, self.hands_come_behind, self.pushed = 1.0, 1.0, True, 0
         self.two_sided = False
+        self.scene, self.q, self.near_off = 1, {"right_joint1": 0.0, "left_joint1": 0.0}, 0.0
+        self.followed: list[object] = []
         self.stopped: Code | None = None
         self.on_report: Callable[[Status], None] = lambda status: None
         self.plans: list[Planned | OpenArmError] = []
@@ -204,7 +213,12 @@ class World(Skills):
 
     async def observe(self, count: int, *, near: bool = False) -> Frames:
         self.call(Observe(count, near))
-        return self.frames(count)
+        seen = self.frames(count)
+        if not near:
+            return seen
+        T_off = se3.make(p=(self.near_off, 0.0, 0.0))
+        shifted = (replace(d, T_base_object=T_off @ d.T_base_object) for d in seen.frames[-1].detections)
+        return Frames((replace(seen.frames[-1], detections=tuple(shifted)),) * count, seen.frame_id)
 
     def in_base(self, seen: Frames) -> Frames:
         self.call(ToBase())
@@ -214,8 +228,8 @@ class World(Skills):
         if isinstance(request, PlanGrasp) and "/push/" in request.candidates[0].id:
             if not self.hands_come_behind:
                 raise OpenArmError(Code.UNREACHABLE, f"{request.arm} arm: too far")
-            self._line = request.candidates[0].retreat_offset
-            return Planned(0, "transfer", "behind", "push")
+            self._line, self._label = request.candidates[0].retreat_offset, ""
+            return self._planned(0, "transfer", "behind", "push")
         self.call(request)
         if self.plans:
             answer = self.plans.pop(0)
@@ -225,12 +239,26 @@ class World(Skills):
         if isinstance(request, PlanGrasp):
             self._reach(request.arm, request.candidates[0].T_base_tcp[:2, 3])
             self._label = request.target.id.removeprefix("target/")
-            return Planned(0, "transfer", "approach", "lift")
+            return self._planned(0, "transfer", "approach", "lift")
         within = [i for i, way in enumerate(request.targets) if self.reaches(request.arm, way.position)]
         if not within:
             self._reach(request.arm, request.targets[0].position)
         self._target = request.targets[within[0]].position
-        return Planned(within[0], "carry", "put down", "leave")
+        return self._planned(within[0], "carry", "put down", "leave")
+
+    def _planned(self, chosen: int, *names: str) -> Planned:
+        transfer, approach, retreat = map(Path, names)
+        return Planned(chosen, transfer, approach, retreat, start=dict(self.q), duration=3.0, scene_version=self.scene)
+
+    def joints(self) -> dict[str, float]:
+        return dict(self.q)
+
+    async def scene_version(self) -> int:
+        return self.scene
+
+    async def until(self, done: Callable[[], bool], limit: float, what: str) -> None:
+        self.call(Wait(0.0))
+        assert done(), f"nobody ended {what}"
 
     def reaches(self, arm: str, p: np.ndarray) -> bool:
         """Each arm reaches all; of two that are `two_sided`, its own side and a strip of the other's."""
@@ -245,8 +273,11 @@ class World(Skills):
         self.call(Reach(tuple(arms)))
         return dict.fromkeys(arms, 0.2)
 
-    async def follow(self, arm: str, trajectory: object, what: str, *, carrying: bool = False) -> None:
+    async def follow(
+        self, arm: str, trajectory: object, what: str, *, carrying: bool = False, line: object = None
+    ) -> None:
         self.call(Follow(arm, str(trajectory), what, carrying))
+        self.followed.append(trajectory)
         self.pass_time(1.0)
         if trajectory == "lift" and self.held:
             self.lifted(self.held)

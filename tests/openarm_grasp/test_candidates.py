@@ -15,7 +15,6 @@ from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig, HandConfig
 from openarm_grasp.planning.candidates import (
-    USED_PENALTY,
     held_box,
     obstacle_boxes,
     propose,
@@ -182,7 +181,7 @@ def test_leaning_away_from_the_shoulder_comes_first():
 def test_score_is_the_sum_of_its_parts():
     for c in propose(box(), CONFIG):
         assert c.score == pytest.approx(sum(c.parts.values()))
-        assert set(c.parts) == {"tilt", "width", "side", "room", "used"}
+        assert set(c.parts) == {"tilt", "width", "side", "room"}
 
 
 @pytest.mark.requirement("N-21")
@@ -197,13 +196,6 @@ def test_hands_whose_fingers_have_room_come_first():
     assert rooms["y"] == 0.0
     assert rooms["x"] < -0.15  # the finger would stand in the block
     assert len(offered) == len(propose(alone, CONFIG))  # the planner has the last word
-
-
-def test_a_used_candidate_comes_last():
-    first = propose(box(), CONFIG)[0]
-    again = propose(box(), CONFIG, used=frozenset({first.id}))
-    assert again[-1].id == first.id
-    assert again[-1].parts["used"] == -USED_PENALTY
 
 
 def test_only_the_narrow_edge_of_a_wide_box_is_grasped():

@@ -35,7 +35,6 @@ def test_every_parameter_is_described_and_numbers_have_a_range(name, field):
     [
         ("timing", "pause_at_grasp", 0.5),  # B-52
         ("timing", "after_close", 0.2),  # B-54
-        ("approach", "pregrasp_distance", 0.08),  # B-45
         ("approach", "max_width", 0.070),  # B-17
         ("detect", "max_age", 0.5),  # P-33
         ("limits", "max_attempts", 3),  # A-70
@@ -45,6 +44,16 @@ def test_every_parameter_is_described_and_numbers_have_a_range(name, field):
 )
 def test_defaults_are_those_of_the_requirements(section, key, value):
     assert getattr(getattr(GraspConfig(), section), key) == value
+
+
+@pytest.mark.parametrize(("pregrasp", "clear"), [(None, True), (0.06, False)])
+@pytest.mark.requirement("B-45", "B-48")
+def test_by_default_the_open_fingers_begin_farther_above_any_object_than_they_may_be_off_their_path(pregrasp, clear):
+    """Of the 5 to 8 cm that are allowed; a tall object reaches deepest between the fingers, up to the palm."""
+    config = GraspConfig.model_validate({"approach": {} if pregrasp is None else {"pregrasp_distance": pregrasp}})
+    assert 0.05 <= config.approach.pregrasp_distance <= 0.08
+    above = config.approach.pregrasp_distance - config.hand.palm_depth - config.hand.tip_clearance
+    assert (above > config.approach.path_tolerance) is clear
 
 
 @pytest.mark.parametrize("tilts", [[], [-5.0], [0.0, 70.0]])

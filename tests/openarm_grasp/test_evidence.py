@@ -107,6 +107,19 @@ def test_sight_truth_table(after, code, reason):
     assert reason in verdict.reason
 
 
+@pytest.mark.parametrize(
+    ("top", "code"),
+    [(0.57, Code.OK), (0.535, Code.OK), (0.511, Code.OK), (0.509, Code.GRASP_LOST), (0.485, Code.GRASP_LOST)],
+)
+@pytest.mark.requirement("P-07")
+def test_what_is_seen_more_than_a_centimetre_below_the_hold_has_slipped(top, code):
+    """A cube of 5 cm was lifted by 12 cm: its lower face should be at 0.52 m."""
+    seen_part = replace(seen(top=top, height=top - 0.4), measured=False)
+    verdict = judge_sight(seen(), [Frame(1, (seen_part,))], HELD, match_radius=0.03, lift=0.12)
+    assert verdict.code is code
+    assert ("slipped by at least" in verdict.reason) is (code is Code.GRASP_LOST)
+
+
 @pytest.mark.parametrize("sight", [Code.OK, Code.GRASP_MISSED, Code.STALE_DATA])
 @pytest.mark.parametrize("grip", [Code.OK, Code.GRASP_MISSED, Code.HAND_COLLISION, Code.GRASP_LOST])
 @pytest.mark.requirement("A-71", "P-08")
@@ -141,6 +154,24 @@ def test_without_an_object_nothing_is_held():
 def test_a_place_counts_when_the_camera_sees_it_within_2_cm(frames, code):
     verdict = judge_place("red", np.array([0.26, -0.2, 0.4]), frames, 0.02)
     assert verdict.code is code
+
+
+@pytest.mark.parametrize(
+    ("edges", "code"),
+    [
+        ([(0.05, 0.05)], Code.OK),
+        ([(0.06, 0.05), (0.07, 0.06)], Code.OK),  # in one frame only
+        ([(0.05, 0.062), (0.062, 0.05)], Code.PLACE_FAILED),
+        ([(0.04, 0.04)], Code.OK),  # a part is hidden
+    ],
+)
+@pytest.mark.requirement("P-09")
+def test_an_object_whose_footprint_has_grown_leans(edges, code) -> None:
+    frames = [Frame(i, (replace(seen(), size=np.array([*edge, 0.05])),)) for i, edge in enumerate(edges)]
+    target, footprint = np.array([0.26, -0.2, 0.4]), np.array([0.05, 0.05])
+    verdict = judge_place("red", target, frames, 0.02, height=0.05, footprint=footprint)
+    assert verdict.code is code, verdict.reason
+    assert ("not stand upright" in verdict.reason) is (code is not Code.OK)
 
 
 @pytest.mark.requirement("P-08")

@@ -53,6 +53,14 @@ def test_unknown_label_is_refused_with_what_is_in_view():
     assert error.value.message == "no 'mug' in view; in view: blue, red"
 
 
+@pytest.mark.parametrize("code", [Code.INTRINSICS_MISMATCH, Code.TABLE_MISMATCH, Code.NOTHING_DETECTED])
+@pytest.mark.requirement("R-15")
+def test_what_its_detector_withholds_is_refused_with_the_reason(code):
+    with pytest.raises(OpenArmError) as error:
+        look(frames(*[(replace(seen(), measured=False, code=code),)] * 3))
+    assert error.value.code is code
+
+
 def test_an_empty_view_says_so():
     with pytest.raises(OpenArmError) as error:
         look(frames((), ()))
@@ -81,9 +89,34 @@ def test_one_missed_frame_of_three_is_forgiven_and_two_are_not():
 
 
 @pytest.mark.requirement("B-27")
-def test_without_a_label_the_highest_score_is_taken():
-    pair = (seen("red", score=0.5), seen("blue", y=0.2, score=0.8))
-    assert look(frames(pair, pair), "").target.label == "blue"
+@pytest.mark.parametrize("text", ["", "cube"])
+def test_of_several_that_fit_the_first_of_the_message_is_taken(text):
+    """The detector has ranked them, by its policy; not the score, and not the one that was first before."""
+    red, blue = replace(seen("red", score=0.5), kind="cube"), replace(seen("blue", y=0.2, score=0.8), kind="cube")
+    assert look(frames((red, blue), (red, blue)), text).target.label == "red"
+    assert look(frames((red, blue), (blue, red)), text).target.label == "blue"
+
+
+@pytest.mark.requirement("R-18")
+def test_what_is_known_of_an_object_outlives_the_average():
+    can = replace(seen("cola"), color="blue", kind="can")
+    target = look(frames((can,), (can,)), "blue can").target
+    assert target.attributes == ("cola", "blue", "can", "cylinder")
+
+
+@pytest.mark.requirement("R-18")
+def test_the_same_object_is_followed_wherever_it_is_and_not_its_twin():
+    """The words would choose the other one; what stood next to it and still does is not it."""
+    a, b = seen(x=0.20), seen(x=0.32)
+    before = look(frames((a, b)))
+    moved = seen(x=0.50)
+    assert look(frames((b, moved)), same=before).target.p_base[0] == pytest.approx(0.50)
+    assert look(frames((b, a)), same=before).target.p_base[0] == pytest.approx(0.20)
+    near = seen(x=0.28, y=-0.22)
+    assert look(frames((b, near)), same=before).target.p_base[0] == pytest.approx(0.28)
+    with pytest.raises(OpenArmError, match=r"'red' that was at .* is not in view; in view: red") as error:
+        look(frames((b,)), same=before)
+    assert error.value.code is Code.UNKNOWN_OBJECT
 
 
 @given(st.floats(-3.0, 3.0), st.integers(-2, 2))

@@ -132,7 +132,14 @@ def test_what_others_hide_is_asked_for_again_when_they_are_gone():
     order = Order(("red", "blue"))
     order.done(GraspRequest("red"), Code.NOTHING_DETECTED, "something hides its outline")
     order.done(GraspRequest("blue"), Code.OK, "", (0.3, 0.2, 0.4))
-    assert order.next() == GraspRequest("red")
+    assert order.next() == GraspRequest("red", exclude_near=((0.3, 0.2),))
     order.done(GraspRequest("red"), Code.TOO_WIDE, "for good")
     assert order.next() is None
     assert order.faults() == {"red": "TOO_WIDE: for good"}
+
+
+@pytest.mark.requirement("P-03", "R-18")
+def test_what_was_placed_is_not_asked_for_again_by_another_word():
+    order = Order(("cola", "can"))
+    order.done(GraspRequest("cola"), Code.OK, "", (0.3, 0.2, 0.4))
+    assert order.next() == GraspRequest("can", exclude_near=((0.3, 0.2),))

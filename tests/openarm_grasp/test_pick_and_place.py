@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from openarm_common.errors import Code
+from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
 from openarm_grasp.strategies.states import State
 from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Observe, ToBase, Wait
@@ -86,11 +86,54 @@ def test_a_place_that_is_asked_for_is_used(world):
     assert outcome.place_position == pytest.approx((0.3, -0.35, 0.4))
 
 
-def test_without_a_label_the_retry_keeps_to_the_same_object(worlds, box):
-    world = worlds(box("red", 0.26, -0.2), replace(box("blue", 0.26, 0.2), score=0.95))
+@pytest.mark.requirement("R-18", "A-70")
+@pytest.mark.parametrize("words", ["", "cube", "leftmost cube", "cube left of the blue"])
+def test_the_retry_keeps_to_the_same_object_whatever_the_words_fit_by_then(worlds, box, words):
+    """The first attempt misses; then another one is first, further left, and the one that was asked for has moved."""
+    red, blue = (replace(box(label, 0.26, y), kind="cube") for label, y in (("red", -0.2), ("blue", -0.35)))
+    world = worlds(red, blue, box("green", 0.26, -0.5))
     world.slips = 1
-    outcome = world.grasp("")
-    assert (outcome.label, outcome.attempts) == ("blue", 2)
+
+    def swap(call):
+        if isinstance(call, Grip) and call.position == 0.0 and len(world.done(PlanGrasp)) == 1:
+            left, right = (replace(box(label, 0.26, y), kind="cube") for label, y in (("blue", 0.1), ("red", -0.32)))
+            world.objects = {"blue": left, "red": right, "green": world.objects["green"]}
+
+    world.faults.append(swap)
+    outcome = world.grasp(words)
+    assert (outcome.code, outcome.label, outcome.attempts) == (Code.OK, "red", 2), outcome.message
+
+
+@pytest.mark.requirement("R-18", "B-18", "B-58")
+@pytest.mark.parametrize(
+    ("words", "label"),
+    [
+        ("cola", "cola"),
+        ("can", "cola"),
+        ("red can", "cola"),
+        ("cylinder", "cola"),
+        ("red cube", "Tasse"),
+        ("TASSE", "Tasse"),
+    ],
+)
+def test_an_object_is_asked_for_by_class_colour_shape_or_several_words(worlds, box, words, label):
+    can = replace(box("cola", 0.26, -0.2), color="red", kind="can")
+    world = worlds(can, replace(box("Tasse", 0.26, 0.2), color="red", kind="cube"))
+    outcome = world.grasp(words)
+    assert (outcome.code, outcome.label) == (Code.OK, label), outcome.message
+    outcome = world.grasp("blue can")
+    assert outcome.code is Code.UNKNOWN_OBJECT
+    # the scripted hand puts down what has no further attributes
+    assert outcome.message.startswith("no 'blue can' in view; in view: ")
+
+
+@pytest.mark.requirement("R-18")
+def test_what_is_held_is_asked_for_by_any_of_its_attributes(worlds, box):
+    world = worlds(replace(box("cola", 0.26, -0.2), color="red", kind="can"))
+    assert world.grasp("can", phase="pick").success
+    with pytest.raises(OpenArmError, match=r"asked to place 'blue'.* holds 'cola'"):
+        world.grasp("blue", phase="place")
+    assert world.grasp("red can", phase="place").success
 
 
 def test_others_are_obstacles_and_the_target_may_be_touched(world):

@@ -13,17 +13,22 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_motion.collision.solids import Sphere
 from openarm_motion.config import MotionConfig
+from openarm_motion.planning.approach import ApproachRequest, Target
+from openarm_motion.planning.arm import Arm
 from openarm_motion.service.motion_service import MotionService
 from openarm_motion.service.requests import (
     ArmGoal,
     ExecuteRequest,
+    LineGoal,
     MoveArmsRequest,
     MoveRequest,
     NamedGoal,
+    PlanApproachRequest,
     PoseGoal,
 )
 from openarm_motion.service.robot import Outcome
 from openarm_motion.timing.trajectory import Motion
+from openarm_sim_bridge.control.trajectory import JointSpline
 
 TICK_NS = 10_000_000
 
@@ -234,6 +239,46 @@ def test_a_dual_arm_motion_moves_both_arms_from_the_same_moment(bench) -> None:
     assert left.begin_ns == right.begin_ns > 0
     assert answer.plan is not None
     assert answer.plan.clearance >= 0.02
+
+
+@pytest.mark.requirement("A-67")
+@pytest.mark.parametrize("timing", ["blended", "stops", "quintic"])
+def test_what_a_controller_executes_begins_and_ends_with_zero_velocity_and_acceleration(
+    bench, arms, description, table, home, timing: str
+) -> None:
+    """By positions alone: from rest with a limited jerk a joint moves at most jerk t³/6 in a time t, else more."""
+    if timing != MotionConfig().planning.timing:
+        config = MotionConfig.model_validate({"planning": {"timing": timing}})
+        bench = Bench({side: Arm(side, description, config, [table]) for side in arms}, description, home)
+    service, robot = bench.service, bench.robot
+    down = se3.rotation_from_z_y((0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
+    way = Target("spot", se3.make(down, (0.3, -0.2, 0.5)), np.array([0, 0, 0.08]), np.array([0, 0, 0.1]), 0.0)
+    (planned,) = bench.run(service.plan_approach(PlanApproachRequest("right", ApproachRequest((way,)))))
+    assert planned.plan is not None, planned.message
+    for part in planned.plan.parts:
+        (answer,) = bench.run(service.execute(ExecuteRequest("right", part)))
+        assert answer.code is Code.OK, answer.message
+    on_line = LineGoal(se3.make(down, (0.33, -0.22, 0.55)))
+    both = tuple(ArmGoal(arm, NamedGoal("official_home")) for arm in arms)
+    for request in (
+        service.move(MoveRequest("right", on_line)),
+        bench.move(),
+        service.move_arms(MoveArmsRequest(both)),
+    ):
+        (answer,) = bench.run(request)
+        assert answer.code is Code.OK, answer.message
+    executed = [(side, goal.motion) for side in arms for goal in robot.controllers[side].goals]
+    assert len(executed) >= 7
+    for side, motion in executed:
+        spline = JointSpline(motion.t, motion.q, motion.v, motion.a)
+        first, last = spline.sample(float(motion.t[0]))[0], spline.sample(spline.end_s)[0]
+        jerk = arms[side].limits(1.0).jerk
+        for h in (0.001, 0.002, 0.005, 0.01):
+            for moved in (
+                spline.sample(float(motion.t[0]) + h)[0] - first,
+                last - spline.sample(spline.end_s - h)[0],
+            ):
+                assert np.all(np.abs(moved) <= 1.1 * jerk * h**3 / 6.0 + 1e-12), (side, h, moved)
 
 
 def test_an_unreachable_pose_carries_the_nearest_alternative(bench) -> None:

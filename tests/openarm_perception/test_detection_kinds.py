@@ -10,7 +10,6 @@ import pytest
 
 from openarm_common.config import load_config
 from openarm_common.resources import config_dir
-from openarm_common.ros.detections import class_ids
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.kinds import DetectorKind
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
@@ -28,7 +27,7 @@ CLASSES = ("box", "cylinder")
 def perceive(tabletop, tmp_path):
     """What a kind of detector makes of things, of which the network tells (class, score, shift of its box, px)."""
 
-    def run(kind: DetectorKind, things, answers=None, spoil=None, robot=None) -> Perceived:
+    def run(kind: DetectorKind, things, answers=None, spoil=None, robot=None, classes=CLASSES) -> Perceived:
         view = tabletop.render(things)
         rows = []
         for i, thing in enumerate(things):
@@ -41,7 +40,7 @@ def perceive(tabletop, tmp_path):
                 grow = say[3] if len(say) > 3 else 0.0
                 low, high = say[2] - grow, say[2] + grow
                 rows.append((u + low, v + low, u + w + high, v + h + high, say[0], say[1]))
-        model = write_network(tmp_path / "net.onnx", boxes(*rows), (1, 3, 480, 640), str(list(CLASSES)))
+        model = write_network(tmp_path / "net.onnx", boxes(*rows), (1, 3, 480, 640), str(list(classes)))
         localizer = Localizer(LocalizerConfig(), LIMITS, tabletop.table_height)
         pipeline = make_pipeline(kind, COLORS, NetworkConfig(model=str(model)), localizer)
         rgb = view.rgb if spoil is None else spoil(view.rgb.copy())
@@ -70,14 +69,38 @@ def test_boxes_of_a_network_become_objects_in_place(tabletop, perceive, shift: f
     for thing, label in zip(things, ("red", "blue", "box"), strict=True):
         assert np.abs(found[label].p_base - thing.position).max() < 0.003
         assert np.abs(np.array(found[label].size) - [*sorted(thing.size[:2]), thing.size[2]]).max() < 0.004
-    assert class_ids(found["red"]) == ("red", "box")
-    assert class_ids(found["blue"]) == ("blue", "can", "cylinder")
-    assert class_ids(found["box"]) == ("box", "cube")
+    assert found["red"].attributes == ("red", "box")
+    assert found["blue"].attributes == ("blue", "can", "cylinder")
+    assert found["box"].attributes == ("box", "cube")
+
+
+@pytest.mark.requirement("R-18")
+@pytest.mark.parametrize("kind", ["network", "both"])
+@pytest.mark.parametrize("name", ["cola", "Coca Cola", "Tasse", "orange", "Käse"])
+def test_class_colour_and_shape_of_an_object_are_told_apart(tabletop, perceive, kind, name) -> None:
+    """Of a network of the user's own: a class that names no shape says what it is; the outline says its shape."""
+    seen = perceive(kind, three(tabletop), classes=("other", name))
+    found = {place.color: place for place in seen.located}
+    assert found["blue"].attributes == (name, "blue", "can", "cylinder")
+    assert found["red"].attributes == ("other", "red", "box")
+    assert found[""].attributes == ("other", "cube", "box")
+    assert found["blue"].label == name
+
+
+@pytest.mark.requirement("R-18")
+def test_a_class_that_names_a_shape_is_the_shape(tabletop, perceive) -> None:
+    """Also one that would follow from the extents: the network knows better."""
+    seen = perceive("network", three(tabletop)[1:2], {0: (1, 0.9, 0.0)}, classes=("cube", "cylinder"))
+    assert seen.located[0].attributes == ("blue", "can", "cylinder")
+    seen = perceive("network", three(tabletop)[:1], {0: (0, 0.9, 0.0)}, classes=("cube", "can"))
+    assert seen.located[0].attributes == ("red", "cube", "box")
+    seen = perceive("network", three(tabletop)[2:], {0: (1, 0.9, 0.0)}, classes=("cube", "can"))
+    assert seen.located[0].attributes == ("cylinder", "can")
 
 
 def test_a_round_outline_in_depth_is_no_box_whatever_the_network_says(tabletop, perceive) -> None:
     seen = perceive("network", three(tabletop), {0: (1, 0.9, 0.0), 1: (0, 0.9, 0.0)})
-    found = {place.label: class_ids(place) for place in seen.located}
+    found = {place.label: place.attributes for place in seen.located}
     assert found["blue"] == ("blue", "can", "cylinder")
     assert found["red"] == ("red", "cylinder")  # it may lie
 

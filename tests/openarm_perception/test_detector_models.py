@@ -11,7 +11,6 @@ import pytest
 
 from benchmarks.localization import Studio, errors
 from openarm_common.resources import models_dir
-from openarm_common.ros.detections import class_ids
 from openarm_common.scene.scene import SHAPES, random_scene
 from openarm_perception.config import DetectNodeConfig
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
@@ -53,7 +52,7 @@ def test_the_shipped_network_finds_random_scenes(kind) -> None:
         items = {item.label: item for item in scene.objects}
         assert sorted(place.label for place in seen.located) == sorted(items), (seed, seen.refused)
         for place in seen.located:
-            assert items[place.label].shape in class_ids(place)
+            assert items[place.label].shape in place.attributes
             assert np.abs(errors(place, items[place.label], scene.table))[0] < 3.0
     studio.close()
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
@@ -17,7 +18,7 @@ from openarm_common.resources import config_dir
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
 from openarm_perception.detection.pipeline import Pipeline
-from openarm_perception.geometry.depth import Deprojector, DepthLimits
+from openarm_perception.geometry.depth import Deprojector, DepthLimits, View
 from openarm_perception.geometry.filters import CloudFilter, FilterConfig
 from openarm_perception.geometry.table import measure_table
 
@@ -101,10 +102,14 @@ def test_the_table_is_measured_to_two_millimetres_with_things_on_it_or_refused(
     depth = (z + rng.normal(0.0, 0.002, z.shape)).astype(np.float32)
     depth[:40] = rng.uniform(0.3, 0.55, (40, 160))
     depth[rng.random(depth.shape) < 0.05] = np.nan
-    found = measure_table(depth, k, T, LIMITS, 0.4 + off)
+
+    def view(depth: NDArray[np.uint16 | np.float32]) -> View:
+        return View(np.zeros((120, 160, 3), np.uint8), depth, k, T)
+
+    found = measure_table(view(depth), LIMITS, 0.4 + off)
     seen = np.isfinite(depth[40:])
     middle = (T[:3, 3] + directions[40:][seen] * z[40:][seen][:, None]).mean(axis=0)
     assert abs(found.height - middle[2]) < 0.002 + 0.1 * np.sin(tilt)
     assert abs(found.tilt - tilt) < 0.01
     with pytest.raises(OpenArmError, match="0 points of a level surface"):
-        measure_table(np.zeros((120, 160), np.uint16), k, T, LIMITS, 0.4)
+        measure_table(view(np.zeros((120, 160), np.uint16)), LIMITS, 0.4)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -167,3 +168,21 @@ def test_other_numbers_do_not_read_the_file_again(tmp_path) -> None:
     for read_with in ({"model": str(network.path.with_name("other.onnx"))}, {"width": 320}):
         with pytest.raises(OpenArmError, match="there is no network"):
             network.changed(network.config.model_copy(update=read_with))
+
+
+@pytest.mark.parametrize(
+    "names", ["[" * 100_000, "{'x': 'box'}", "5", "(" + "1+" * 20_000 + "1)", f"['{'x' * 100_000}']", "{0: 'box'"]
+)
+def test_hostile_names_are_refused_in_a_sentence(tmp_path: Path, names: str) -> None:
+    path = write_network(tmp_path / "a.onnx", boxes(), names=names)
+    with pytest.raises(OpenArmError, match=r"a\.onnx: its metadata has names") as caught:
+        NetworkDetector(NetworkConfig(model=str(path)))
+    assert len(caught.value.message) < 500
+
+
+@pytest.mark.parametrize("text", ["names: 5", "names: {x: box}", "names: {[1]: box}"])
+def test_names_next_to_the_file_that_are_none_are_refused(tmp_path: Path, text: str) -> None:
+    path = write_network(tmp_path / "a.onnx", boxes(), names="")
+    path.with_suffix(".yaml").write_text(text)
+    with pytest.raises(OpenArmError, match=r"a\.yaml"):
+        NetworkDetector(NetworkConfig(model=str(path)))

@@ -8,6 +8,8 @@ import pytest
 from openarm_common.config import load_config
 from openarm_common.errors import OpenArmError
 from openarm_common.resources import config_dir
+from openarm_grasp.config import DetectConfig
+from openarm_grasp.perception.detections import Frame, find
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.localize import Localizer, LocalizerConfig
 from openarm_perception.detection.pipeline import Pipeline
@@ -41,8 +43,33 @@ def test_the_pipeline_ranks_and_filters(tabletop, pipeline) -> None:
     view = tabletop.render([near, far])
     central = Pipeline(pipeline.detector, pipeline.localizer, "centre")
     assert [p.label for p in run(central, view).located] == ["red", "blue"]
-    only = Pipeline(pipeline.detector, pipeline.localizer, label="blue")
-    assert [p.label for p in run(only, view).located] == ["blue"]
+    for words in ("blue", "cylinder", "Blue cylinder"):
+        only = run(Pipeline(pipeline.detector, pipeline.localizer, label=words), view)
+        assert ([p.label for p in only.found], [p.label for p in only.located]) == (["blue"], ["blue"])
+
+
+@pytest.mark.requirement("B-27")
+def test_what_is_partly_hidden_comes_after_what_is_seen_whole(tabletop, pipeline) -> None:
+    """Certain in the image, less certain in space: the order is that of the scores that are published."""
+    hidden = tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.16, 0.10, 0.3)
+    before = tabletop.Thing("blue", "cylinder", (0.066, 0.066, 0.115), 0.235, 0.115)
+    whole = tabletop.Thing("green", "box", (0.05, 0.05, 0.05), 0.27, -0.2)
+    located = run(pipeline, tabletop.render([hidden, before, whole])).located
+    assert [p.score for p in located] == sorted((p.score for p in located), reverse=True)
+    assert located[-1].label == "red"
+
+
+@pytest.mark.parametrize(("policy", "first"), [("score", "green"), ("centre", "red")])
+@pytest.mark.requirement("B-27")
+def test_what_is_grasped_of_several_that_fit_follows_from_the_policy(tabletop, pipeline, policy, first) -> None:
+    """The cube in the middle is partly hidden and so less certain than the other; the can is asked for by neither."""
+    things = [
+        tabletop.Thing("red", "box", (0.05, 0.05, 0.05), 0.23, 0.0, 0.3),
+        tabletop.Thing("green", "box", (0.05, 0.05, 0.05), 0.27, -0.3),
+        tabletop.Thing("blue", "cylinder", (0.066, 0.066, 0.115), 0.305, 0.035),
+    ]
+    seen = run(Pipeline(pipeline.detector, pipeline.localizer, policy), tabletop.render(things))
+    assert find([Frame(0, seen.boxes)], "cube", DetectConfig()).target.label == first
 
 
 def test_what_cannot_be_measured_is_still_in_the_way(tabletop, pipeline) -> None:

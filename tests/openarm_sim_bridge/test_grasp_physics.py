@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.grasp_trials import BACK, MUJOCO_DEFAULTS, OBJECTS, OPEN, TABLE, Trial, make, quintic
+from benchmarks.grasp_trials import BACK, MUJOCO_DEFAULTS, OBJECTS, OPEN, Trial, make, quintic
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -66,16 +66,31 @@ def test_closing_on_nothing_shows_in_gap_and_effort() -> None:
     assert trial.effort < 1.0
 
 
+@pytest.mark.parametrize("kind", ["cube_4cm", "box", "cylinder", "can"])
 @pytest.mark.requirement("A-07")
-def test_repeated_grasps_of_one_object_neither_throw_nor_lose_it() -> None:
-    item, error = make("cylinder", 3)
+def test_a_hundred_grasps_in_a_row_neither_throw_nor_lose_an_object(kind: str) -> None:
+    """25 of each object, aimed 2 mm beside where it stands then: lift, put down, leave, twice as fast as the suite."""
+    item, error = make(kind, 3)
     trial = Trial(item, "right", error)
-    for _ in range(6):
-        trial.run(1.2, lambda u: trial.target(trial.grasp.q(BACK * (1 - quintic(u)))))
-        trial.run(0.6, lambda u: trial.fingers(OPEN * (1 - u)))
-        trial.run(0.3)
-        trial.lift()
-        assert trial.position[2] - TABLE.top_z > 0.12
-        trial.place()
-        assert trial.position[2] == pytest.approx(TABLE.top_z + item.size[2] / 2, abs=1e-3)
-    assert trial.speed < 0.6
+    start, rng = trial.position, np.random.default_rng(3)
+    trial.pick()
+    trial.place()
+
+    def go(seconds: float, q_from: np.ndarray, q_to: np.ndarray) -> np.ndarray:
+        trial.run(seconds, lambda u: trial.target(q_from + (q_to - q_from) * quintic(u)))
+        return q_to
+
+    q, trial.speed = trial.grasp.q(BACK), 0.0
+    for _ in range(25):
+        before = trial.position
+        trial.grasp = trial.grasp.at(before[:2] + rng.normal(0.0, 0.002, 2))
+        q = go(0.5, q, trial.grasp.q())
+        trial.run(0.3, lambda u: trial.fingers(OPEN * (1.0 - u)))
+        q = go(0.4, q, trial.grasp.q(up=0.06))
+        assert trial.position[2] - start[2] > 0.05
+        q = go(0.4, q, trial.grasp.q(up=0.001))
+        trial.run(0.2, lambda u: trial.fingers(OPEN * u))
+        q = go(0.4, q, trial.grasp.q(BACK))
+        assert trial.position[2] == pytest.approx(start[2], abs=1e-3)  # stands as before
+        assert np.linalg.norm(trial.position - before) < 0.02
+    assert trial.speed < 0.6  # that of the hand is 0.3 m/s

@@ -76,24 +76,35 @@ def test_ticks_keep_pace_with_the_wall_clock(bench: Bench) -> None:
     bench.wait(lambda: len(bench.states) > 200)
     (wall_0, first), (wall_1, last) = bench.states[50], bench.states[200]
     assert last.t_ns - first.t_ns == 1_500_000_000
-    assert wall_1 - wall_0 == pytest.approx(1.5, abs=0.05)
+    assert wall_1 - wall_0 == pytest.approx(1.5, rel=0.02)
     assert bench.simulation.real_time_factor.value == pytest.approx(1.0, abs=0.05)
     figures = bench.simulation.periods.figures()
     assert figures.n > 150
     assert figures.p50_ms == pytest.approx(10.0, abs=1.0)
+    # A window of two seconds: that the machine halts once is not the simulation's.
+    bench.wait(lambda: p99(bench.states[-200:]) < 0.015, 20.0)
 
 
-@pytest.mark.parametrize("speed", [5.0, 0.0])
+def p99(states: list[tuple[float, JointReadout]]) -> float:
+    """Of the time from state to state, s."""
+    return float(np.percentile(np.diff([wall for wall, _ in states]), 99))
+
+
+@pytest.mark.parametrize("speed", [5.0, 1.5, 0.0])
 @pytest.mark.requirement("A-20")
 def test_a_faster_world_is_still_published_at_a_hundred_hertz(speed: float) -> None:
+    def rate(count: int) -> float:
+        """Of the last so many states, Hz."""
+        return count / (bench.states[-1][0] - bench.states[-1 - count][0]) if len(bench.states) > count else 0.0
+
     bench = Bench(speed)
     bench.simulation.start()
     try:
-        bench.wait(lambda: len(bench.states) > 100)
+        bench.wait(lambda: rate(100) == pytest.approx(100.0, rel=0.02), 20.0)
     finally:
         bench.simulation.stop()
     (wall_0, first), (wall_1, last) = bench.states[0], bench.states[-1]
-    assert len(bench.states) / (wall_1 - wall_0) < 120.0
+    assert rate(len(bench.states) - 1) < 102.0
     ratio = (last.t_ns - first.t_ns) * 1e-9 / (wall_1 - wall_0)
     assert ratio > 6.0 if speed == 0.0 else ratio == pytest.approx(speed, rel=0.1)
 

@@ -16,7 +16,7 @@ import numpy as np
 from sensor_msgs.msg import CameraInfo, Image
 
 from openarm_bringup.bags.bag import Bag
-from openarm_bringup.bags.ros.messages import messages_of
+from openarm_bringup.bags.ros.messages import contents, messages_of
 from openarm_calibration.board.board import CircleGrid
 from openarm_calibration.board.detect import detect
 from openarm_calibration.ros.image_capture import grey
@@ -28,6 +28,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import depth_image, intrinsics_from_info, rgb_image, stamp_to_ns, transform_to_matrix
 from openarm_common.ros.node import BASE_FRAME
+from openarm_common.ros.tf import table_height
 from openarm_common.scene.scene import load_scene
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
 from openarm_octomap.grid import DepthScan
@@ -74,7 +75,7 @@ def numbers_of(
 
     Args:
         bag: Open; with colour and depth of a camera of the suite, /joint_states and /tf_static.
-        scene: Scene whose table the objects stand on.
+        scene: Scene whose table the objects stand on, for a bag without the frame `table`.
         on_progress: Called with the number of frames done, and of all.
 
     Returns:
@@ -85,9 +86,11 @@ def numbers_of(
         OpenArmError: NOTHING_DETECTED, when the bag has no frame that could be used.
     """
     description = RobotDescription.load()
-    shots, states = _read(bag, description)
+    with contents(bag):
+        shots, states = _read(bag, description)
     detector = ColorDetector(load_config(config_dir() / "params" / "detector.yaml", ColorDetectorConfig))
-    table = load_scene(scene).table.top_z
+    said = [height for message in messages_of(bag, ["/tf_static"])["/tf_static"] if (height := table_height(message))]
+    table = said[-1] if said else load_scene(scene).table.top_z
     mapper = Mapper(description, GridConfig(), FilterConfig(), FieldConfig())
     found = _Found()
     searched_ns: dict[str, int] = {}
@@ -121,7 +124,7 @@ def _read(bag: Bag, description: RobotDescription) -> tuple[list[_Shot], RobotSt
         for edge in message.transforms:
             states.set_static(edge.header.frame_id, edge.child_frame_id, transform_to_matrix(edge.transform))
     for message in sorted(found["/joint_states"], key=_stamp):
-        states.add_joint_state(_stamp(message), message.name, message.position)
+        states.add_joint_state(_stamp(message), message.name, message.position, message.velocity)
     shots: dict[tuple[int, str], _Shot] = {}
     for topic, (name, part) in topics.items():
         for message in found[topic]:

@@ -3,18 +3,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rclpy.serialization import deserialize_message
 
-from openarm_bringup.bags.bag import Bag
+from openarm_bringup.bags.bag import Bag, Record, damaged
+from openarm_bringup.bags.mcap import DAMAGE
 from openarm_bringup.messages import interface
+from openarm_common.errors import Code, OpenArmError
+
+
+def message_of(bag: Bag, record: Record) -> Any:
+    """Return the message of a record.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, when its bytes are not of its type.
+    """
+    try:
+        return deserialize_message(record.data, interface(record.type))
+    except OpenArmError:
+        raise
+    # rclpy raises types of its own, and those of the middleware's parser
+    except Exception as error:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"{bag.path} has a message of {record.topic} at {record.t_ns} ns that is no {record.type}"
+            f" ({len(record.data)} bytes); the bag is damaged",
+        ) from error
 
 
 def messages_of(bag: Bag, topics: Iterable[str]) -> dict[str, list[Any]]:
-    """Return the messages of each topic, in the order in which they were received; none of a topic that is missing."""
+    """Return the messages of each topic, in the order in which they were received; none of a topic that is missing.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, as `message_of`.
+    """
     found: dict[str, list[Any]] = {topic: [] for topic in topics}
     for record in bag.records(list(found)):
-        found[record.topic].append(deserialize_message(record.data, interface(record.type)))
+        found[record.topic].append(message_of(bag, record))
     return found
+
+
+@contextmanager
+def contents(bag: Bag) -> Iterator[None]:
+    """Turn what reading the fields of a damaged message ends in into one sentence.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT.
+    """
+    try:
+        yield
+    except DAMAGE as error:
+        raise damaged(bag.path, error) from error

@@ -7,12 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import yaml
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import Image
-
 from openarm_bringup.bags.bag import Bag
-from openarm_bringup.bags.ros.messages import messages_of
+from openarm_bringup.bags.ros.messages import contents, message_of, messages_of
 from openarm_calibration.board.board import Board
 from openarm_calibration.config import CalibrationConfig
 from openarm_calibration.ros.image_capture import grey
@@ -20,6 +16,7 @@ from openarm_calibration.sampling.gate import GateConfig
 from openarm_calibration.sampling.samples import SampleSet, head_of
 from openarm_calibration.sampling.stills import Picker, Stretch, stretches
 from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
+from openarm_common.config import parse_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import intrinsics_from_info, stamp_to_ns
@@ -59,7 +56,8 @@ def samples_of(
             rectified; NO_TRANSFORM, when nothing says which link carries the camera.
     """
     camera = _camera(bag, camera)
-    small = _small(bag, camera)
+    with contents(bag):
+        small = _small(bag, camera)
     optics = next(iter(small.optics.values()))
     configured = load_cameras()
     base = BASE_FRAME if BASE_FRAME in small.robot.links else small.robot.root
@@ -73,13 +71,14 @@ def samples_of(
     samples = SampleSet(head, small.robot)
     images = f"/{camera}{_IMAGES}"
     # The first bytes of a message are its stamp; the pixels are read in a second pass, where they are needed.
-    stamps = [_stamp(record.data) for record in bag.records([images])]
+    with contents(bag):
+        stamps = [_stamp(record.data) for record in bag.records([images])]
     found = stretches(stamps, small.states, samples.joint_names, small.robot, GateConfig())
     picker = Picker(samples, found)
     for record in bag.records([images]):
         t_ns = _stamp(record.data)
         if picker.wants(t_ns):
-            picker.offer(t_ns, grey(deserialize_message(record.data, Image)), small.optics.get(t_ns, optics))
+            picker.offer(t_ns, grey(message_of(bag, record)), small.optics.get(t_ns, optics))
     return samples, found
 
 
@@ -154,9 +153,9 @@ def _ancestors(parents: Mapping[str, str], frame: str) -> list[str]:
 def _seed(bag: Bag) -> int | None:
     """Mount seed of the simulation that a bag was recorded from, by the parameters it carries."""
     try:
-        nodes: Any = yaml.safe_load(bag.custom.get("parameters", ""))
+        nodes: Any = parse_yaml(bag.custom.get("parameters", ""), "parameters")
         seed = nodes["mujoco_bridge"]["ros__parameters"]["mount_seed"]
-    except (yaml.YAMLError, KeyError, TypeError):
+    except (OpenArmError, KeyError, TypeError):
         return None  # of a real robot, or recorded by something else
     return seed if isinstance(seed, int) and seed >= 0 else None
 

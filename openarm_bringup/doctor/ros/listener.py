@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections import Counter
 from functools import partial
 from typing import Any
@@ -18,8 +19,8 @@ from openarm_bringup.supervision.runs import RunRecord
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import QOS_COMMAND
 
-#: Long enough for two rounds of /diagnostics, s.
-_LISTEN_S = 2.5
+#: Long enough for the rates, and for two rounds of /diagnostics where a node is silent in the first, s.
+_RATES_S, _LISTEN_S = 1.2, 2.5
 
 
 def listen(run: RunRecord) -> GraphStatus:
@@ -34,7 +35,7 @@ def listen(run: RunRecord) -> GraphStatus:
 
 def _listen(run: RunRecord) -> GraphStatus:
     os.environ.update(variables(run.domain, run.discovery))
-    counts = Counter[str]()
+    counts, first = Counter[str](), dict[str, float]()
     diagnostics: dict[str, tuple[bool, str]] = {}
 
     def note(message: DiagnosticArray) -> None:
@@ -46,14 +47,17 @@ def _listen(run: RunRecord) -> GraphStatus:
         names = [name for name, _ in peer.node.get_node_names_and_namespaces() if not name.startswith("_")]
         for topic, kind in peer.topics().items():
             if topic in RATES:
-                count: Any = partial(_count, counts, topic)
+                count: Any = partial(_count, counts, first, topic)
                 peer.node.create_subscription(interface(kind), topic, count, peer.offered(topic), raw=True)
         peer.node.create_subscription(DiagnosticArray, "/diagnostics", note, QOS_COMMAND)
-        began = peer.node.get_clock().now()
-        peer.spin_until(lambda: False, _LISTEN_S)
-        seconds = (peer.node.get_clock().now() - began).nanoseconds * 1e-9
-    return GraphStatus({topic: n / seconds for topic, n in counts.items()}, diagnostics, names)
+        enough, expected = time.monotonic() + _RATES_S, set(run.ready_nodes)
+        peer.spin_until(lambda: time.monotonic() > enough and expected <= diagnostics.keys(), _LISTEN_S)
+        now = time.monotonic()
+    # From the first one on: until then the publisher did not know of this subscriber.
+    rates = {topic: (n - 1) / (now - first[topic]) for topic, n in counts.items()}
+    return GraphStatus(rates, diagnostics, names)
 
 
-def _count(counts: Counter[str], topic: str, _: bytes) -> None:
+def _count(counts: Counter[str], first: dict[str, float], topic: str, _: bytes) -> None:
+    first.setdefault(topic, time.monotonic())
     counts[topic] += 1

@@ -21,7 +21,20 @@ const spoken = (state) => state.charAt(0) + state.slice(1).toLowerCase().replace
 /** Object and arm of a step: two objects may be picked simultaneously. */
 const whose = ({ label, arm }) => [label, arm && `${arm} arm`].filter(Boolean);
 
+function tell(id, { success, code, message }) {
+  $(id).dataset.result = success ? "success" : "failure";
+  $(id).textContent = success ? message : `${code}: ${message}`;
+}
+
 export class GraspPanel {
+  /** @param ask sends a request and gives its answer */
+  constructor(ask) {
+    this.ask = ask;
+    this.plan = ""; // that waits
+    $("run").addEventListener("click", () => this.#answer(true));
+    $("reject").addEventListener("click", () => this.#answer(false));
+  }
+
   setStates(states) {
     this.states = states;
     $("track").replaceChildren(...states.map((state) => element("li", { title: spoken(state) })));
@@ -37,7 +50,15 @@ export class GraspPanel {
     [...$("track").children].forEach((bar, i) => {
       bar.className = at === 0 ? "" : i < at ? "past" : i === at ? "now" : "";
     });
+    this.plan = last.plan_id;
+    $("confirm").hidden = !this.plan;
+    $("confirm-answer").textContent = "";
     $("steps").replaceChildren(...steps.map((step) => this.#row(step)).reverse());
+  }
+
+  async #answer(accept) {
+    const answer = await this.ask("confirm", { plan_id: this.plan, accept });
+    if (!answer.success) tell("confirm-answer", answer); // else the next step says it
   }
 
   #row(step) {
@@ -97,28 +118,24 @@ export class AskPanel {
     if (outcome.running) {
       $("outcome").textContent = "";
     } else {
-      this.#tell("outcome", outcome);
+      tell("outcome", outcome);
     }
   }
 
   async #pick(form) {
-    const answer = await this.ask("pick", { label: this.label, arm: form.get("arm"), dry_run: form.has("dry_run") });
-    if (!answer.success) this.#tell("outcome", answer);
+    const [dry_run, confirm] = [form.has("dry_run"), form.has("confirm")];
+    const answer = await this.ask("pick", { label: this.label, arm: form.get("arm"), dry_run, confirm });
+    if (!answer.success) tell("outcome", answer);
   }
 
   async #cancel() {
     const answer = await this.ask("cancel");
-    if (!answer.success) this.#tell("outcome", answer); // else the end of the grasp says it, perhaps before this answer
+    if (!answer.success) tell("outcome", answer); // else the end of the grasp says it, perhaps before this answer
   }
 
   async #reset(order) {
     const answer = await this.ask("reset", order);
-    this.#tell("world-answer", answer);
-  }
-
-  #tell(id, { success, code, message }) {
-    $(id).dataset.result = success ? "success" : "failure";
-    $(id).textContent = success ? message : `${code}: ${message}`;
+    tell("world-answer", answer);
   }
 
   #enable() {

@@ -10,7 +10,7 @@ const token = new URLSearchParams(location.search).get("token") ?? "";
 const LAYERS = { detections: "Objects", cloud: "Cloud", map: "Map", plan: "Plan" };
 const wanted = new Set(["robot", "detections", "cloud", "plan"]);
 const scene = new Scene($("scene"), placeLabels);
-const grasp = new GraspPanel();
+const grasp = new GraspPanel(ask);
 const asking = new AskPanel(ask, markChosen);
 const health = new HealthPanel();
 

@@ -238,9 +238,24 @@ def _detections(message: Detection3DArray) -> str:
     return _text("detections", boxes=[_detection_box(item) for item in message.detections if item.results])
 
 
-def _plan(preview: MarkerArray) -> str:
-    """Paths of the tools on a plan."""
-    lines = [marker for marker in preview.markers if marker.type == Marker.LINE_STRIP]
+def _show_plans() -> Show:
+    """Paths of the tools: of the plan that waits for a person, else of the newest one."""
+    waits = False
+
+    def show(previews: list[MarkerArray], grasps: list[MarkerArray]) -> Items:
+        nonlocal waits
+        waiting = [marker for marker in grasps[-1].markers if marker.ns.startswith("plan/")] if grasps else []
+        waits = bool(waiting) if grasps else waits
+        if waiting:
+            yield "plan", _plan(waiting)
+        elif previews and not waits:
+            yield "plan", _plan(previews[-1].markers)
+
+    return show
+
+
+def _plan(markers: Sequence[Marker]) -> str:
+    lines = [marker for marker in markers if marker.type == Marker.LINE_STRIP]
     return _text("plan", ways=[np.round([xyz(p) for p in line.points], 4).tolist() for line in lines if line.points])
 
 
@@ -275,7 +290,10 @@ def makers(
             period=0.04,
         ),
         "detections": maker(_newest(_detections, "detections"), detections),
-        "plan": maker(_newest(_plan, "plan"), Source(MarkerArray, "/motion/preview", QOS_LATCHED)),
+        "plan": maker(
+            _show_plans,
+            *(Source(MarkerArray, topic, QOS_LATCHED) for topic in ("/motion/preview", "/grasp/markers")),
+        ),
         "map": maker(_newest(_map, "map"), Source(Octomap, "/octomap_binary", QOS_LATCHED, silence=5.0), period=0.5),
         "cloud": maker(lambda: _show_cloud(description, chosen), *(static, depth, images[cloud], info), period=0.25),
     }
@@ -291,7 +309,7 @@ def _text(kind: str, **values: Any) -> str:
 
 
 def _step(message: GraspStatus) -> dict[str, Any]:
-    names = ("state", "previous_state", "reason", "attempt", "label", "arm")
+    names = ("state", "previous_state", "reason", "attempt", "label", "arm", "plan_id")
     return {"t": stamp_to_ns(message.header.stamp) * 1e-9, **{name: getattr(message, name) for name in names}}
 
 

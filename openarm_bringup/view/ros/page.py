@@ -11,10 +11,10 @@ from typing import Any
 
 from action_msgs.srv import CancelGoal
 from openarm_interfaces.action import Pick
-from openarm_interfaces.srv import ResetWorld
+from openarm_interfaces.srv import ConfirmPlan, ResetWorld
 
 from openarm_bringup.view.ros.layers import Layer, makers
-from openarm_bringup.view.server import Item, Order, Reset
+from openarm_bringup.view.server import Confirmation, Item, Order, Reset
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
@@ -79,11 +79,21 @@ class GraphView(ContextNode):
         Raises:
             OpenArmError: NOT_READY, when no grasp node answers; BUSY; TIMEOUT.
         """
-        goal = Pick.Goal(label=order.label, arm=order.arm, dry_run=order.dry_run)
+        goal = Pick.Goal(label=order.label, arm=order.arm, dry_run=order.dry_run, confirm=order.confirm)
         with self._picking:
             result = self._ask.do(Pick, "/grasp/pick", goal, timeout=_PICK_S, stop=self._stop_picking)
         names = ("success", "outcome", "code", "message", "label", "arm", "attempts", "duration")
         return {name: getattr(result, name) for name in names}
+
+    def confirm(self, answer: Confirmation) -> tuple[bool, str]:
+        """Confirm or reject the plan that waits, of whichever client.
+
+        Raises:
+            OpenArmError: NOT_READY, when no grasp node answers.
+        """
+        request = ConfirmPlan.Request(plan_id=answer.plan_id, accept=answer.accept)
+        response = self._ask.call(ConfirmPlan, "/grasp/confirm", request, _ANSWER_S)
+        return response.success, response.message
 
     def cancel(self) -> tuple[bool, str]:
         """Cancel the grasp that runs, of whichever client of the action.

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
+from openarm_interfaces.srv import SaveRecording
 
 from openarm_bringup.supervision import environment
 from openarm_bringup.supervision.graph import load_graph
@@ -17,6 +18,7 @@ from openarm_bringup.supervision.session import running_graph, work_until_stoppe
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.campaign.options import CampaignOptions, Row
+from openarm_evaluation.campaign.record import write_reason
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import add_clearance, crashed_row, row_of
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
     from openarm_evaluation.judging.ros.observer import Observer
     from openarm_grasp.ros.client import GraspClient
 
+#: Longest wait for a recording, s: a busy machine takes a while.
+_WRITTEN_S = 60.0
 #: Sets without fault injection, in which a request does not depend on the outcome of those before.
 GRAPH_SETS = ("nominal", "handover", "push", "pairs", "pairs_in_turn")
 
@@ -71,9 +75,38 @@ async def _run(options: CampaignOptions, seeds: Sequence[int], folder: Path, kee
             def work() -> None:
                 for seed in seeds:
                     row = _row(observer, client, make_task(options.set_name, seed), folder / "scenes")
-                    keep({**row, "again": f"{options.command(seed)} --graph"})
+                    row = {**row, "again": f"{options.command(seed)} --graph"}
+                    if not row["as_expected"]:
+                        keep_recording(client, row, folder / "failures" / str(seed))
+                    keep(row)
 
             await work_until_stopped(supervisor, work, client.cancel)
+
+
+def keep_recording(client: GraspClient, row: Row, folder: Path, timeout: float = _WRITTEN_S) -> None:
+    """Keep what the flight recorder has of a task that did not go as expected, also one that the grasp calls a success.
+
+    Args:
+        client: Of the graph.
+        row: Of the task.
+        folder: Gets the recording and the row with its reason.
+        timeout: Longest wait until the recording is complete, s of wall clock.
+    """
+    about = {key: row[key] for key in ("message", "set", "seed", "scene_hash", "again")}
+    lines = [str(row["code"]), *(f"{key}: {' '.join(str(value).split())}" for key, value in about.items())]
+    write_reason(folder, row)
+    try:
+        saved = client.call(SaveRecording, "/flight_recorder/save", SaveRecording.Request(reason="\n".join(lines)))
+        if not saved.success:
+            raise OpenArmError(Code(saved.code), saved.message)
+        path, deadline = Path(saved.path), time.monotonic() + timeout
+        while not path.exists():
+            if time.monotonic() > deadline:
+                raise OpenArmError(Code.TIMEOUT, f"{path} is not complete after {timeout:g} s")
+            time.sleep(0.1)
+        path.rename(folder / path.name)
+    except OpenArmError as error:  # the campaign goes on without
+        (folder / "no_recording.txt").write_text(f"{error}\n", encoding="utf-8")
 
 
 def _row(observer: Observer, client: GraspClient, task: Task, scenes: Path) -> Row:

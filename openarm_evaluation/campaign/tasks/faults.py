@@ -15,11 +15,13 @@ import numpy as np
 
 from openarm_common.errors import Code
 from openarm_common.scene.scene import Scene, SceneObject
-from openarm_evaluation.campaign.tasks.task import MISSES, PLAN_FAILS, FaultPlan, Task, nominal
+from openarm_evaluation.campaign.tasks.task import FaultPlan, Task, nominal
 
 _NOTHING_HELD = (Code.GRASP_MISSED, Code.GRASP_LOST)
 #: The hand is off its plan: it meets the object, misses it, or is stopped.
 _ASTRAY = (*_NOTHING_HELD, Code.HAND_COLLISION, Code.EXECUTION_FAILED, Code.PLACE_FAILED, Code.STALE_DATA)
+#: The camera does not see the table where it was calibrated to.
+_NOT_AS_CALIBRATED = (Code.INTRINSICS_MISMATCH, Code.TABLE_MISMATCH)
 _NO_WAY = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN)
 
 
@@ -53,6 +55,16 @@ def _nudged(when: str) -> Maker:
         return _fault("object_nudged", when=when, object=_target(task).name, mm=(20.0, 50.0))(task, rng)
 
     return make
+
+
+def _missed(task: Task, rng: np.random.Generator) -> Task:
+    share = round(float(rng.uniform(0.2, 0.5)), 3)
+    faults = (f"faults.miss_share={share}", f"faults.seed={task.seed}")
+    return replace(task, sets=tuple(f"{node}.{fault}" for node in ("detector", "wrist_detector") for fault in faults))
+
+
+def _plan_fails(task: Task, rng: np.random.Generator) -> Task:
+    return replace(task, sets=("motion.faults.no_plan_share=1.0", "motion.faults.no_plan_limit=1"))
 
 
 def _depth_patch(task: Task, rng: np.random.Generator) -> Task:
@@ -161,7 +173,7 @@ def _arm_in_the_way(task: Task, rng: np.random.Generator) -> Task:
 KINDS: Mapping[str, Maker] = MappingProxyType(
     {
         # what must be recovered from
-        "detection_missed": _fault(MISSES, share=(0.2, 0.5)),
+        "detection_missed": _missed,
         "frames_dropped": _fault("camera_drop", camera="overhead", share=(0.4, 0.7)),
         "frames_late": _fault("camera_delay", camera="overhead", seconds=(0.1, 0.25)),
         "stamps_off": _fault("stamp_offset", camera="overhead", ms=(20.0, 100.0)),
@@ -171,14 +183,18 @@ KINDS: Mapping[str, Maker] = MappingProxyType(
         "slippery": _fault("friction_lowered", scale=(0.4, 0.7)),
         "gripper_stuck_once": _fault("gripper_stuck", when="CLOSE_GRIPPER", until_attempt=2, side="both"),
         "gripper_weak": _fault("gripper_weak", share=(0.4, 0.7)),
-        "plan_fails_once": _fault(PLAN_FAILS, times=1),
+        "plan_fails_once": _plan_fails,
         "joint_states_gap": _fault("joint_state_gap", ms=(100.0, 300.0), every=2.0),
         "two_alike": _two_alike,
         "arms_in_the_way": _arm_in_the_way,
         "corridor_blocked": _corridor,
-        "intrinsics_off": _fault("intrinsics_bias", camera="overhead", focal=(-0.01, 0.01)),
+        "intrinsics_off": _fault(
+            "intrinsics_bias", Code.INTRINSICS_MISMATCH, camera="overhead", focal=(0.05, 1.0), cx=(-60.0, 60.0)
+        ),
         # what may be recovered from, and must be reported truly when not
-        "mount_knocked": _fault("mount_knocked", Code.OK, *_ASTRAY, *_NO_WAY, camera="overhead", mm=10.0, deg=1.0),
+        "mount_knocked": _fault(
+            "mount_knocked", Code.OK, *_ASTRAY, *_NO_WAY, *_NOT_AS_CALIBRATED, camera="overhead", mm=10.0, deg=1.0
+        ),
         "depth_patch": _depth_patch,
         "joints_late": _fault("joint_late", Code.OK, Code.EXECUTION_FAILED, ms=(50.0, 150.0)),
         "joints_sag": _fault("joint_sag", Code.OK, Code.HAND_COLLISION, Code.EXECUTION_FAILED, share=(0.3, 0.8)),

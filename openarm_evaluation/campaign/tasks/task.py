@@ -16,12 +16,6 @@ import numpy as np
 from openarm_common.errors import Code
 from openarm_common.scene.scene import PALETTE, SPACING, Scene, random_scene
 
-#: Faults of the campaign itself: the first `times` plans fail,
-PLAN_FAILS = "plan_fails"
-#: and the detector misses each object in a `share` of the frames.
-MISSES = "detection_missed"
-
-
 _ENDURANCE = 10
 
 
@@ -30,7 +24,7 @@ class FaultPlan:
     """Something that goes wrong.
 
     Attributes:
-        name: Of `openarm_sim_bridge.faults.faults`, `PLAN_FAILS` or `MISSES`.
+        name: Of `openarm_sim_bridge.faults.faults`.
         parameters: Of it.
         when: State that is entered when it begins; "" begins with the scene.
         until_attempt: It is cleared when this attempt begins; 0: never.
@@ -54,6 +48,7 @@ class Task:
         arm: auto, left or right.
         kind: What is special, for the report.
         fault: What goes wrong; None: nothing.
+        sets: Parameters of nodes, `node.param=value`: faults that nodes inject themselves.
         codes: Allowed results; OK is placed. Without OK it is impossible and must be refused.
         mount_seed: Of the true camera mounts; None: nominal.
         place: (x, y) of the requested footprint centre, base frame, m; None: chosen by the suite.
@@ -70,6 +65,7 @@ class Task:
     arm: str = "auto"
     kind: str = "nominal"
     fault: FaultPlan | None = None
+    sets: tuple[str, ...] = ()
     codes: tuple[Code, ...] = (Code.OK,)
     mount_seed: int | None = None
     place: tuple[float, float] | None = None

@@ -96,6 +96,10 @@ class Observer(BackgroundNode):
             self._joint_states = self._node.create_subscription(JointState, "/joint_states", self._on_joints, _RELIABLE)
         return list(self._joints)
 
+    def subscribers(self, topic: str) -> set[str]:
+        """Return the names of the nodes that subscribe to a topic, this one included."""
+        return {endpoint.node_name for endpoint in self._node.get_subscriptions_info_by_topic(topic)}
+
     def forget(self) -> None:
         """Begin new tracks and a new list of states."""
         with self._changed:

@@ -6,17 +6,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo
 from tf2_msgs.msg import TFMessage
 
 from openarm_calibration.ros.publisher import PublisherNode
-from openarm_calibration.store.store import CalibrationStore, StoredCalibration, default_folder
+from openarm_calibration.store.records import default_folder
+from openarm_calibration.store.store import CalibrationStore, StoredCalibration
 from openarm_common import se3
-from openarm_common.camera.cameras import load_cameras, true_mount
+from openarm_common.camera.cameras import Intrinsics, load_cameras, true_mount
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
-from openarm_common.ros.convert import transform_to_matrix
-from openarm_common.ros.node import QOS_STATIC_TF
+from openarm_common.ros.convert import intrinsics_from_info, transform_to_matrix
+from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF
+from openarm_common.scene.scene import load_scene
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +43,8 @@ def test_mounts_and_optical_frames_of_all_cameras(ros) -> None:
     ros.add(PublisherNode())
     published = edges(ros)
     cameras = load_cameras()
-    assert len(published) == 2 * len(cameras)
+    assert len(published) == 2 * len(cameras) + 1
+    assert published["openarm_body_link0", "table"][2, 3] == load_scene("demo").table.top_z
     assert ("openarm_body_link0", "overhead_link") in published
     assert ("openarm_right_link7", "wrist_link") in published
     for name, camera in cameras.items():
@@ -109,6 +113,21 @@ def test_stored_calibrations_are_latched_and_a_change_arrives_without_a_restart(
     assert wrist() == 0.11
     store.rollback("wrist")
     ros.spin_until(lambda: wrist() == 0.10, 10.0, "the mount before")
+
+
+@pytest.mark.requirement("A-32", "R-15")
+def test_the_intrinsics_of_the_calibration_in_use_are_latched_and_taken_back_without_a_record(ros) -> None:
+    store, optics = CalibrationStore(default_folder()), Intrinsics(640, 480, 600.0, 601.0, 320.0, 240.0)
+    store.save(stored(0.10, None).model_copy(update={"intrinsics": optics}))
+    ros.add(PublisherNode(parameter_overrides=[Parameter("period", value=0.05)]))
+    got: dict[str, list[CameraInfo]] = {"wrist": [], "overhead": []}
+    for name, infos in got.items():
+        ros.node.create_subscription(CameraInfo, f"/calibration/{name}/camera_info", infos.append, QOS_LATCHED)
+    ros.spin_until(lambda: all(got.values()), 10.0, "camera infos")
+    assert intrinsics_from_info(got["wrist"][-1]) == optics
+    assert got["overhead"][-1].width == 0, "the mount is nominal"
+    store.save(stored(0.11, None))
+    ros.spin_until(lambda: got["wrist"][-1].width == 0, 10.0, "a calibration without intrinsics")
 
 
 @pytest.mark.parametrize("wrong", [stored(0.2, 1), stored(0.2, None, "openarm_left_link7")])

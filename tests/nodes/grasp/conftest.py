@@ -15,7 +15,7 @@ import pytest
 from control_msgs.action import ParallelGripperCommand
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, Pick, PickTwo, PlanApproach
 from openarm_interfaces.msg import GraspStatus, Refusal
-from openarm_interfaces.srv import ComputeIK, Grasp
+from openarm_interfaces.srv import ComputeIK, ConfirmPlan, GetScene, Grasp
 from rclpy.action import ActionClient, ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -50,6 +50,8 @@ class FakeGraph(Node):
         asked: The same of motions alone: arm, what, and how long it may rest first.
         during: Called at the start of a motion; may return a future that it waits for.
         slips: Closes that get nothing.
+        scene: Version of the planning scene.
+        executed: Trajectories.
         silent: No joint states any more.
     """
 
@@ -60,7 +62,8 @@ class FakeGraph(Node):
         self.robot = RobotDescription.load()
         self.t_ns = 5_000_000_000
         self.silent = False
-        self.slips = 0
+        self.slips, self.scene = 0, 1
+        self.executed: list[JointTrajectory] = []
         self.unreachable = False
         self.during: Callable[[str], Future | None] = lambda what: None
         self.objects = {"red": np.array([0.26, -0.2, 0.425]), "blue": np.array([0.26, 0.2, 0.425])}
@@ -84,6 +87,7 @@ class FakeGraph(Node):
             self._serve(ExecuteTrajectory, "/motion/execute", self._execute)
             self._serve(MoveArm, "/motion/move", self._move)
             self.create_service(ComputeIK, "/motion/compute_ik", self._ik)
+            self.create_service(GetScene, "/motion/get_scene", self._get_scene)
         for arm in ARMS:
             self._serve(ParallelGripperCommand, f"/{arm}_gripper_controller/gripper_cmd", self._grip)
 
@@ -141,11 +145,13 @@ class FakeGraph(Node):
         p = pose_to_matrix(target.pose)[:3, 3]
         end = p + np.array([target.retreat_offset.x, target.retreat_offset.y, target.retreat_offset.z])
         before = p + np.array([target.approach_offset.x, target.approach_offset.y, target.approach_offset.z])
+        start = np.array(request.start or [self.q[n] for n in self.robot.arm_joints(request.arm)])
         q = self._reach(request.arm, before)
-        result.transfer = self._trajectory(request.arm, q)
-        q = self._reach(request.arm, p, q)
-        result.approach = self._trajectory(request.arm, q)
-        result.retreat = self._trajectory(request.arm, self._reach(request.arm, end, q))
+        result.transfer = self._trajectory(request.arm, start, q)
+        down = self._reach(request.arm, p, q)
+        result.approach = self._trajectory(request.arm, q, down)
+        result.retreat = self._trajectory(request.arm, down, self._reach(request.arm, end, down))
+        result.scene_version = self.scene
         result.success, result.code, result.chosen = True, "OK", 0
         result.limit_margins = [0.25] + [math.nan] * (len(request.targets) - 1)
         goal.succeed()
@@ -162,10 +168,11 @@ class FakeGraph(Node):
 
         return least_squares(error, np.clip(start, lower + 0.01, upper - 0.01), bounds=(lower, upper)).x
 
-    def _trajectory(self, arm: str, q: np.ndarray) -> JointTrajectory:
-        return JointTrajectory(
-            joint_names=list(self.robot.arm_joints(arm)), points=[JointTrajectoryPoint(positions=q.tolist())]
-        )
+    def _trajectory(self, arm: str, start: np.ndarray, end: np.ndarray) -> JointTrajectory:
+        points = [JointTrajectoryPoint(positions=(start + u * (end - start)).tolist()) for u in (0.0, 0.5, 1.0)]
+        for i, point in enumerate(points):
+            point.time_from_start.sec = i
+        return JointTrajectory(joint_names=list(self.robot.arm_joints(arm)), points=points)
 
     async def _execute(self, goal) -> ExecuteTrajectory.Result:
         result = ExecuteTrajectory.Result()
@@ -173,6 +180,7 @@ class FakeGraph(Node):
             result.code, result.message = "CANCELLED", "cancelled"
             return result
         trajectory = goal.request.trajectory
+        self.executed.append(trajectory)
         self.q |= dict(zip(trajectory.joint_names, trajectory.points[-1].positions, strict=True))
         self._carry(goal.request.arm)
         goal.succeed()
@@ -210,6 +218,10 @@ class FakeGraph(Node):
             goal.canceled()
             return True
         return False
+
+    def _get_scene(self, _, response):
+        response.version = self.scene
+        return response
 
     def _ik(self, request, response):
         response.code = "UNREACHABLE"
@@ -265,12 +277,16 @@ class Bench:
         probe.create_subscription(GraspStatus, "/grasp/status", self.status.append, latched)
         probe.create_subscription(MarkerArray, "/grasp/markers", self.markers.append, QOS_LATCHED)
         self.service = probe.create_client(Grasp, "/grasp")
+        self.confirm = probe.create_client(ConfirmPlan, "/grasp/confirm")
         self.action = ActionClient(probe, Pick, "/grasp/pick")
         self.two = ActionClient(probe, PickTwo, "/grasp/pick_two")
         ros.spin_until(lambda: self.status, 20.0, "the first status")
 
     def ask(self, label: str = "red", timeout: float = 30.0, **request) -> Grasp.Response:
         return self.ros.call(self.service, Grasp.Request(label=label, **request), timeout)
+
+    def answer(self, plan_id: str, *, accept: bool) -> ConfirmPlan.Response:
+        return self.ros.call(self.confirm, ConfirmPlan.Request(plan_id=plan_id, accept=accept), 20.0)
 
     def states(self) -> list[str]:
         return [s.state for s in self.status]

@@ -29,7 +29,7 @@ def test_the_client_picks_from_plain_python(bench):
     assert results[0].raise_for_code() is results[0]
     assert "LIFT" in heard
     chosen = results[0].options[0]
-    assert (chosen.code, chosen.arm, set(chosen.parts)) == ("OK", "right", {"tilt", "width", "side", "room", "used"})
+    assert (chosen.code, chosen.arm, set(chosen.parts)) == ("OK", "right", {"tilt", "width", "side", "room"})
     assert results[1].code is Code.UNKNOWN_OBJECT
     with pytest.raises(OpenArmError, match="no 'mug' in view"):
         results[1].raise_for_code()

@@ -7,6 +7,7 @@ import time
 
 import pytest
 from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from openarm_interfaces.action import Pick
 from openarm_interfaces.srv import Grasp
 from rclpy.parameter import Parameter
@@ -14,6 +15,7 @@ from rclpy.task import Future
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.ros.node import GraspNode
+from tests.nodes.grasp.conftest import FakeGraph
 
 OPEN = 0.044
 
@@ -69,10 +71,15 @@ def test_the_action_gives_feedback_and_the_same_answer(bench):
     assert {"DETECT", "PLAN", "LIFT", "PLACE"} <= set(heard)
 
 
-@pytest.mark.requirement("A-71")
+@pytest.mark.requirement("A-71", "N-19")
 def test_an_empty_hand_is_tried_again_and_then_named(bench):
     bench.world.slips = 99
     answer = bench.ask()
+    bench.until(lambda: any(one.code for one in bench.status), what="the status of the end")
+    assert {(one.state, one.code) for one in bench.status if one.code} == {("IDLE", "GRASP_MISSED")}
+    assert {one.budget for one in bench.status if one.state == "PLAN"} == {5.0}
+    assert sum(one.duration for one in answer.state_times) == pytest.approx(answer.duration, abs=0.05)
+    assert {one.state for one in answer.state_times} >= {"DETECT", "CLOSE_GRIPPER", "RESET"}
     assert (answer.code, answer.attempts) == ("GRASP_MISSED", 3)
     assert "closed on nothing" in answer.message
     assert bench.world.q[bench.world.robot.finger_joint("right")] == OPEN
@@ -137,7 +144,7 @@ def test_a_dry_run_moves_nothing(bench):
     chosen, *others = answer.options
     assert (chosen.arm, chosen.code, chosen.limit_margin) == ("right", "OK", 0.25)
     assert chosen.score == pytest.approx(sum(chosen.values))
-    assert chosen.parts == ["tilt", "width", "side", "room", "used"]
+    assert chosen.parts == ["tilt", "width", "side", "room"]
     assert {(o.code, o.message) for o in others} == {("", "not needed: another was chosen")}
     bench.until(lambda: bench.markers, what="markers of the candidates")
     assert len(bench.markers[-1].markers) > 20
@@ -212,3 +219,22 @@ def test_a_pregrasp_within_the_path_tolerance_is_refused_at_start(ros):
     with pytest.raises(OpenArmError, match="at least twice path_tolerance") as error:
         GraspNode(parameter_overrides=wrong)
     assert error.value.code is Code.CONFIG_INVALID
+
+
+@pytest.mark.requirement("N-19")
+def test_a_state_that_takes_longer_than_its_budget_is_a_warning_in_diagnostics_and_in_the_answer(ros):
+    world = ros.add(FakeGraph())
+    node = ros.add(GraspNode(parameter_overrides=[Parameter("budget.close_gripper", value=0.1)]))
+    heard: list[DiagnosticStatus] = []
+    ros.node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: heard.extend(m.status), 10)
+    service = ros.node.create_client(Grasp, "/grasp")
+    answer = ros.call(service, Grasp.Request(label="red"), 30.0)
+    assert answer.success, answer.message
+    late = [one.state for one in answer.state_times if 0.0 < one.budget < one.longest]
+    assert late == ["CLOSE_GRIPPER"]
+
+    def warned() -> list[str]:
+        return [one.message for one in heard if one.level == DiagnosticStatus.WARN and node.get_name() in one.name]
+
+    ros.spin_until(lambda: any("CLOSE_GRIPPER" in text for text in warned()), 20.0, "the warning")
+    assert world.log

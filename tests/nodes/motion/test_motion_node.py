@@ -12,14 +12,16 @@ from geometry_msgs.msg import PoseStamped, Vector3
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
 from openarm_interfaces.msg import ApproachTarget, CollisionBox
 from openarm_interfaces.srv import ComputeIK
+from rclpy.parameter import Parameter
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import (
     matrix_to_pose,
 )
+from openarm_common.scene.scene import load_scene
 from openarm_motion.planning.planner import PlannedPath, PlanQuery
-from openarm_motion.ros.node import table_boxes
+from openarm_motion.service.motion_service import table_box
 
 
 # --- inverse kinematics
@@ -213,12 +215,32 @@ def test_an_approach_that_fails_carries_all_refusals(bench) -> None:
     assert bench.run(bench.plan_client, goal).code == "INVALID_ARGUMENT"
 
 
+@pytest.mark.requirement("N-03")
+def test_plans_fail_by_injection_while_the_node_runs(bench) -> None:
+    """All of them, or no more than so many; a share that cannot be is refused."""
+
+    def set_faults(**values: float) -> bool:
+        answers = bench.node.set_parameters([Parameter(f"faults.{k}", value=v) for k, v in values.items()])
+        return all(answer.successful for answer in answers)
+
+    def codes(count: int) -> list[str]:
+        return [bench.run(bench.plan_client, approach_goal(bench)).code for _ in range(count)]
+
+    assert codes(1) == ["OK"]
+    assert set_faults(no_plan_share=1.0)
+    assert codes(2) == ["NO_PLAN", "NO_PLAN"]
+    assert not set_faults(no_plan_share=1.5)
+    assert set_faults(no_plan_limit=1)
+    assert codes(3) == ["NO_PLAN", "OK", "OK"]
+    assert set_faults(no_plan_share=0.0)
+    assert codes(1) == ["OK"]
+
+
 @pytest.mark.requirement("B-49")
 def test_table_comes_from_the_scene_description() -> None:
-    (table,) = table_boxes("empty")
+    table = table_box(load_scene("empty").table)
     np.testing.assert_allclose(table.T[:3, 3], [0.46, 0.0, 0.38])
     np.testing.assert_allclose(table.size, [0.70, 1.20, 0.04])
-    assert table_boxes("") == ()
 
 
 @pytest.mark.requirement("B-50")

@@ -13,12 +13,13 @@ from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
 from openarm_interfaces.msg import ApproachTarget, CollisionBox, CollisionObject
 from openarm_interfaces.srv import ApplyScene, GetScene
 from rclpy.parameter import Parameter
+from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
 from openarm_common.octree.distance_field import CameraMoment, DistanceFieldWriter, field_path
 from openarm_common.octree.lattice import Lattice
-from openarm_common.ros.convert import matrix_to_pose
+from openarm_common.ros.convert import matrix_to_pose, matrix_to_transform
 from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED
 
 LATTICE = Lattice.from_bounds(0.02, (-0.48, -1.0, -0.08), (1.28, 1.0, 1.36))
@@ -28,6 +29,22 @@ def body(bench, id: str, p, size=(0.05, 0.05, 0.05), shape: str = "box", frame: 
     message = CollisionObject(id=id, shape=shape, pose=bench.stamped(se3.make(None, p), frame))
     message.size = Vector3(x=size[0], y=size[1], z=size[2])
     return message
+
+
+@pytest.mark.requirement("B-63")
+def test_the_table_is_where_its_frame_is(bench) -> None:
+    """A measured height moves the obstacle and makes another version of the scene."""
+    planned = bench.run(bench.move_client, bench.named(plan_only=True)).scene_version
+    edge = matrix_to_transform("world", "table", se3.make(None, (0.0, 0.0, 0.415)), 0)
+    bench.robot.tf.publish(TFMessage(transforms=[edge]))
+    service = bench.node.service
+    bench.ros.spin_until(lambda: service.scene.version == planned + 1, 10.0, "another table")
+    scene = bench.ros.call(bench.get_client, GetScene.Request())
+    (table,) = scene.objects
+    assert table.pose.pose.position.z + table.size.z / 2.0 == pytest.approx(0.415)
+    assert {box.T[2, 3] + box.size[2] / 2.0 for arm in service.arms.values() for box in arm.static} == {0.415}
+    late = ApplyScene.Request(clear=True, expected_version=planned)
+    assert bench.ros.call(bench.apply_client, late).code == "STALE_DATA"
 
 
 def goal_tip(bench) -> np.ndarray:

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records that are kept: one YAML each, checked by its own hash, with history and rollback.
+
+Files are written to another name and renamed, so that a reader gets an old or a new one, never a part. A damaged file
+is refused, and the newest good one of the history takes its place.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import hashlib
+import json
+import os
+import re
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import yaml
+
+from openarm_common.config import Config, load_yaml, validate
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.resources import write_whole
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
+
+
+class Record(Config, ABC):
+    """What is stored under a name."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """What it is stored under."""
+
+    def fields(self) -> dict[str, Any]:
+        """Return what is written and hashed."""
+        return self.model_dump(mode="json")
+
+    def digest(self) -> str:
+        """Return the hash of all fields."""
+        text = json.dumps(self.fields(), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+RecordT = TypeVar("RecordT", bound=Record)
+
+
+@dataclass(frozen=True)
+class Found(Generic[RecordT]):
+    """What a store has under a name: the record, and what was wrong with the file when it is an older one."""
+
+    record: RecordT
+    warning: str = ""
+
+
+class RecordStore(Generic[RecordT]):
+    """A folder of records.
+
+    Args:
+        folder: Where; made at the first save.
+        kind: Their model.
+        noun: What they are called in messages, for example "calibration".
+    """
+
+    def __init__(self, folder: Path, kind: type[RecordT], noun: str) -> None:
+        self.folder = folder
+        self._kind, self._noun = kind, noun
+
+    def path(self, name: str) -> Path:
+        """Return the file of a name.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for a name that could lead elsewhere.
+        """
+        return self.folder / f"{checked_name(name)}.yaml"
+
+    def names(self) -> tuple[str, ...]:
+        """Return the names that have a file, damaged or not."""
+        return tuple(sorted(p.stem for p in self.folder.glob("*.yaml") if _NAME.fullmatch(p.stem)))
+
+    def save(self, record: RecordT) -> Path:
+        """Make it the present one of its name; the one before stays in the history.
+
+        Raises:
+            OpenArmError: ENVIRONMENT, when the folder can't be written.
+        """
+        path = self.path(record.name)
+        digest = record.digest()
+        text = yaml.safe_dump({**record.fields(), "sha256": digest}, sort_keys=False)
+        number = 1 + max(map(_number, self._past(record.name)), default=0)
+        write_whole(self._history(record.name) / f"{number:06d}-{digest[:12]}.yaml", text.encode())
+        write_whole(path, text.encode())
+        return path
+
+    def load(self, name: str) -> RecordT:
+        """Read what is stored under a name.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when there is none or it is damaged, saying how.
+        """
+        path = self.path(name)
+        if not path.is_file():
+            known = ", ".join(self.names()) or "none"
+            raise OpenArmError(
+                Code.CONFIG_INVALID, f"no {self._noun} of {name!r} in {self.folder}; stored are: {known}"
+            )
+        return self._read(path)
+
+    def find(self, name: str) -> Found[RecordT] | None:
+        """Return what is stored under a name, or the newest good one before it; None when nothing was ever stored.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when the file is damaged and the history has no good one.
+        """
+        if not self.path(name).is_file() and not self._past(name):
+            return None
+        try:
+            return Found(self.load(name))
+        except OpenArmError as error:
+            good = self._good(name)
+            if not good:
+                raise
+            older, record = good[-1]
+            return Found(record, f"{error.message}; the last good one, {older.name}, is used")
+
+    def history(self, name: str) -> tuple[RecordT, ...]:
+        """Return all good records of a name, oldest first."""
+        return tuple(record for _, record in self._good(name))
+
+    def rollback(self, name: str) -> RecordT:
+        """Go back to the record before the present one; the present one leaves the history.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when there is none before it.
+        """
+        past, good = self._past(name), self._good(name)
+        if len(good) < 2:
+            raise OpenArmError(
+                Code.CONFIG_INVALID,
+                f"going back needs a {self._noun} of {name!r} before the present one; stored: {len(good)}",
+            )
+        path, before = good[-2]
+        write_whole(self.path(name), path.read_bytes())
+        for later in past[past.index(path) + 1 :]:
+            later.unlink()
+        return before
+
+    def state(self) -> tuple[tuple[str, int, int], ...]:
+        """Return what changes when a file does: names, sizes and times of the files."""
+        out: list[tuple[str, int, int]] = []
+        for name in self.names():
+            try:
+                status = self.path(name).stat()
+            except FileNotFoundError:
+                continue  # between the listing and now
+            out.append((name, status.st_mtime_ns, status.st_size))
+        return tuple(out)
+
+    def _history(self, name: str) -> Path:
+        return self.folder / "history" / checked_name(name)
+
+    def _good(self, name: str) -> list[tuple[Path, RecordT]]:
+        """Return the records of the history that are not damaged, oldest first."""
+        out: list[tuple[Path, RecordT]] = []
+        for path in self._past(name):
+            with contextlib.suppress(OpenArmError):
+                out.append((path, self._read(path)))
+        return out
+
+    def _past(self, name: str) -> list[Path]:
+        return sorted(self._history(name).glob("*.yaml"), key=_number)
+
+    def _read(self, path: Path) -> RecordT:
+        """Read and check one file.
+
+        Raises:
+            OpenArmError: CONFIG_INVALID, when it is not as it was written.
+        """
+        data = load_yaml(path)
+        stated = data.pop("sha256", None)
+        record = validate(self._kind, data, str(path))
+        if stated != record.digest():
+            raise OpenArmError(
+                Code.CONFIG_INVALID,
+                f"{path} is damaged or was edited: its contents do not have the hash that it states; calibrate and save"
+                " again, or roll back",
+            )
+        return record
+
+
+def checked_name(name: str) -> str:
+    """Return a name when it is one.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for anything else, above all what a file system reads as a path.
+    """
+    if not _NAME.fullmatch(name):
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"name {name!r}: expected lower-case letters, digits and _, beginning with a letter, at most 64",
+        )
+    return name
+
+
+def now() -> str:
+    """Return date and time for the record."""
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def default_folder() -> Path:
+    """Return the default folder of calibrations: OPENARM_CALIBRATIONS, or the user's data folder."""
+    given = os.environ.get("OPENARM_CALIBRATIONS", "")
+    if given:
+        return Path(given).expanduser()
+    base = os.environ.get("XDG_DATA_HOME", "")
+    return (Path(base) if base else Path.home() / ".local" / "share") / "openarm" / "calibrations"
+
+
+def _number(path: Path) -> int:
+    head = path.name.partition("-")[0]
+    return int(head) if head.isdigit() else 0

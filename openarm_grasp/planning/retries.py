@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a failed grasp leaves to the next attempt: which grasps would repeat it, and what to change for its cause.
+
+After another observation a name says nothing: the axes of a cube may have been swapped. So a failed grasp is the pose
+of the hand relative to where the object stood, and the gripper is the same after half a turn about its approach.
+Base frame, m, rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import acos, cos, radians
+
+import numpy as np
+
+from openarm_common import se3
+from openarm_common.detection import Detection
+from openarm_common.errors import Code
+from openarm_common.types import Array
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.planning.candidates import GraspCandidate, propose
+
+#: A grasp is repeated by a hand whose opening axis and approach are both turned by less, rad, displaced by less, m.
+SAME_ANGLE, SAME_POSITION = radians(10.0), 0.005
+#: A higher grasp is higher by this, m: twice what counts as the same.
+RAISE = 2.0 * SAME_POSITION
+#: Below what every tilt costs: a higher grasp holds less, and comes last; after a collision it comes first.
+_RAISED, _RAISED_AFTER_COLLISION = -1.6, 0.1
+#: Fingers at the same sides again, at another tilt or height.
+_SAME_SIDES = -0.3
+
+
+@dataclass(frozen=True)
+class FailedGrasp:
+    """A grasp that has failed.
+
+    Attributes:
+        code: Why.
+        arm: Whose hand.
+        R_base_tcp: (3, 3) orientation of the hand.
+        offset: (3,) of its TCP from the middle of the object's lower face.
+    """
+
+    code: Code
+    arm: str
+    R_base_tcp: Array
+    offset: Array
+
+    @classmethod
+    def of(cls, code: Code, arm: str, candidate: GraspCandidate, target: Detection) -> FailedGrasp:
+        """Remember a grasp of the object where it was seen."""
+        return cls(code, arm, candidate.T_base_tcp[:3, :3], _offset(candidate, target))
+
+    def repeated_by(self, candidate: GraspCandidate, target: Detection) -> bool:
+        """Whether a grasp of the object, where it is seen now, is the same, as far as can be told."""
+        R = candidate.T_base_tcp[:3, :3]
+        alike = self.sides(candidate) > cos(SAME_ANGLE) and _angle(R[:, 2], self.R_base_tcp[:, 2]) < SAME_ANGLE
+        return alike and float(np.linalg.norm(_offset(candidate, target) - self.offset)) < SAME_POSITION
+
+    def sides(self, candidate: GraspCandidate) -> float:
+        """How far the fingers are at the same sides: 1 on the same, 0 a quarter turn from them."""
+        return abs(float(candidate.T_base_tcp[:3, 1] @ self.R_base_tcp[:, 1]))
+
+
+@dataclass(frozen=True)
+class Ways:
+    """Grasps to choose from, best first: those that no failed one resembles, and those that would repeat one."""
+
+    fresh: tuple[GraspCandidate, ...]
+    repeats: tuple[GraspCandidate, ...]
+
+
+def ways(
+    target: Detection,
+    config: GraspConfig,
+    failed: Sequence[FailedGrasp],
+    *,
+    shoulder_xy: Sequence[float] = (0.0, 0.0),
+    others: Sequence[Detection] = (),
+) -> Ways:
+    """Propose grasps for the next attempt.
+
+    After a collision the hand first stays higher; else a higher grasp is what is left when all others are refused.
+    Fingers go to other sides first. Lower than it is, no grasp can be: tips, pads or palm decide.
+
+    Args:
+        target: The object as it is seen now.
+        config: Parameters.
+        failed: What has failed so far.
+        shoulder_xy: As of `propose`.
+        others: As of `propose`.
+
+    Raises:
+        OpenArmError: TOO_WIDE, when no side fits into the hand.
+    """
+    if not failed:
+        return Ways(propose(target, config, shoulder_xy=shoulder_xy, others=others), ())
+    after_collision = any(one.code is Code.HAND_COLLISION for one in failed)
+    ranked: list[GraspCandidate] = []
+    for raised in (0.0, RAISE):
+        for one in propose(target, config, shoulder_xy=shoulder_xy, others=others, raised=raised):
+            score = _SAME_SIDES * max(past.sides(one) for past in failed)
+            if raised:
+                score += _RAISED_AFTER_COLLISION if after_collision else _RAISED
+            ranked.append(replace(one, score=one.score + score, parts={**one.parts, "retry": score}))
+    ranked.sort(key=lambda c: -c.score)
+    again = [any(past.repeated_by(one, target) for past in failed) for one in ranked]
+    fresh = tuple(one for one, is_repeat in zip(ranked, again, strict=True) if not is_repeat)
+    return Ways(fresh, tuple(one for one, is_repeat in zip(ranked, again, strict=True) if is_repeat))
+
+
+def arms_to_try(arms: Sequence[str], failed: Sequence[FailedGrasp]) -> tuple[str, ...]:
+    """The arms in their order; one that has missed the object last: the other observes and reaches it differently."""
+    missed = {one.arm for one in failed if one.code is Code.GRASP_MISSED}
+    return tuple(sorted(arms, key=lambda arm: arm in missed))
+
+
+def most_like(candidate: GraspCandidate, offered: Sequence[GraspCandidate]) -> GraspCandidate:
+    """The one whose hand is turned most like a candidate's; of several, the nearest to its height."""
+
+    def differs(other: GraspCandidate) -> tuple[float, float]:
+        T, T_other = candidate.T_base_tcp, other.T_base_tcp
+        return round(se3.angle_between(T_other[:3, :3], T[:3, :3]), 6), abs(float(T_other[2, 3] - T[2, 3]))
+
+    return min(offered, key=differs)
+
+
+def _offset(candidate: GraspCandidate, target: Detection) -> Array:
+    return candidate.T_base_tcp[:3, 3] - np.array([*target.p_base[:2], target.bottom])
+
+
+def _angle(a: Array, b: Array) -> float:
+    return acos(float(np.clip(a @ b, -1.0, 1.0)))

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The way back: where the hand is, and how it leaves the object and goes home, after a place and after a failure.
+
+Nobody is asked to confirm it, and an attempt that has failed ends with it. Base frame, m.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.evidence.verdicts import GripperVerdict, Verdict
+from openarm_grasp.planning import candidates
+from openarm_grasp.planning.candidates import PlaceTarget
+from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.planning.place import place_targets
+from openarm_grasp.robot.skills import reraise_stop
+from openarm_grasp.strategies.states import State
+
+if TYPE_CHECKING:
+    from openarm_grasp.strategies.pick_and_place import Run
+    from openarm_grasp.strategies.task import Grasp
+
+
+class Hand(Enum):
+    """Where the hand is, as far as known; it decides the way home."""
+
+    FREE = "away from objects, empty"
+    AT_OBJECT = "around the object or straight above its grasp, empty"
+    HOLDING = "around the object or straight above its grasp, holding it"
+    CARRYING = "elsewhere, holding the object"
+    RELEASED = "around the object that it has put down"
+    CLEAR = "away from the object that it has put down"
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An object that was put down.
+
+    Attributes:
+        target: Where.
+        gripper: That the hand held it above that place.
+        reason: How it was put down.
+        failure: Why it was put back where it came from; None when it was put where it belongs.
+    """
+
+    target: PlaceTarget
+    gripper: GripperVerdict
+    reason: str
+    failure: Verdict | None = None
+
+
+def still_held(run: Run, error: OpenArmError) -> str:
+    """Sentence for an object that stays in the hand."""
+    return f"{error.message}; the {run.arm} hand still holds {run.label!r}: open it over a safe place"
+
+
+async def retreat(run: Run, grasp: Grasp, placed: Placed | None) -> None:
+    """Leave the object, putting it down first when it is held, and go home with an open hand.
+
+    Raises:
+        OpenArmError: When there is no way home, also without regard to obstacles; the arm stays where it is.
+    """
+    run.robot.stop_observing()
+    failure = run.failure if placed is None else placed.failure
+    for last, obstacles in ((False, _obstacles(run, grasp, placed)), (True, ())):
+        try:
+            await _leave(run, grasp, placed)
+            await run.robot.go_home((grasp.arm,), obstacles)
+            return
+        except OpenArmError as error:
+            reraise_stop(error)
+            if last or run.holding:
+                text = f"the arm could not go home: {still_held(run, error) if run.holding else error.message}"
+                code, text = (failure.code, f"{failure.reason}; {text}") if failure else (error.code, text)
+                raise OpenArmError(code, text) from error
+            run.hand = Hand.FREE if placed is None else Hand.CLEAR
+            run.enter(State.RESET, f"{error.message}; trying another way home")
+
+
+async def _leave(run: Run, grasp: Grasp, placed: Placed | None) -> None:
+    """Free the hand and bring it away from the object on a straight line."""
+    arm, robot, config, T_base_tcp = grasp.arm, run.robot, run.config, grasp.candidate.T_base_tcp
+    if placed is not None:
+        if run.hand is Hand.RELEASED:
+            T_away = se3.make(p=placed.target.retreat_offset) @ placed.target.T_base_tcp
+            await robot.move_linear(arm, T_away, "leave")
+        return
+    at_object = run.hand is not Hand.FREE
+    if run.hand is Hand.HOLDING:
+        await _put_back(run, grasp)
+        run.hand = Hand.AT_OBJECT
+    await robot.grip(arm, config.hand.opening, "open")
+    await robot.wait(config.timing.after_release)
+    if at_object:
+        await robot.move_linear(arm, se3.make(p=grasp.candidate.approach_offset) @ T_base_tcp, "back off")
+
+
+async def _put_back(run: Run, grasp: Grasp) -> None:
+    """Bring what the hand holds straight back; where the map shows what has slipped, by a plan that knows of it."""
+    arm, robot, config, candidate = grasp.arm, run.robot, run.config, grasp.candidate
+    above = config.place.release_height
+    if run.failure is not None and run.failure.code is Code.GRASP_LOST:
+        above += 2.0 * config.held.slip_along  # it reaches lower than it did
+    T_back = se3.make(p=above * candidates.UP) @ candidate.T_base_tcp
+    try:
+        await robot.move_linear(arm, T_back, "put back")
+    except OpenArmError as error:
+        if error.code not in NO_WAY:
+            raise
+        target = grasp.sighting.target
+        way = replace(place_targets(target, candidate, (target.p_base[:2],), config)[0], T_base_tcp=T_back)
+        plan = await robot.plan_place(arm, (way,), grasp.sighting, candidate)
+        for part in (plan.transfer, plan.approach):
+            await robot.follow(arm, part, "put back")
+
+
+def _obstacles(run: Run, grasp: Grasp, placed: Placed | None) -> tuple[candidates.Box, ...]:
+    """What the way home keeps clear of; where a lost object lies is not known."""
+    others = candidates.obstacle_boxes(grasp.sighting.others, run.config)
+    if placed is None:
+        return others
+    held = candidates.held_box(grasp.sighting.target, grasp.candidate, run.config)
+    return (*others, candidates.Box(f"placed/{run.label}", placed.target.T_base_tcp @ held.T_frame_box, held.size))

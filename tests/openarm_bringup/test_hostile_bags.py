@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of others: bounded in time and memory, and one sentence for every damage."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import time
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from rclpy.serialization import serialize_message
+from rosbags.rosbag2.storage_mcap import zstd
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+from openarm_bringup.bags import mcap
+from openarm_bringup.bags.bag import BagWriter, open_bag
+from openarm_bringup.bags.ros.listener import from_profile
+from openarm_bringup.bags.ros.messages import messages_of
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.node import QOS_COMMAND
+
+
+def _write(path: Path, data: list[bytes], *, compress: bool = True, kind: str = "std_msgs/msg/String") -> Path:
+    with BagWriter(path, {}, compress=compress) as bag:
+        bag.add_topic("/chatter", kind, from_profile(QOS_COMMAND))
+        for i, message in enumerate(data):
+            bag.write("/chatter", i, message)
+    return path
+
+
+def _refused(path: Path) -> str:
+    with pytest.raises(OpenArmError) as caught, open_bag(path) as bag:
+        list(bag.records())
+    assert caught.value.code is Code.INVALID_ARGUMENT
+    assert len(caught.value.message) < 600
+    return caught.value.message
+
+
+def test_a_chunk_that_unpacks_to_more_than_a_recording_holds_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zeros of 40 MiB, packed to a few kB: what is unpacked is bounded before its size is compared."""
+    path = _write(tmp_path / "bag", [bytes(40 * 2**20)])
+    assert (path / "bag.mcap").stat().st_size < 100_000
+    monkeypatch.setattr(mcap, "MAX_UNPACKED", 2**20)
+    tracemalloc.start()
+    assert "unpack to more than 1048576 bytes" in _refused(path)
+    assert tracemalloc.get_traced_memory()[1] < 8e6
+    tracemalloc.stop()
+
+
+def test_messages_and_files_that_are_compressed_one_by_one_are_read_within_bounds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The two other ways of rosbag2 to compress, with which `ros2 bag record --compression-mode` writes."""
+    plain = serialize_message(String(data="hello" * 100))
+    by_message = _write(tmp_path / "message", [zstd.compress(plain)], compress=False)
+    by_file = _write(tmp_path / "file", [plain], compress=False)
+    packed = zstd.compress((by_file / "file.mcap").read_bytes())
+    (by_file / "file.mcap").unlink()
+    (by_file / "file.mcap.zst").write_bytes(packed)
+    for path, mode in ((by_message, "MESSAGE"), (by_file, "FILE")):
+        document = yaml.safe_load((path / "metadata.yaml").read_text())
+        about = document["rosbag2_bagfile_information"]
+        about |= {"compression_format": "zstd", "compression_mode": mode}
+        if mode == "FILE":
+            about["relative_file_paths"] = ["file.mcap.zst"]
+        (path / "metadata.yaml").write_text(yaml.safe_dump(document))
+        with open_bag(path) as bag:
+            assert [record.data for record in bag.records()] == [plain]
+    (by_file / "file.mcap.zst").write_bytes(zstd.compress(bytes(20 * 2**20)))
+    assert "file.mcap.zst unpacks to more than 200 times its size" in _refused(by_file)
+    monkeypatch.setattr(mcap, "MAX_UNPACKED", 100)
+    assert "unpack to more than 100 bytes" in _refused(by_message)
+
+
+def test_an_unfinished_chunk_of_many_messages_is_mended_in_linear_time(tmp_path: Path) -> None:
+    count = 400_000
+    path = _write(tmp_path / "bag", [serialize_message(String(data="x"))], compress=False) / "bag.mcap"
+    with path.open("rb") as file:
+        ((start, length), *_), _ = mcap.whole_chunks(file, path.stat().st_size)
+        file.seek(start)
+        chunk = file.read(length)
+    head, (first, last, _, _, name) = chunk[:9], mcap._OF_CHUNK.unpack_from(chunk, 9)
+    at = 9 + mcap._OF_CHUNK.size + name + 8
+    records = chunk[at:]
+    message = records[records.rindex(struct.pack("<BQ", 5, 22 + len(serialize_message(String(data="x"))))) :]
+    content = records + (count - 1) * message
+    middle = mcap._OF_CHUNK.pack(first, last, len(content), 0, name) + struct.pack("<Q", len(content))
+    whole = path.read_bytes()[:start] + head[:1] + struct.pack("<Q", len(middle) + len(content)) + middle + content
+    path.write_bytes(whole)
+    (path.parent / "metadata.yaml").unlink()
+    began = time.monotonic()
+    with open_bag(path) as bag:
+        assert bag.counts == {"/chatter": count}
+    assert time.monotonic() - began < 30.0, "before, a minute"
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_an_altered_bag_is_read_or_refused_in_a_sentence(tmp_path: Path, ended: bool) -> None:
+    names = [f"joint{k}" for k in range(7)]
+    data = [serialize_message(JointState(name=names, position=[0.1 * k] * 7)) for k in range(40)]
+    sound = (
+        _write(tmp_path / "bag", data, kind="sensor_msgs/msg/JointState", compress=ended) / "bag.mcap"
+    ).read_bytes()
+    rng, path, read = np.random.default_rng(11), tmp_path / "altered.mcap", 0
+    for _ in range(150):
+        altered = bytearray(sound if ended else sound[: len(sound) - int(rng.integers(1, len(sound) // 2))])
+        for _ in range(int(rng.integers(1, 6))):
+            altered[int(rng.integers(8, len(altered)))] = int(rng.choice([0, 255, rng.integers(256)]))
+        path.write_bytes(altered)
+        with contextlib.suppress(OpenArmError), open_bag(path) as bag:
+            messages_of(bag, bag.topics)
+            read += 1
+    assert 0 < read < 150
+
+
+def test_a_message_that_is_not_of_its_type_is_named(tmp_path: Path) -> None:
+    with (
+        open_bag(_write(tmp_path / "bag", [b"\0\1\0\0\xff\xff\xff\xff"])) as bag,
+        pytest.raises(OpenArmError, match=r"message of /chatter at 0 ns that is no std_msgs/msg/String \(8 bytes\)"),
+    ):
+        messages_of(bag, ["/chatter"])
