@@ -92,6 +92,7 @@ class Report:
         flying: Pixels that were left out because they float between surfaces, by source.
         reset: Cells that the robot filled.
         ends: Cells that rays ended in.
+        outdated: Whether the frames were left out, as the map was reset, loaded or edited after they were taken.
     """
 
     snapshot: Snapshot
@@ -100,6 +101,7 @@ class Report:
     flying: Mapping[str, int] = field(default_factory=dict[str, int])
     reset: int = 0
     ends: int = 0
+    outdated: bool = False
 
 
 class Mapper:
@@ -122,6 +124,12 @@ class Mapper:
         self._flying = robot.flying
         self._transform = DistanceTransform(self._grid.lattice, distances.reach, distances.unknown)
         self._lock = threading.Lock()
+        self._edition = 0
+
+    @property
+    def edition(self) -> int:
+        """How often the map was reset, loaded or edited."""
+        return self._edition
 
     @property
     def lattice(self) -> Lattice:
@@ -134,6 +142,7 @@ class Mapper:
         held: Sequence[HeldBox] = (),
         distances: Floats | None = None,
         wanted: Collection[str] = (),
+        edition: int | None = None,
     ) -> Report:
         """Put the frames of one moment into the map.
 
@@ -142,6 +151,7 @@ class Mapper:
             held: What the hands hold.
             distances: (nx, ny, nz), filled with the distance field; None leaves it out.
             wanted: "full" and "states", where the snapshot needs them.
+            edition: Of the map when the frames were taken: they are left out of a later one. None: of any.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT, when frames are missing or lack a joint; the map is as it was.
@@ -167,7 +177,8 @@ class Mapper:
                 scan, flying[frame.source] = _without_flying(scan, self._flying)
             scans.append(scan)
         with self._lock:
-            update = self._grid.integrate(scans, newest.t_ns)
+            outdated = edition is not None and edition != self._edition
+            update = self._grid.integrate([] if outdated else scans, newest.t_ns)
             changes = [update.changed, self._grid.decay(newest.t_ns)]
             if shapes is not None:
                 changes.append(self._grid.forget(shapes, self._reset_padding))
@@ -180,6 +191,7 @@ class Mapper:
                 flying=flying,
                 reset=int(changes[-1].size) if shapes is not None else 0,
                 ends=update.ends,
+                outdated=outdated,
             )
 
     def snapshot(self, wanted: Collection[str] = ()) -> Snapshot:
@@ -208,6 +220,7 @@ class Mapper:
     def reset(self) -> None:
         """Forget everything."""
         with self._lock:
+            self._edition += 1
             self._grid.reset()
 
     def clear_box(self, lower: ArrayLike, upper: ArrayLike, state: int) -> int:
@@ -219,6 +232,7 @@ class Mapper:
             state: FREE or UNKNOWN.
         """
         with self._lock:
+            self._edition += 1
             return self._grid.clear_box(lower, upper, state)
 
     def save(self, path: Path) -> int:
@@ -276,6 +290,7 @@ class Mapper:
         """
         leaves = read_file(path)
         with self._lock:
+            self._edition += 1
             try:
                 return leaves.nodes, self._grid.load(leaves)
             except OpenArmError as error:

@@ -49,7 +49,6 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
             self._sources.append(cloud_source(self, self._states, config.cloud_topic, need))
         self._t_ns = 0
         self._busy = False
-        self._edition = 0
         self._updates = self._overruns = 0
         self._elapsed_ms = 0.0
         self._last: Report | None = None
@@ -101,14 +100,15 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         if self._busy:
             self._overruns += 1
             return
+        edition = self._mapper.edition
         found = [source.take() for source in self._sources]
         frames = [frame for frame in found if frame is not None]
         if not frames:
             return
-        self._busy, edition = True, self._edition
+        self._busy = True
         try:
             report: Report = await self.in_thread(
-                self._update, frames, self._states.tracker.held, self._publisher.wanted()
+                self._update, frames, self._states.tracker.held, self._publisher.wanted(), edition
             )
         except OpenArmError as error:
             self._fault = error.message
@@ -118,18 +118,18 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         self._fault, self._last = "", report
         self._updates += 1
         self._t_ns = max(frame.t_ns for frame in frames)
-        if edition == self._edition:
+        if edition == self._mapper.edition:
             self._publisher.publish(report.snapshot, self._t_ns, report.changed)
-        else:  # the map was reset, loaded or edited meanwhile: what the update saw is out of date
+        else:  # the map was reset, loaded or edited meanwhile: what was computed is out of date
             self._show()
 
-    def _update(self, frames: list[Frame], held: tuple[HeldBox, ...], wanted: set[str]) -> Report:
+    def _update(self, frames: list[Frame], held: tuple[HeldBox, ...], wanted: set[str], edition: int) -> Report:
         """Do one update, in a worker thread."""
         begin = time.thread_time()
         slot = self._field.begin() if self._field is not None else None
-        report = self._mapper.update(frames, held, slot, wanted)
+        report = self._mapper.update(frames, held, slot, wanted, edition)
         by_name = {source.name: source for source in self._sources}
-        for frame in frames:
+        for frame in () if report.outdated else frames:
             by_name[frame.source].took(frame.t_ns)
         if self._field is not None:
             self._field.commit(max(frame.t_ns for frame in frames), time.monotonic_ns(), self._moments())
@@ -137,8 +137,9 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         return report
 
     def _show(self) -> None:
-        """Make a map that did not come from an image visible everywhere, at once."""
-        self._edition += 1
+        """Make a map that did not come from an image visible everywhere, at once, and forget the images before it."""
+        for source in self._sources:
+            source.forget()
         self._publisher.publish(self._mapper.snapshot(self._publisher.wanted(everything=True)), self._t_ns)
         if self._field is not None and not self._busy:
             self._mapper.compute_distances(self._field.begin())

@@ -70,6 +70,10 @@ class Source:
         self._stream.listen(on)
         self.fault = ""
 
+    def forget(self) -> None:
+        """Forget the frames that wait: the map was replaced after them."""
+        self._stream.frames.clear()
+
     @property
     def waiting(self) -> bool:
         """Whether a frame waits for an update."""

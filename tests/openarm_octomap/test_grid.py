@@ -251,6 +251,18 @@ def test_each_query_says_what_unknown_counts_as() -> None:
     assert mapper.query([free], 64 * 0.02, "free").blocked.tolist() == [True]  # the coarse cell holds the box
 
 
+def test_frames_from_before_a_reset_are_left_out() -> None:
+    """Of an update that is overtaken by the reset; later ones are put into the map."""
+    mapper = Mapper(RobotDescription.load(), GridConfig(**SMALL), FilterConfig(enabled=False), FieldConfig())
+    frames, edition = [Frame("overhead", 0, scan(floor()), {})], mapper.edition
+    mapper.reset()
+    report = mapper.update(frames, edition=edition)
+    assert (report.outdated, mapper.counts(0)["occupied"]) == (True, 0)
+    report = mapper.update(frames, edition=mapper.edition)
+    assert not report.outdated
+    assert mapper.counts(0)["occupied"] > 0
+
+
 def test_decay_forgets_what_was_not_observed() -> None:
     grid = OccupancyGrid(GridConfig(decay_s=2.0, **SMALL))
     s = 1_000_000_000
