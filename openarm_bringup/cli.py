@@ -8,6 +8,7 @@ code. Modules of commands import heavy libraries inside their functions, so that
 from __future__ import annotations
 
 import ast
+import errno
 import json
 import os
 import shutil
@@ -15,6 +16,7 @@ import sys
 import textwrap
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,6 +50,8 @@ COMMANDS = {
 }
 
 
+#: Faults of a disk, which are none of the program.
+_OF_DISKS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 #: Held while a call is read: the groups of commands are shared by all requests to a daemon.
 _READING = threading.Lock()
 
@@ -104,12 +108,15 @@ def _run(tokens: Sequence[str], sink: str | None) -> int:
         if error.code == Code.INVALID_ARGUMENT:
             return _refuse(error.message, error.code, sink)
         result = failure(error)
+    except OSError as error:
+        if error.errno not in _OF_DISKS:
+            raise
+        result = failure(OpenArmError(Code.ENVIRONMENT, f"can't write {error.filename or 'a file'}: {error.strerror}"))
     except KeyboardInterrupt:
         result = Outcome(False, "stopped by Ctrl-C", Code.CANCELLED)
     if not isinstance(result, Outcome):  # --help and --version have printed
         return 0
-    _show(result, sink)
-    return result.exit_code
+    return _show(result, sink)
 
 
 def _help() -> str:
@@ -156,14 +163,18 @@ def take_json(argv: Sequence[str]) -> tuple[list[str], str | None]:
     return tokens, None
 
 
-def _show(outcome: Outcome, sink: str | None) -> None:
+def _show(outcome: Outcome, sink: str | None) -> int:
+    """Show how a command ended; return its exit code."""
     if sink == "-":
         _print(json.dumps(outcome.as_json(), indent=2, default=str))
-        return
+        return outcome.exit_code
     if sink is not None:
         from openarm_bringup.supervision import runs
 
-        runs.write_json(Path(sink), outcome.as_json())
+        try:
+            runs.write_json(Path(sink), outcome.as_json())
+        except OpenArmError as error:
+            outcome = replace(outcome, success=False, code=error.code, message=f"{outcome.message}; {error.message}")
     if outcome.text:
         _print(outcome.text)
     if outcome.success:
@@ -171,6 +182,7 @@ def _show(outcome: Outcome, sink: str | None) -> None:
             _print(outcome.message)
     else:
         sys.stderr.write(f"openarm: {outcome.code}: {outcome.message}\n")
+    return outcome.exit_code
 
 
 def _refuse(message: str, code: Code, sink: str | None) -> int:

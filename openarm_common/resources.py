@@ -50,10 +50,14 @@ def write_whole(path: Path, data: bytes, code: Code = Code.ENVIRONMENT) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(file.name).chmod(0o644)
-        os.replace(file.name, path)
+            try:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+                os.fchmod(file.fileno(), 0o644)
+                os.replace(file.name, path)
+            except OSError:
+                Path(file.name).unlink(missing_ok=True)  # nothing of it stays on a full disk
+                raise
     except OSError as error:
         raise OpenArmError(code, f"can't write {path}: {error.strerror}") from error

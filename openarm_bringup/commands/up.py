@@ -90,6 +90,9 @@ async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
                 shown.print(text, markup=False, soft_wrap=True)
             await supervisor.wait_stop_asked()
             data["states"] = supervisor.states()
+        data["lost_log_lines"] = supervisor.lost_lines
     except OpenArmError as error:
         return failure(error, **data)
-    return Outcome(True, f"{graph.name} stopped; no process is left, the logs are in {run_dir / 'logs'}", data=data)
+    lost = f", without {lines} lines that the disk did not take" if (lines := data["lost_log_lines"]) else ""
+    message = f"{graph.name} stopped; no process is left, the logs are in {run_dir / 'logs'}{lost}"
+    return Outcome(True, message, data=data)

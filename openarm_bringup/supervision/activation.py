@@ -87,7 +87,7 @@ class Activation:
         supervisor, loop = self._supervisor, asyncio.get_running_loop()
         env = environment.client_environment(supervisor.graph)
         argv = [sys.executable, "-m", _MODULE, str(listener.fileno()), str(environment.domain_id(supervisor.graph))]
-        log = supervisor.run_dir / "logs" / "daemon.log"
+        log = supervisor.log_file("daemon")
         while True:
             loop.add_reader(listener, self._asked.set)
             try:
@@ -106,7 +106,7 @@ class Activation:
                 code = str(error)
             if code == 0:  # its code has changed: the next answers
                 continue
-            supervisor.say(f"the daemon ended ({code}); its log is {log}")
+            supervisor.say(f"the daemon ended ({code}); its log is {log.path}")
             await asyncio.to_thread(shm.clean_shm)
             await asyncio.sleep(_PAUSE_S)
             _turn_away(listener)

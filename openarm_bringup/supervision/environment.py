@@ -15,7 +15,7 @@ import yaml
 from openarm_bringup.supervision.discovery import ACROSS_MACHINES, LAST_DOMAIN, PROFILE, network_profile, variables
 from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import config_dir
+from openarm_common.resources import config_dir, write_whole
 
 #: Of one message through shared memory, MiB; a cloud of 640x480 points takes 3.7 MB.
 _LARGEST_MIB = 4
@@ -72,9 +72,14 @@ def write_profile(spec: NodeSpec, path: Path) -> Path:
         sized, count = re.subn(rf"(?<=<{tag}>)\d+(?=</{tag}>)", str(mib * 2**20), sized)
         if count != 1:
             raise OpenArmError(Code.CONFIG_INVALID, f"{file}: expected one <{tag}>, found {count}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(sized, encoding="utf-8")
+    _keep(path, sized)
     return path
+
+
+def _keep(path: Path, text: str) -> None:
+    """Write a file that does not have this content yet: a restart needs no room on the disk."""
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        write_whole(path, text.encode())
 
 
 @contextmanager
@@ -102,7 +107,6 @@ def node_arguments(graph: Graph, name: str, run_dir: Path) -> list[str]:
     ros += [part for old, new in spec.remaps.items() for part in ("-r", f"{old}:={new}")]
     if params := graph.parameters(name):
         path = run_dir / "params" / f"{name}.yaml"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(yaml.safe_dump({name: {"ros__parameters": params}}, sort_keys=False), encoding="utf-8")
+        _keep(path, yaml.safe_dump({name: {"ros__parameters": params}}, sort_keys=False))
         ros += ["--params-file", str(path)]
     return [*argv, "--ros-args", *ros]

@@ -61,7 +61,7 @@ class Keeper:
         self.process: NodeProcess | None = None
         self.restarts = 0
         self.ready = asyncio.Event()
-        self.log = supervisor.run_dir / "logs" / f"{name}.log"
+        self.log = supervisor.log_file(name)
         #: Names in /dev/shm that its processes have used.
         self.mapped: set[str] = set()
         self._supervisor = supervisor
@@ -177,7 +177,7 @@ class Keeper:
 
     def _given_up(self, why: str) -> OpenArmError:
         tail = "\n".join(list(self.process.tail)[-12:]) if self.process else ""
-        return OpenArmError(Code.NOT_READY, f"{self.name} {why}; its log {self.log} ends with:\n{tail}")
+        return OpenArmError(Code.NOT_READY, f"{self.name} {why}; its log {self.log.path} ends with:\n{tail}")
 
     def _enter(self, state: NodeState, detail: str) -> None:
         self.state = state

@@ -10,11 +10,9 @@ import signal
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
-from pathlib import Path
-from typing import TextIO
 
 from openarm_bringup.supervision.guard import group_alive
+from openarm_bringup.supervision.log import LogFile
 from openarm_common.errors import Code, OpenArmError
 
 
@@ -33,9 +31,9 @@ class Ladder:
 
 
 class NodeProcess:
-    """A running child; everything it prints goes to a log file with the time of day."""
+    """A running child; everything it prints goes to a log file, whether or not that takes it."""
 
-    def __init__(self, process: asyncio.subprocess.Process, log: Path) -> None:
+    def __init__(self, process: asyncio.subprocess.Process, log: LogFile) -> None:
         self._process = process
         self._log = log
         self.tail: deque[str] = deque(maxlen=40)
@@ -44,14 +42,14 @@ class NodeProcess:
 
     @classmethod
     async def start(
-        cls, argv: Sequence[str], env: Mapping[str, str], log: Path, *, pass_fds: Sequence[int] = ()
+        cls, argv: Sequence[str], env: Mapping[str, str], log: LogFile, *, pass_fds: Sequence[int] = ()
     ) -> NodeProcess:
         """Start a command in a new session, so that signals reach its whole group and none from the terminal do.
 
         Args:
             argv: The command.
             env: Its whole environment.
-            log: File for what it prints.
+            log: For what it prints.
             pass_fds: Open files that it inherits.
 
         Raises:
@@ -126,17 +124,14 @@ class NodeProcess:
         if stream is None:
             return
         rest = b""
-        with self._log.open("a", encoding="utf-8", buffering=1) as log:
-            while chunk := await stream.read(65536):
-                *lines, rest = (rest + chunk).split(b"\n")
-                if len(rest) > 1_000_000:  # a line that never ends must not grow without bound
-                    lines, rest = [*lines, rest], b""
-                self._write(log, lines)
-            self._write(log, [rest] if rest else [])
+        while chunk := await stream.read(65536):
+            *lines, rest = (rest + chunk).split(b"\n")
+            if len(rest) > 1_000_000:  # a line that never ends must not grow without bound
+                lines, rest = [*lines, rest], b""
+            self._write(lines)
+        self._write([rest] if rest else [])
 
-    def _write(self, log: TextIO, lines: Sequence[bytes]) -> None:
-        now = datetime.now().isoformat(sep=" ", timespec="milliseconds")
-        for line in lines:
-            text = line.decode("utf-8", errors="replace").rstrip("\r")
-            self.tail.append(text)
-            log.write(f"{now} {text}\n")
+    def _write(self, lines: Sequence[bytes]) -> None:
+        texts = [line.decode("utf-8", errors="replace").rstrip("\r") for line in lines]
+        self.tail.extend(texts)
+        self._log.write(texts)

@@ -77,8 +77,22 @@ def runs_root(environ: Mapping[str, str] = os.environ) -> Path:
 
 
 def new_run_dir(root: Path | None = None) -> Path:
-    """Make a run folder named by the time of day, with `logs/` and `params/`, and point `latest` at it."""
+    """Make a run folder named by the time of day, with `logs/` and `params/`, and point `latest` at it.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, when it can't be made.
+    """
     root = runs_root() if root is None else root
+    try:
+        return _make_run_dir(root)
+    except OSError as error:
+        raise OpenArmError(
+            Code.ENVIRONMENT,
+            f"no folder for this run in {root}: {error.strerror}; make room, or choose another by OPENARM_RUNS",
+        ) from error
+
+
+def _make_run_dir(root: Path) -> Path:
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     number, folder = 1, root / stamp
     while True:
@@ -102,8 +116,11 @@ def write_record(record: RunRecord) -> Path:
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     path = folder / f"{record.pid}.json"
     draft = path.with_suffix(".tmp")
-    draft.write_text(record.model_dump_json(indent=1), encoding="utf-8")
-    draft.replace(path)
+    try:
+        draft.write_text(record.model_dump_json(indent=1), encoding="utf-8")
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
     return path
 
 
@@ -183,6 +200,13 @@ def recording_number(path: Path) -> int:
 
 
 def write_json(path: Path, data: Mapping[str, Any]) -> None:
-    """Write a JSON report."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(data, indent=2, default=str) + "\n", encoding="utf-8")
+    """Write a JSON report.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, when it can't be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(data, indent=2, default=str) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OpenArmError(Code.ENVIRONMENT, f"can't write {path}: {error.strerror}") from error

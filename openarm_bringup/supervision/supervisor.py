@@ -25,6 +25,7 @@ from openarm_bringup.supervision import environment, guard, runs, shm
 from openarm_bringup.supervision.activation import Activation
 from openarm_bringup.supervision.graph import Graph
 from openarm_bringup.supervision.keeper import Keeper, NodeState, Probe
+from openarm_bringup.supervision.log import LogFile
 from openarm_bringup.supervision.process import Ladder
 from openarm_common.errors import Code, OpenArmError
 
@@ -77,6 +78,9 @@ class Supervisor:
         self.spawning = asyncio.Lock()
         self.stop_asked = asyncio.Event()
         self.ladder, self.poll = ladder or Ladder(), poll
+        self._logs: list[LogFile] = []
+        self._log = self.log_file("supervisor")
+        self._disk_faults: set[Path] = set()
         self._keepers = {name: Keeper(name, self) for name in self.graph.nodes}
         self.daemon = Activation(self)
 
@@ -219,30 +223,55 @@ class Supervisor:
         """Log, record and publish a change of a node."""
         self.say(f"{node}: {state}: {detail}")
         self._record()
-        if self._listener is not None:
-            self._listener(Event(time.monotonic() - self._began, node, state, detail))
+        self._publish(node, state, detail)
 
     def say(self, text: str) -> None:
-        """Write a line to the supervisor's log."""
-        with (self.run_dir / "logs" / "supervisor.log").open("a", encoding="utf-8") as log:
-            log.write(f"{datetime.now().isoformat(sep=' ', timespec='milliseconds')} {text}\n")
+        """Write to the supervisor's log."""
+        self._log.write([text])
+
+    def log_file(self, name: str) -> LogFile:
+        """Return a new log of this run."""
+        path = self.run_dir / "logs" / f"{name}.log"
+        self._logs.append(LogFile(path, lambda reason: self._disk_fault(path.parent, f"{reason}; log lines are lost")))
+        return self._logs[-1]
+
+    @property
+    def lost_lines(self) -> int:
+        """Lines that are missing in the logs."""
+        return sum(log.lost for log in self._logs)
+
+    def _disk_fault(self, folder: Path, reason: str) -> None:
+        """Publish, once a folder, that it takes nothing; the nodes do not need it."""
+        if folder in self._disk_faults:
+            return
+        self._disk_faults.add(folder)
+        text = f"can't write to {folder}: {reason}; the graph goes on without it"
+        self._publish("supervisor", NodeState.FAILED, text)
+
+    def _publish(self, node: str, state: NodeState, detail: str) -> None:
+        if self._listener is not None:
+            self._listener(Event(time.monotonic() - self._began, node, state, detail))
 
     def _record(self) -> None:
         me = psutil.Process()
         nodes = {
-            name: runs.NodeRecord(state=keeper.state, pid=keeper.pid, restarts=keeper.restarts, log=str(keeper.log))
+            name: runs.NodeRecord(
+                state=keeper.state, pid=keeper.pid, restarts=keeper.restarts, log=str(keeper.log.path)
+            )
             for name, keeper in self._keepers.items()
         }
-        runs.write_record(
-            runs.RunRecord(
-                graph=self.graph.name,
-                pid=me.pid,
-                pid_created=me.create_time(),
-                domain=environment.domain_id(self.graph),
-                discovery=self.graph.discovery,
-                run_dir=str(self.run_dir),
-                started=self._started,
-                ready=all(keeper.state == NodeState.READY for keeper in self._keepers.values()),
-                nodes=nodes,
-            )
+        record = runs.RunRecord(
+            graph=self.graph.name,
+            pid=me.pid,
+            pid_created=me.create_time(),
+            domain=environment.domain_id(self.graph),
+            discovery=self.graph.discovery,
+            run_dir=str(self.run_dir),
+            started=self._started,
+            ready=all(keeper.state == NodeState.READY for keeper in self._keepers.values()),
+            nodes=nodes,
         )
+        try:
+            runs.write_record(record)
+        except OSError as error:
+            self._disk_fault(runs.state_dir(), f"{error.strerror}; `openarm ps` shows an old state")

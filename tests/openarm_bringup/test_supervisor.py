@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import signal
 import subprocess
@@ -17,7 +18,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from openarm_bringup.supervision import runs
+from openarm_bringup.supervision import environment, runs
 from openarm_bringup.supervision.graph import Graph, NodeSpec, Ready, Restart
 from openarm_bringup.supervision.keeper import NodeState
 from openarm_bringup.supervision.process import Ladder
@@ -155,6 +156,39 @@ def test_output_goes_to_a_log_per_node_with_the_time(tmp_path: Path) -> None:
     lines = (tmp_path / "run" / "logs" / "talker.log").read_text().splitlines()
     assert [line.split(" ", 2)[2] for line in lines] == ["to out", "to err", "no end"]
     assert all(line[:2] == "20" and line[10] == " " for line in lines)
+
+
+@pytest.mark.requirement("P-34")
+def test_a_full_run_folder_holds_no_node_up_and_nothing_is_left_after_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs = tmp_path / "run" / "logs"
+    logs.mkdir(parents=True)
+    for name in ("talker", "supervisor"):
+        (logs / f"{name}.log").symlink_to("/dev/full")
+    much = "print('x' * 300_000, flush=True); pathlib.Path(sys.argv[1] + '.printed').touch(); time.sleep(60)"
+    nodes = {"talker": toy(tmp_path, "talker", much, params={"speed": 1.0}, restart=Restart(backoff=0.05))}
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    async def body() -> None:
+        async with running(tmp_path, nodes) as run:
+            await run.supervisor.wait_ready()
+            await run.until(lambda: (tmp_path / "talker.printed").exists())
+            monkeypatch.setattr(environment, "write_whole", full)
+            monkeypatch.setattr(runs, "write_record", full)
+            first = run.supervisor.pid("talker")
+            os.kill(first, signal.SIGKILL)
+            await run.until(lambda: run.seen("talker").count(NodeState.READY) == 2)
+            second = run.supervisor.pid("talker")
+        assert [gone(pid) for pid in (first, second)] == [True, True]
+        assert run.supervisor.lost_lines > 1
+        said = [event.detail for event in run.events if event.node == "supervisor"]
+        assert [text.partition(":")[0] for text in said] == [f"can't write to {f}" for f in (logs, runs.state_dir())]
+        assert runs.running() == []
+
+    asyncio.run(body())
 
 
 def test_failed_node_comes_back_and_old_endpoints_do_not_count_as_ready(tmp_path: Path) -> None:
