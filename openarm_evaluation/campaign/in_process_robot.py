@@ -138,6 +138,9 @@ class InProcessRobot:
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
         return Frames(tuple(fresh()[-count:]), self.base_frame)
 
+    def expect_near(self) -> None:
+        """Nothing to wake: images are rendered when they are asked for."""
+
     def stop_observing(self) -> None:
         """Nothing is detected for now."""
         self.robot.observe("")

@@ -93,6 +93,10 @@ class CoordinatedRobot:
             coordination.observing = ""
             self._robot.stop_observing()
 
+    def expect_near(self) -> None:
+        """Announce an observation by the camera on the hand."""
+        self._robot.expect_near()
+
     def stop_observing(self) -> None:
         """An observation ends by itself."""
 

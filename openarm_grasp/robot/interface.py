@@ -131,6 +131,9 @@ class RobotInterface(Protocol):
     def warn(self, text: str) -> None:
         """Report something that does not stop the work."""
 
+    def expect_near(self) -> None:
+        """Announce an observation by the camera on the hand, which may need a moment to wake."""
+
     def stop_observing(self) -> None:
         """The camera is not needed for now."""
 

@@ -88,6 +88,10 @@ class Skills:
         self.robot.check()
         return await self.robot.observe(count, near=near)
 
+    def expect_near(self) -> None:
+        """Announce an observation by the camera on the hand."""
+        self.robot.expect_near()
+
     def stop_observing(self) -> None:
         """Let the detector rest."""
         self.robot.stop_observing()

@@ -3,13 +3,14 @@
 
 A wait ends by its condition, by a deadline of the wall clock, by a cancel, or because the robot went silent; checked 40
 times a second. Robot time is the stamp of the joint states, so the node needs no /clock. /joint_states is subscribed
-only while a grasp runs, /detections_3d only in states that observe.
+only while a grasp runs, detections only in states that observe.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rclpy.action import ActionClient
@@ -51,7 +52,7 @@ class GraphClients:
         self._config = config
         self.robot = RobotStateListener(node, node.description, joints=False)
         self.pads = Pads(node)
-        self._detections: Subscription | None = None
+        self._detections: dict[str, Subscription] = {}
         self._topic = DETECTIONS
         self._frames: list[Frame] = []
         self._frame_id = BASE_FRAME
@@ -207,12 +208,8 @@ class GraphClients:
             OpenArmError: STALE_DATA, when they do not come; CANCELLED; ROBOT_LOST.
         """
         self._frames = []
-        self._observing_since_ns = self.now_ns
-        if self._detections is not None and self._topic != topic:
-            self.stop_observing()
-        if self._detections is None:
-            self._topic = topic
-            self._detections = self._node.create_subscription(Detection3DArray, topic, self._on_detections, reliable(5))
+        self._observing_since_ns, self._topic = self.now_ns, topic
+        self.listen(topic)
         try:
             await self.until(lambda: len(self._frames) >= count, limit, "observing")
         except OpenArmError as error:
@@ -222,10 +219,17 @@ class GraphClients:
             raise OpenArmError(Code.STALE_DATA, f"{seen}; are camera and detector running?") from error
         return Frames(tuple(self._frames[-count:]), self._frame_id)
 
-    def _on_detections(self, message: Detection3DArray) -> None:
+    def listen(self, topic: str) -> None:
+        """Let a detector begin: the first frame comes up to 1.5 s later, as its camera rests without a subscriber."""
+        if topic not in self._detections:
+            self._detections[topic] = self._node.create_subscription(
+                Detection3DArray, topic, partial(self._on_detections, topic), reliable(5)
+            )
+
+    def _on_detections(self, topic: str, message: Detection3DArray) -> None:
         # What the camera took before this observation began shows another state of the world.
         t_ns = stamp_to_ns(message.header.stamp)
-        if t_ns < self._observing_since_ns:
+        if topic != self._topic or t_ns < self._observing_since_ns:
             return
         try:
             self._frames.append(Frame(t_ns, detections_from_msg(message)))
@@ -235,7 +239,6 @@ class GraphClients:
         self._frame_id = message.header.frame_id
 
     def stop_observing(self) -> None:
-        """Leave /detections_3d, so that the detector may rest."""
-        if self._detections is not None:
-            self._node.destroy_subscription(self._detections)
-            self._detections = None
+        """Leave all detections, so that the detectors may rest."""
+        while self._detections:
+            self._node.destroy_subscription(self._detections.popitem()[1])

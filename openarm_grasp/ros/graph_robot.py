@@ -182,8 +182,12 @@ class GraphRobot:
             raise OpenArmError(Code.NOT_READY, f"no node publishes {config.topic}")
         return await self._nodes.observe(count, config.topic, config.timeout)
 
+    def expect_near(self) -> None:
+        """Wake the detector of the camera on the hand."""
+        self._nodes.listen(self._config.near.topic)
+
     def stop_observing(self) -> None:
-        """Leave /detections_3d."""
+        """Leave all detections."""
         self._nodes.stop_observing()
 
     # --- planning and moving

@@ -516,9 +516,12 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
     run.tried += 1
     run.enter(State.MOVE_TO_PREGRASP, why)
     what, opening = "move to the pre-grasp", config.hand.opening
+    second = config.near.enabled and arm == config.near.arm
+    if second:
+        robot.expect_near()
     await robot.follow_and_grip(arm, plan.transfer, what, position=opening, how="open")
     why = "the open hand is before the object"
-    if config.near.enabled and arm == config.near.arm:
+    if second:
         grasp, plan, why = await _correct(run, grasp, plan)
     run.enter(State.MOVE_TO_GRASP, why)
     target = grasp.sighting.target

@@ -40,7 +40,10 @@ def test_a_grasp_by_service_places_the_object_and_publishes_its_states(bench):
 
 @pytest.mark.requirement("B-51", "B-53", "B-71")
 def test_order_of_hand_and_arm(bench):
+    near: list[int] = []
+    bench.world.during = lambda _: near.append(bench.world.count_subscribers("/wrist/detections_3d"))
     assert bench.ask().success
+    assert near[:2] == [1, 0]  # the detector of the camera on the hand wakes during the motion to the pre-grasp
     log = [entry for entry in bench.world.log if not entry.startswith("plan")]
     assert sorted(log[:2]) == ["execute", "gripper 0.044"]  # at the same time
     assert log[2:] == [
