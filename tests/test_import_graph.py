@@ -103,6 +103,27 @@ def test_importing_a_package_is_light(package: str) -> None:
     assert done.stdout == "set()\n"
 
 
+def _attributes_set(code: ast.AST) -> set[str]:
+    """Names that `self.NAME = ...` gives a value to."""
+    stores = (node for node in ast.walk(code) if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store))
+    return {node.attr for node in stores if isinstance(node.value, ast.Name) and node.value.id == "self"}
+
+
+def test_no_node_overwrites_what_rclpy_keeps() -> None:
+    """A node with `self._timers` of its own loses the timers of its base class without an error."""
+    spec = importlib.util.find_spec("rclpy")
+    assert spec is not None
+    assert spec.origin is not None
+    folder = Path(spec.origin).parent
+    kept = _attributes_set(ast.parse((folder / "node.py").read_text()))
+    assert {"_timers", "_publishers"} <= kept
+    for path in (*MODULES, *(ROOT / "tests").rglob("*.py")):
+        for code in ast.walk(ast.parse(path.read_text())):
+            bases = [ast.unparse(base).partition("[")[0] for base in getattr(code, "bases", ())]
+            if {"Node", "BaseNode", "ManagedNode", "RosNode"} & set(bases):
+                assert not _attributes_set(code) & kept, f"{path}: {ast.unparse(code)[:60]}"
+
+
 def test_packages_import_each_other_in_no_circle() -> None:
     assert structure.circles(structure.package_imports(ROOT)) == []
 

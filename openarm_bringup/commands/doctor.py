@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import importlib
 import importlib.util
+import json
 import os
 import platform
 import socket
@@ -15,11 +16,15 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from openarm_bringup.doctor import checks, graph
 from openarm_bringup.doctor.checks import Finding
 from openarm_bringup.outcome import Outcome, as_text
 from openarm_common.errors import Code
+
+if TYPE_CHECKING:
+    from openarm_bringup.supervision.runs import RunRecord
 
 MARKS = {"ok": "[green]ok[/green]", "note": "[yellow]note[/yellow]", "error": "[bold red]error[/bold red]"}
 
@@ -124,10 +129,16 @@ def _graph_findings(name: str) -> list[Finding]:
     for run in running:
         findings += graph.check_nodes(run)
         if run.ready_nodes:
-            from openarm_bringup.doctor.ros.listener import listen
-
-            findings += graph.check_status(run, listen(run))
+            findings += graph.check_status(run, _status(run))
     return findings
+
+
+def _status(run: RunRecord) -> graph.GraphStatus:
+    """Have the nodes of a graph asked, by a process of its own; nothing where none is discovered."""
+    command = [sys.executable, "-m", "openarm_bringup.cli", "node", "health", "--domain", str(run.domain), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    data = json.loads(done.stdout)
+    return graph.GraphStatus(data.get("rates", {}), data.get("diagnostics", {}), data.get("nodes", []))
 
 
 def _failed_imports(names: tuple[str, ...]) -> dict[str, str]:

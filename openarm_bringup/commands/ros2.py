@@ -347,6 +347,24 @@ def info(name: str, *, domain: Domain = None) -> Outcome:
     return Outcome(True, data={"node": found, **data}, text="\n".join(lines))
 
 
+@node.command
+def health(*, domain: Domain = None) -> Outcome:
+    """Show what the nodes report of themselves, and the rates of the topics that have a steady one."""
+    from openarm_bringup.doctor.ros.listener import listen
+
+    status = listen(domain)
+    width = max((len(name) for name in (*status.diagnostics, *status.rates)), default=0)
+    lines = [
+        f"{name:<{width}}  {'ok' if good else 'error':<5}  {message}"
+        for name, (good, message) in sorted(status.diagnostics.items())
+    ]
+    lines += [f"{topic:<{width}}  {rate:.1f} Hz" for topic, rate in sorted(status.rates.items())]
+    faulty = sorted(name for name, (good, _) in status.diagnostics.items() if not good)
+    if faulty:
+        return Outcome(False, f"{', '.join(faulty)}: not well", Code.NOT_READY, vars(status), "\n".join(lines))
+    return Outcome(True, data=vars(status), text="\n".join(lines))
+
+
 def _answered(answer: dict[str, Any], data: dict[str, Any]) -> Outcome:
     from openarm_bringup.messages import to_yaml
 

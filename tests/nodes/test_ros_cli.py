@@ -14,16 +14,19 @@ from typing import Any
 
 import cv2
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from openarm_interfaces.action import Pick
 from openarm_interfaces.srv import SetPause
 from rclpy.action import ActionServer
 from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
 from openarm_bringup import cli
 from openarm_bringup.commands import ros2, tf
+from openarm_bringup.doctor.ros import listener
 from openarm_bringup.ros import peer as peer_client
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_STATIC_TF
@@ -227,6 +230,23 @@ def test_nodes_and_parameters(heard: list[str]) -> None:
     wrong = ros2.param_set("probe", "height", "tall")
     assert not wrong.success
     assert "--set probe.height=tall" in wrong.message
+
+
+def test_nodes_say_how_they_are(ros, heard: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listener, "_RATES_S", 0.5)
+    monkeypatch.setattr(listener, "_LISTEN_S", 0.5)
+    reports = ros.node.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+    levels = {"arm: status": DiagnosticStatus.OK, "eye: status": DiagnosticStatus.ERROR}
+    status = [DiagnosticStatus(name=name, level=level, message="as it is") for name, level in levels.items()]
+    ros.node.create_timer(0.02, lambda: reports.publish(DiagnosticArray(status=status)))
+    clock = ros.node.create_publisher(Clock, "/clock", 10)
+    ros.node.create_timer(0.01, lambda: clock.publish(Clock()))
+    outcome = ros2.health()
+    assert (outcome.success, outcome.message) == (False, "eye: not well")
+    assert outcome.data["diagnostics"] == {"arm": (True, "as it is"), "eye": (False, "as it is")}
+    assert outcome.data["nodes"].count("probe") == 1
+    assert outcome.data["rates"]["/clock"] > 10.0
+    assert outcome.text.splitlines()[1].split() == ["eye", "error", "as", "it", "is"]
 
 
 @pytest.mark.requirement("B-35")

@@ -71,7 +71,7 @@ class FlightRecorder(ManagedNode[FlightRecorderConfig]):
         self._recordings = Recordings(folder, config.most, config.disk * 10**6)
         self._fault = ""
         self.create_service(SaveRecording, "/flight_recorder/save", answering(self._save))
-        self._timers = [
+        self._work = [
             self.create_timer(period, work, clock=self.steady_clock, autostart=False)
             for period, work in ((_DISCOVER_S, self._listener.discover), (_DRAIN_S, self._listener.drain))
         ]
@@ -82,12 +82,12 @@ class FlightRecorder(ManagedNode[FlightRecorderConfig]):
     # --- lifecycle
     def begin(self) -> None:
         """Listen."""
-        for timer in self._timers:
+        for timer in self._work:
             timer.reset()
 
     def rest(self) -> None:
         """Leave the graph alone; what is in memory can still be saved."""
-        for timer in self._timers:
+        for timer in self._work:
             timer.cancel()
         self._listener.leave()
 
