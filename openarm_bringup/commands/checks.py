@@ -40,7 +40,9 @@ def test(*args: Rest) -> Outcome:
     began = time.monotonic()
     shared = [] if given_paths or set(NEEDS_ONE_PROCESS) & set(args) else _shared_out()
     command = [sys.executable, "-m", "pytest", "-q", *shared, *paths, *args]
-    code = subprocess.run(command, cwd=root, check=False).returncode
+    # Byte code is kept, whatever the environment says: the tests start a hundred processes.
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    code = subprocess.run(command, cwd=root, env=env, check=False).returncode
     seconds = time.monotonic() - began
     data = {"exit_code": code, "seconds": round(seconds, 1)}
     if code == 0:

@@ -50,3 +50,16 @@ def test_one_processor_has_one_process(asked: list[list[str]], monkeypatch: pyte
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
     checks.test()
     assert "-n" not in asked[0]
+
+
+def test_byte_code_of_what_the_tests_import_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[dict[str, str]] = []
+
+    def run(command: list[str], *, env: dict[str, str], **_: object) -> subprocess.CompletedProcess[str]:
+        given.append(env)
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(checks.subprocess, "run", run)
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    checks.test()
+    assert given[0] == {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
