@@ -59,6 +59,9 @@ class Restart(Config):
     backoff: float = Field(default=0.5, gt=0, description="s before the first restart; doubles with each one")
     backoff_max: float = Field(default=8.0, gt=0, description="s, the longest wait")
     max: int = Field(default=5, ge=0, description="restarts before the node is given up")
+    retry: float = Field(
+        default=30.0, gt=0, description="s until a node that was given up is tried again, if the graph goes on"
+    )
     forget_after: float = Field(default=60.0, gt=0, description="s of being ready that make up for earlier restarts")
 
 

@@ -99,7 +99,14 @@ class Keeper:
             if policy.policy == "never" or not self._was_ready:
                 raise self._given_up(why)
             if self.restarts >= policy.max:
-                raise self._given_up(f"{why} after {self.restarts} restarts")
+                error = self._given_up(f"{why} after {self.restarts} restarts")
+                if not self.dispensable:
+                    raise error
+                # What it lacks may come back: memory that others had taken, a device.
+                text = f"the graph goes on without it and tries again in {policy.retry:g} s: {error.message}"
+                self._enter(NodeState.FAILED, text)
+                await asyncio.sleep(policy.retry)
+                continue
             self.restarts += 1
             self._enter(NodeState.BACKOFF, f"{why}; restart {self.restarts} of {policy.max} in {pause:g} s")
             await asyncio.sleep(pause)

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -23,9 +24,13 @@ _LARGE_EXTRA_MIB = 2.2
 #: Largest factor by which segments grow, and the share of the free space that a graph may then take.
 _GROWTH, _SHARE = 4, 0.25
 
+#: Time after which a segment without a lock is not just being made, s.
+_UNBORN_S = 5.0
+
 _PORT = re.compile(r"fastrtps_port(\d+)")
 #: Segments and ports of Fast DDS, and distance fields (`openarm_common.octree.distance_field.field_path`).
-_OURS = re.compile(rf"fastrtps_[0-9a-f]{{16}}|{_PORT.pattern}|openarm_field_[A-Za-z0-9_.-]+")
+_SEGMENT = re.compile(r"fastrtps_[0-9a-f]{16}")
+_OURS = re.compile(rf"{_SEGMENT.pattern}|{_PORT.pattern}|openarm_field_[A-Za-z0-9_.-]+")
 
 
 def shm_need_mib(graph: Graph, extra_participants: int = 1) -> float:
@@ -107,6 +112,20 @@ def names_of(domain: int, shm: Path = SHM) -> set[str]:
     return ports | {name for name in names if field.fullmatch(name)}
 
 
+def unborn(shm: Path = SHM) -> list[str]:
+    """Return the names of this user's segments that a full /dev/shm has kept from being made: they never got a lock."""
+    return [path.name for path in shm.iterdir() if _SEGMENT.fullmatch(path.name) and _is_unborn(path)]
+
+
+def _is_unborn(path: Path) -> bool:
+    try:
+        about = path.stat()
+    except FileNotFoundError:
+        return False
+    old = time.time() - about.st_mtime > _UNBORN_S
+    return old and about.st_uid == os.geteuid() and not path.with_name(f"{path.name}_el").exists()
+
+
 def unused(names: Iterable[str], shm: Path = SHM) -> list[str]:
     """Return those of the named segments, ports and fields that exist and are no longer in use.
 
@@ -147,7 +166,7 @@ def _locked(path: Path) -> bool:
 def main() -> None:
     """`python -m openarm_bringup.supervision.shm DOMAIN`: clean up after a graph whose supervisor is dead."""
     clean_shm()
-    sweep(names_of(int(sys.argv[1])))
+    sweep({*names_of(int(sys.argv[1])), *unborn()})
 
 
 if __name__ == "__main__":

@@ -52,6 +52,28 @@ def test_a_node_that_can_be_spared_is_given_up_and_the_rest_goes_on(tmp_path: Pa
     assert asyncio.run(body()).message.startswith("arm ended by signal 9")
 
 
+def test_a_node_that_can_be_spared_comes_back_when_what_it_lacked_is_there_again(tmp_path: Path) -> None:
+    full = tmp_path / "full"
+    spec = toy(tmp_path, "map", restart=Restart(backoff=0.01, max=2, retry=0.1), essential=False)
+    *python, code, ready = spec.command
+    guarded = f"import os, sys; os.path.exists({str(full)!r}) and sys.exit('no room'); {code}"
+    nodes = {"map": spec.model_copy(update={"command": (*python, guarded, ready)})}
+
+    async def body() -> None:
+        async with running(tmp_path, nodes) as run:
+            await run.supervisor.wait_ready()
+            full.touch()
+            os.kill(run.supervisor.pid("map"), signal.SIGKILL)
+            await run.until(lambda: run.seen("map").count(NodeState.FAILED) == 2)
+            assert "tries again in 0.1 s: map ended with code 1 after 2 restarts" in run.events[-1].detail
+            full.unlink()
+            await run.until(lambda: run.seen("map")[-1] == NodeState.READY)
+            (record,) = runs.running()
+            assert record.health == "ready"
+
+    asyncio.run(body())
+
+
 def test_a_node_that_can_be_spared_still_has_to_come_up_once(tmp_path: Path) -> None:
     command = ("python", "-c", "raise SystemExit('no such scene')")
     broken = NodeSpec(command=command, ready=(Ready(service="/x"),), essential=False)

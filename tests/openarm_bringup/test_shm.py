@@ -18,6 +18,7 @@ from openarm_bringup.supervision.shm import (
     names_of,
     shm_need_mib,
     sweep,
+    unborn,
     with_larger_segments,
 )
 
@@ -68,6 +69,18 @@ def test_the_distance_field_of_a_killed_map_goes_and_that_of_a_living_one_stays(
         assert mapped_by(os.getpid(), tmp_path) == {living.name}
         assert sweep(names_of(4, tmp_path) | names_of(43, tmp_path), tmp_path) == sorted(dead)
     assert sorted(p.name for p in tmp_path.glob("openarm_*")) == sorted(others)
+
+
+def test_what_a_full_memory_has_kept_from_being_made_is_removed_and_what_is_being_made_is_not(tmp_path: Path) -> None:
+    unborn_one, made, young = (make(tmp_path, f"fastrtps_{d * 16}", lock=d == "b") for d in "abc")
+    port = make(tmp_path, "fastrtps_port7411", lock=False)
+    for old in (unborn_one, made, port):
+        os.utime(old, (1e9, 1e9))
+    assert unborn(tmp_path) == [unborn_one.name]
+    with unborn_one.open("r+b") as file, mmap.mmap(file.fileno(), 4096):
+        assert sweep(unborn(tmp_path), tmp_path) == []
+    assert sweep(unborn(tmp_path), tmp_path) == [unborn_one.name]
+    assert young.exists()
 
 
 def test_mapped_by_a_process_that_has_ended_is_nothing() -> None:
