@@ -18,7 +18,7 @@ import setuptools
 _ROOT = Path(__file__).parents[1]
 _PACKAGES = sorted(path.parent.name for path in _ROOT.glob("openarm_*/__init__.py"))
 _INTERFACES = sorted(path.parent.name for path in _ROOT.glob("interfaces/*/package.xml"))
-_LOCKS = ["requirements.lock", "requirements-build.lock", "requirements-dev.lock"]
+_LOCKS = sorted(path.name for path in _ROOT.glob("*.lock"))
 
 
 def test_the_wheel_holds_packages_models_and_parameters_and_nothing_of_colcon(tmp_path: Path) -> None:

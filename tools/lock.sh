@@ -13,3 +13,4 @@ lock() {
 lock requirements.lock pyproject.toml --extra test --group setup "$@"
 lock requirements-build.lock --group interfaces "$@"
 lock requirements-dev.lock --group dev --constraints requirements.lock "$@"
+echo foxglove-sdk | lock requirements-viz.lock --constraints requirements.lock "$@" -

@@ -63,6 +63,7 @@ def require_sdk() -> None:
     if importlib.util.find_spec("foxglove") is None:
         raise OpenArmError(
             Code.ENVIRONMENT,
-            "--viz needs foxglove-sdk, which is not installed: `.venv/bin/uv pip install foxglove-sdk` in a checkout, "
+            "--viz needs foxglove-sdk, which is not installed: `.venv/bin/uv pip install --require-hashes "
+            "-r requirements-viz.lock` in a checkout, "
             "`pip install 'openarm-vision[viz]'` elsewhere; `openarm view` needs nothing",
         )

@@ -13,7 +13,7 @@ from typing import Any
 import aiohttp
 import pytest
 
-pytest.importorskip("foxglove", reason="needs foxglove-sdk: .venv/bin/uv pip install foxglove-sdk")
+pytest.importorskip("foxglove", reason="needs foxglove-sdk: .venv/bin/uv pip install --require-hashes -r requirements-viz.lock")
 
 PROTOCOL = "foxglove.sdk.v1"
 
