@@ -161,10 +161,11 @@ class Supervisor:
             # A node that is slow to end does not hold back the rest: its own ladder goes on meanwhile.
             await asyncio.wait(tasks, timeout=1.0)
         await asyncio.gather(*stops)
+        mapped = shm.mapped_by(os.getpid())
         if self._probe is not None and (await asyncio.wait([self._probe])) and self._probe.exception() is None:
             await self.ask(lambda probe: probe.close())
         self._threads.shutdown()
-        mapped = self.daemon.mapped.union(*(keeper.mapped for keeper in self._keepers.values()))
+        mapped |= self.daemon.mapped.union(*(keeper.mapped for keeper in self._keepers.values()))
         domain = environment.domain_id(self.graph)
         swept = await asyncio.to_thread(lambda: shm.sweep({*mapped, *shm.names_of(domain), *shm.unborn()}))
         self.say(f"removed from /dev/shm: {', '.join(swept) or 'nothing'}")
