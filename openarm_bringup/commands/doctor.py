@@ -86,6 +86,8 @@ def gather(graph: str) -> list[Finding]:
         rclpy_version = installed.get("ros-rclpy") or installed.get("rclpy") or "unknown"
         findings += checks.check_ros(environ, rclpy.origin if rclpy else None, rclpy_version, sys.prefix)
         findings += checks.check_rmw(environ)
+        from_wheels = bool(rclpy and rclpy.origin and rclpy.origin.startswith(sys.prefix))
+        findings += checks.check_security(environ, from_wheels)
         findings += [checks.check_imports(failed[purpose], purpose, names) for purpose, names in GROUPS.items()]
         findings.append(checks.check_gl(render.result(), environ.get("MUJOCO_GL", "egl")))
         findings += of_graph.result()
@@ -123,6 +125,7 @@ def _graph_findings(name: str) -> list[Finding]:
     running = runs.running()
     observed = "; ".join(f"{run.graph} in domain {run.domain}: {run.health} (pid {run.pid})" for run in running)
     findings.append(Finding("graphs", "ok", observed or "none is running"))
+    findings += checks.check_reach([run.discovery for run in running])
     latest = [] if running else [runs.runs_root() / "latest"]  # the last that has ended
     folders = [*(Path(run.run_dir) for run in running), *(path.resolve() for path in latest if path.exists())]
     findings += [graph.check_recordings(folder) for folder in folders]

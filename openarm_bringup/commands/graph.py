@@ -26,7 +26,9 @@ def list_() -> Outcome:
 
 @graph.command
 def check(graph: str = "sim") -> Outcome:
-    """Check a graph file: keys, names, needs, parameter files, modules, shared memory.
+    """Check a graph file: keys, names, needs, parameter files, modules, shared memory. List what it runs.
+
+    A graph file runs any program as the user who starts it: those that are none of the suite's are named.
 
     Args:
         graph: Name of a graph, or a file.
@@ -38,6 +40,7 @@ def check(graph: str = "sim") -> Outcome:
     loaded = load_graph(graph)
     missing = {name: spec.module for name, spec in loaded.nodes.items() if spec.module and not _exists(spec.module)}
     need, free = shm_need_mib(loaded, extra_participants=4), shm_free_mib()
+    foreign = [name for name, spec in loaded.nodes.items() if spec.foreign]
     data = {
         "graph": loaded.name,
         "nodes": list(loaded.nodes),
@@ -45,16 +48,20 @@ def check(graph: str = "sim") -> Outcome:
         "domain": domain_id(loaded),
         "shm_need_mib": need,
         "shm_free_mib": round(free, 1),
+        "programs": {name: spec.program for name, spec in loaded.nodes.items()},
+        "foreign": foreign,
     }
+    width = max(map(len, loaded.nodes))
+    lines = [f"{name:<{width}}  {spec.program}" for name, spec in loaded.nodes.items()]
+    text = "\n".join(line.encode("unicode_escape").decode() for line in lines)  # a line of the table each
     if missing:
         name, module = next(iter(missing.items()))
         message = f"node {name}: there is no module {module}; is the package that holds it installed?"
-        return Outcome(False, message, Code.CONFIG_INVALID, data)
-    return Outcome(
-        True,
-        f"{loaded.name}: {len(loaded.nodes)} nodes, {need:.0f} MiB of /dev/shm ({free:.0f} free): valid",
-        data=data,
-    )
+        return Outcome(False, message, Code.CONFIG_INVALID, data, text)
+    message = f"{loaded.name}: {len(loaded.nodes)} nodes, {need:.0f} MiB of /dev/shm ({free:.0f} free): valid"
+    if foreign:
+        message += f"; not of the suite: {', '.join(foreign)}. Start it only if you trust these programs"
+    return Outcome(True, message, data=data, text=text)
 
 
 @graph.command

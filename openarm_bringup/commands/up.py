@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from openarm_bringup.commands.connect import Sets
 from openarm_bringup.outcome import Outcome, console, failure
-from openarm_bringup.supervision.discovery import Discovery
+from openarm_bringup.supervision.discovery import Discovery, exposure
 from openarm_common.errors import OpenArmError
 
 if TYPE_CHECKING:
@@ -76,6 +76,8 @@ async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
         shown.print(line, markup=False, soft_wrap=True)
 
     data: dict[str, Any] = {"graph": graph.name, "run_dir": str(run_dir), "domain": domain_id(graph)}
+    if warning := exposure(graph.discovery):
+        shown.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
     try:
         async with running_graph(graph, run_dir, show) as supervisor:
             data["ready_s"] = round(await supervisor.wait_ready(), 2)

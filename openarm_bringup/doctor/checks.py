@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from openarm_bringup.supervision.discovery import LAST_DOMAIN
+from openarm_bringup.supervision.discovery import ACROSS_MACHINES, LAST_DOMAIN, exposure
 
 Level = Literal["ok", "note", "error"]
 
@@ -179,6 +179,30 @@ def check_rmw(environ: Mapping[str, str]) -> list[Finding]:
         )
         findings.append(note("fast dds profile", environ["FASTRTPS_DEFAULT_PROFILES_FILE"], advice))
     return findings
+
+
+def check_security(environ: Mapping[str, str], from_wheels: bool) -> list[Finding]:
+    """Check whether SROS 2 is asked of Fast DDS wheels, which were built without it; nothing where it is not asked.
+
+    Args:
+        environ: The environment.
+        from_wheels: Whether ROS comes from the wheels, not from a native installation.
+    """
+    if environ.get("ROS_SECURITY_ENABLE", "").lower() != "true":
+        return []
+    if from_wheels:
+        advice = (
+            "the wheels are built without DDS security: nodes either refuse to start or talk unprotected; unset it, "
+            "and keep others out as docs/two_machines.md says, or use a native ROS 2 (docs/native.md)"
+        )
+        return [error("security", "ROS_SECURITY_ENABLE=true", advice)]
+    advice = "the suite brings no keystore and is not tested with SROS 2"
+    return [note("security", "ROS_SECURITY_ENABLE=true", advice)]
+
+
+def check_reach(reaches: Sequence[str]) -> list[Finding]:
+    """Check whether graphs that run are open to the network, by their reaches of discovery."""
+    return [note("network", f"discovery {reach}", exposure(reach)) for reach in sorted({*reaches} & {*ACROSS_MACHINES})]
 
 
 def check_domain(text: str, first_ephemeral_port: int) -> Finding:

@@ -25,6 +25,16 @@ def variables(domain: int, discovery: str) -> dict[str, str]:
     return found
 
 
+def exposure(discovery: str) -> str:
+    """Return a warning that the network can command the robot; empty where discovery stays on this machine."""
+    if discovery not in ACROSS_MACHINES:
+        return ""
+    return (
+        f"discovery {discovery}: whoever is on this network can see the cameras and move the arms, without a password; "
+        "docs/two_machines.md says how to keep others out"
+    )
+
+
 def network_profile() -> Path:
     """Return the Fast DDS profile of processes that receive images from another machine."""
     return config_dir() / "fastdds_network.xml"

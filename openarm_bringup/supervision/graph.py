@@ -8,6 +8,7 @@ replaced by the graph's own top-level values.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -25,6 +26,8 @@ ConditionKind = Literal["topic", "message", "service", "action"]
 
 #: Values of the graph that parameters may refer to.
 VARIABLES = ("scene", "seed", "mount_seed")
+#: Modules of the suite begin with this.
+_SUITE = "openarm_"
 #: Parameters that rclpy declares for every node.
 _OF_ROS = ("use_sim_time", "qos_overrides.")
 
@@ -84,6 +87,17 @@ class NodeSpec(Config):
     env: dict[str, str] = Field(default_factory=dict)
     offers: tuple[str, ...] = Field(default=(), description="topics, services, actions, for `graph draw`")
     uses: tuple[str, ...] = Field(default=(), description="names that other nodes offer, for `graph draw`")
+
+    @property
+    def program(self) -> str:
+        """What is started, as in a shell."""
+        start = shlex.join(self.command) if self.command else f"python -m {self.module}"
+        return " ".join([*(f"{name}={shlex.quote(value)}" for name, value in self.env.items()), start])
+
+    @property
+    def foreign(self) -> bool:
+        """Whether it is more than a module of the suite: a command, another module, or variables of its own."""
+        return bool(self.command or self.env) or not str(self.module).startswith(_SUITE)
 
     @model_validator(mode="after")
     def _start(self) -> NodeSpec:

@@ -13,7 +13,9 @@ from typing import Any
 import aiohttp
 import pytest
 
-pytest.importorskip("foxglove", reason="needs foxglove-sdk: .venv/bin/uv pip install --require-hashes -r requirements-viz.lock")
+pytest.importorskip(
+    "foxglove", reason="needs foxglove-sdk: .venv/bin/uv pip install --require-hashes -r requirements-viz.lock"
+)
 
 PROTOCOL = "foxglove.sdk.v1"
 

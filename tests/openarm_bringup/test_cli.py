@@ -96,12 +96,32 @@ def test_missing_module_is_named_by_graph_check(tmp_path: Path, capsys: pytest.C
     assert "there is no module no_such_package.node" in capsys.readouterr().err
 
 
+def test_graph_check_lists_what_it_runs_and_names_what_is_none_of_the_suite(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    foreign = {
+        "extra": {"command": ["sh", "-c", "true\n\x1b[2J"]},
+        "other": {"module": "json.tool"},
+        "octomap": {"env": {"LD_PRELOAD": "/tmp/x.so"}},
+    }
+    path = tmp_path / "mine.yaml"
+    path.write_text(json.dumps({"extends": "map", "nodes": foreign}))
+    assert cli.run(["graph", "check", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "not of the suite: octomap, extra, other. Start it only if you trust" in out
+    assert "LD_PRELOAD=/tmp/x.so python -m openarm_octomap.ros.node" in out
+    (line,) = [line for line in out.splitlines() if line.startswith("extra ")]
+    assert line.split(maxsplit=1)[1] == r"sh -c 'true\n\x1b[2J'"
+
+
 def test_every_graph_of_the_suite_is_sound() -> None:
     """B-66: each step of the bring-up is a graph of its own."""
     listed = graph.list_().data["graphs"]
     assert set(listed) >= {"sim", "sim_only", "perception", "motion"}
     for name in listed:
-        assert graph.check(name).success, name
+        checked = graph.check(name)
+        assert checked.success, name
+        assert not checked.data["foreign"], name
 
 
 def test_draw_writes_json_to_a_file_and_text_to_stdout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

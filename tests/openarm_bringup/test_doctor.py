@@ -196,6 +196,21 @@ def test_environment_that_changes_discovery_is_noted() -> None:
     assert [finding.level for finding in checks.check_rmw({})] == ["ok", "ok"]
 
 
+def test_sros_2_is_refused_for_the_wheels_which_are_built_without_it() -> None:
+    asked = {"ROS_SECURITY_ENABLE": "true"}
+    (found,) = checks.check_security(asked, from_wheels=True)
+    assert (found.level, found.observed) == ("error", "ROS_SECURITY_ENABLE=true")
+    assert "docs/two_machines.md" in found.advice
+    assert [finding.level for finding in checks.check_security(asked, from_wheels=False)] == ["note"]
+    assert checks.check_security({"ROS_SECURITY_ENABLE": "false"}, from_wheels=True) == []
+
+
+def test_a_graph_that_the_network_can_command_is_noted() -> None:
+    (found,) = checks.check_reach(["localhost", "subnet", "subnet"])
+    assert (found.level, found.observed) == ("note", "discovery subnet")
+    assert "move the arms, without a password" in found.advice
+
+
 @pytest.mark.slow
 @pytest.mark.requirement("B-10")
 def test_doctor_of_this_machine_checks_ros_simulator_and_planner(

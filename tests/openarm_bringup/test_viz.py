@@ -70,7 +70,7 @@ def test_up_sets_parameters_of_the_added_node_too(monkeypatch: pytest.MonkeyPatc
 
 def test_a_missing_sdk_is_said_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(OpenArmError, match="--require-hashes -r requirements-viz.lock") as refused:
+    with pytest.raises(OpenArmError, match=r"--require-hashes -r requirements-viz\.lock") as refused:
         with_viz(load_graph("sim_only"), free_port())
     assert refused.value.code is Code.ENVIRONMENT
 
