@@ -94,8 +94,13 @@ def completion(shell: Literal["bash", "zsh", "fish"] = "bash", *, install: bool 
 
 
 def _in_order(tests: Path) -> list[str]:
-    """Return the test files: those that wait evenly among those that compute, of each kind the largest first."""
-    files = sorted(tests.rglob("test_*.py"), key=lambda path: (-path.stat().st_size, path))
+    """Return the test files: those that wait evenly among those that compute, of each kind the longest first.
+
+    A long one that came last would keep one process busy and the others waiting. Those with a test that is marked slow
+    come first, then those with most text.
+    """
+    texts = {path: path.read_bytes() for path in tests.rglob("test_*.py")}
+    files = sorted(texts, key=lambda path: (b"mark.slow" not in texts[path], -len(texts[path]), path))
     kinds = [path.relative_to(tests).parts[0] in WAITING for path in files]
     ranks = [kinds[:k].count(kind) / kinds.count(kind) for k, kind in enumerate(kinds)]
     return [str(path.relative_to(tests.parent)) for _, path in sorted(zip(ranks, files, strict=True))]

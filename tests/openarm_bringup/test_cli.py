@@ -272,6 +272,14 @@ def test_files_of_tests_that_wait_are_spread_among_those_that_compute() -> None:
     assert max(counts) - min(counts) <= 2
 
 
+def test_files_with_a_slow_test_come_first_then_the_largest(tmp_path: Path) -> None:
+    tests = tmp_path / "tests"
+    tests.mkdir()
+    for name, text in {"large": "#" * 90, "small": "", "slow": "@pytest.mark." + "slow"}.items():
+        (tests / f"test_{name}.py").write_text(text)
+    assert _in_order(tests) == ["tests/test_slow.py", "tests/test_large.py", "tests/test_small.py"]
+
+
 def test_outcome_exit_codes() -> None:
     assert Outcome(True).exit_code == 0
     assert Outcome(False, "no", Code.NO_PLAN).exit_code == 1

@@ -56,6 +56,7 @@ def test_old_grasps_are_forgotten():
     assert not watch.drift().alarm
 
 
+@pytest.mark.slow
 @pytest.mark.requirement("N-06")
 def test_grasps_with_a_mount_8_mm_off_raise_the_alarm() -> None:
     camera = load_cameras()["overhead"]
