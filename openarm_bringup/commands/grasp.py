@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`openarm grasp`: the states of a grasp."""
+"""`openarm grasp`: the states of a grasp, and the release of a hand."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Literal
 
 from cyclopts import App
 
+from openarm_bringup.commands.connect import Domain, join_graph, requires_node
 from openarm_bringup.outcome import Outcome
 
-grasp = App(name="grasp", help="The states of a grasp.")
+grasp = App(name="grasp", help="The states of a grasp; release of a hand.")
 
 
 @grasp.command
@@ -24,3 +25,18 @@ def graph(*, form: Literal["text", "mermaid"] = "text") -> Outcome:
     drawing = mermaid() if form == "mermaid" else as_text()
     data = {state.value: {other.value: when for other, when in row.items()} for state, row in SUCCESSORS.items()}
     return Outcome(True, data={"successors": data, "drawing": drawing}, text=drawing)
+
+
+@grasp.command
+def release(*, arm: Literal["", "left", "right"] = "", domain: Domain = None) -> Outcome:
+    """Open a hand where it is: what it holds falls from there. `openarm pick --phase place` puts it down instead.
+
+    Args:
+        arm: left or right; when not given, of the one that holds something.
+    """
+    join_graph(domain)
+    from openarm_grasp.ros.client import GraspClient
+
+    with requires_node("grasp", "sim"), GraspClient() as client:
+        answer = client.release(arm)
+    return Outcome(answer.success, answer.message, answer.code)

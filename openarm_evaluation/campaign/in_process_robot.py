@@ -87,6 +87,11 @@ class InProcessRobot:
         links = pad_links("left" if arm == "left" else "right")
         return tuple(float(np.linalg.norm(self.robot.world.pad_wrench(link)[0])) for link in links)
 
+    def held_box(self, arm: str) -> GraspBox | None:
+        """What the motion service carries in a hand, TCP frame."""
+        held = self.robot.motion.memory.held.get(arm, ())
+        return GraspBox(held[0].id, held[0].T, np.array(held[0].size)) if len(held) == 1 else None
+
     def check(self) -> None:
         """Raise when the grasp must not go on: CANCELLED, ROBOT_LOST."""
         self.watch()

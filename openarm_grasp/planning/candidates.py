@@ -264,3 +264,9 @@ def held_box(target: Detection, candidate: GraspCandidate, config: GraspConfig) 
     """The object in the closed hand, TCP frame."""
     box = target_box(target, config)
     return Box(box.id, se3.inverse(candidate.T_base_tcp) @ box.T_frame_box, box.size)
+
+
+def object_in(box: Box, config: GraspConfig) -> tuple[Array, Array]:
+    """Edges (3,) of the object whose `held_box` this is, and its pose (4, 4) in the TCP frame."""
+    gap = min(config.approach.table_gap, float(box.size[2]))
+    return box.size + np.array([0.0, 0.0, gap]), box.T_frame_box @ se3.make(p=(0.0, 0.0, -0.5 * gap))

@@ -125,6 +125,10 @@ class RobotInterface(Protocol):
         """Force on each finger pad of a hand, N; empty without a sensor."""
         ...
 
+    def held_box(self, arm: str) -> Box | None:
+        """What the planner carries in a hand, TCP frame; None when it knows of nothing there."""
+        ...
+
     def check(self) -> None:
         """Raise when the work may not go on: CANCELLED, ROBOT_LOST."""
 

@@ -267,6 +267,14 @@ class Skills:
         """
         return self._hands[arm].gap()
 
+    def T_base_tcp(self, arm: str) -> Array:
+        """(4, 4) pose of the tool centre point."""
+        return self._hands[arm].T_base_tcp()
+
+    def held_box(self, arm: str) -> Box | None:
+        """What the planner carries in a hand, TCP frame; None when it knows of nothing there."""
+        return self.robot.held_box(arm)
+
     async def grip(self, arm: str, position: float, what: str, effort: float = 0.0) -> None:
         """Move the fingers until they are there or push against something.
 

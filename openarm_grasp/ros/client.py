@@ -11,7 +11,7 @@ from typing import Any
 
 from openarm_interfaces.action import Pick, PickTwo
 from openarm_interfaces.msg import GraspStatus, PickRequest, PickResult
-from openarm_interfaces.srv import ConfirmPlan
+from openarm_interfaces.srv import ConfirmPlan, ReleaseHand
 
 from openarm_common.errors import Answer, Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
@@ -23,6 +23,9 @@ from openarm_grasp.strategies.state_times import StateTime
 
 OnFeedback = Callable[[GraspStatus], None]
 OnPlan = Callable[[GraspStatus], bool]
+
+#: Longest wait for a hand to open, s.
+_RELEASE_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -146,9 +149,11 @@ class GraspClient(BackgroundNode):
     def confirm(self, plan_id: str, *, accept: bool) -> Answer:
         """Confirm or reject the plan that waits, of whichever client."""
         request = ConfirmPlan.Request(plan_id=plan_id, accept=accept)
-        answer = self.call(ConfirmPlan, "/grasp/confirm", request, self._timeout)
-        code = Code.OK if answer.success else code_from_text(answer.code, Code.INTERNAL)
-        return Answer(answer.success, code, answer.message)
+        return _answer(self.call(ConfirmPlan, "/grasp/confirm", request, self._timeout))
+
+    def release(self, arm: str = "") -> Answer:
+        """Open a hand where it is, and forget what it held; "" is the one that holds something."""
+        return _answer(self.call(ReleaseHand, "/grasp/release", ReleaseHand.Request(arm=arm), _RELEASE_S))
 
     def pick_two(
         self,
@@ -215,6 +220,11 @@ class GraspClient(BackgroundNode):
                 self.confirm(plan.plan_id, accept=confirm(plan))
 
         return self.do(kind, name, goal, timeout=timeout, on_feedback=deliver, stop=self._stop, meanwhile=answer)
+
+
+def _answer(message: ConfirmPlan.Response | ReleaseHand.Response) -> Answer:
+    code = Code.OK if message.success else code_from_text(message.code, Code.INTERNAL)
+    return Answer(message.success, code, message.message)
 
 
 def _where(

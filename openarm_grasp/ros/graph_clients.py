@@ -50,7 +50,7 @@ class GraphClients:
     def __init__(self, node: BaseNode[Any], config: GraspConfig) -> None:
         self._node = node
         self._config = config
-        self.robot = RobotStateListener(node, node.description, joints=False)
+        self.robot = RobotStateListener(node, node.description, joints=False, held_topic="/motion/attached_objects")
         self.pads = Pads(node)
         self._detections: dict[str, Subscription] = {}
         self._topic = DETECTIONS

@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from copy import copy
 from typing import Any
 
+import numpy as np
 from control_msgs.action import GripperCommand, ParallelGripperCommand
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
 from openarm_interfaces.srv import ComputeIK, GetScene
@@ -127,6 +128,14 @@ class GraphRobot:
     def pads(self, arm: str) -> tuple[float, ...]:
         """Force on each finger pad of a hand, N; empty without a sensor."""
         return self._nodes.pads.of(arm)
+
+    def held_box(self, arm: str) -> Box | None:
+        """What /motion/attached_objects says of a hand; none, when it says more than one thing."""
+        link = self.description.tcp_link("left" if arm == "left" else "right")
+        held = [box for box in self._nodes.robot.tracker.held if box.link == link]
+        if len(held) != 1:
+            return None
+        return Box(held[0].name.removeprefix(f"{arm}/"), held[0].T_link_box, np.array(held[0].size))
 
     def check(self) -> None:
         """Raise when the grasp may not go on."""

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The grasp node.
 
-Services /grasp and /grasp/confirm, actions /grasp/pick and /grasp/pick_two, topics /grasp/status and /grasp/markers.
+Services /grasp, /grasp/confirm and /grasp/release, actions /grasp/pick and /grasp/pick_two, topics /grasp/status and
+/grasp/markers.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any, TypeVar
 
 from openarm_interfaces.action import Pick, PickTwo
 from openarm_interfaces.msg import GraspStatus
-from openarm_interfaces.srv import ConfirmPlan, Grasp
+from openarm_interfaces.srv import ConfirmPlan, Grasp, ReleaseHand
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.qos import QoSProfile
@@ -37,7 +38,8 @@ from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOut
 from openarm_grasp.strategies.states import State
 from openarm_grasp.strategies.task import GraspSession, Status, Task
 
-AnswerT = TypeVar("AnswerT", GraspOutcome, PairOutcome)
+AnswerT = TypeVar("AnswerT", GraspOutcome, PairOutcome, str)
+OutcomeT = TypeVar("OutcomeT", GraspOutcome, PairOutcome)
 OnStatus = Callable[[int, GraspStatus], None]
 
 #: Latched, and deep enough that two transitions in a row both arrive.
@@ -55,13 +57,15 @@ class GraspNode(BaseNode[GraspConfig]):
         self._session = GraspSession(context)
         self._flight_recorder = FlightRecorderClient(self)
         self._robot.follow_table(self._take_table)
-        self._running: tuple[GraspRequest, ...] = ()
+        #: What is being carried out, for the answer to what comes meanwhile.
+        self._running = ""
         self._newest: dict[int, Status] = {}
         self._goal: ServerGoalHandle | None = None
         self._status_topic = self.create_publisher(GraspStatus, "/grasp/status", _QOS_STATUS)
         self._marker_topic = self.create_publisher(MarkerArray, "/grasp/markers", QOS_LATCHED)
         self.create_service(Grasp, "/grasp", self._on_grasp)
         self.create_service(ConfirmPlan, "/grasp/confirm", self._on_confirm)
+        self.create_service(ReleaseHand, "/grasp/release", self._on_release)
         self._actions = [
             self._serve(Pick, "/grasp/pick", self._on_pick),
             self._serve(PickTwo, "/grasp/pick_two", self._on_pick_two),
@@ -92,6 +96,17 @@ class GraspNode(BaseNode[GraspConfig]):
             response.code, response.message = error.code.value, error.message
         return response
 
+    async def _on_release(self, request: ReleaseHand.Request, response: ReleaseHand.Response) -> ReleaseHand.Response:
+        try:
+            response.message = await self._take(
+                "the release of a hand", lambda: self._session.release(self._skills, request.arm), moves=True
+            )
+            response.success, response.code = True, Code.OK.value
+        except OpenArmError as error:
+            response.code, response.message = error.code.value, error.message
+        self.get_logger().info(f"release of the {request.arm or 'full'} hand: {response.message}")
+        return response
+
     async def _on_pick(self, goal: ServerGoalHandle) -> Pick.Result:
         def feedback(_: int, status: GraspStatus) -> None:
             goal.publish_feedback(Pick.Feedback(status=status))
@@ -107,7 +122,7 @@ class GraspNode(BaseNode[GraspConfig]):
         requests = messages.requests_from_msg(goal.request)
         return messages.pair_result(await self._as_goal(goal, lambda: self._two(requests, feedback)))
 
-    async def _as_goal(self, goal: ServerGoalHandle, work: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
+    async def _as_goal(self, goal: ServerGoalHandle, work: Callable[[], Awaitable[OutcomeT]]) -> OutcomeT:
         """Carry a goal out; a cancel reaches the one that is being carried out."""
         if not self._running:
             self._goal = goal
@@ -136,7 +151,9 @@ class GraspNode(BaseNode[GraspConfig]):
         report = partial(self._publish, on_status=on_status)
         try:
             outcome = await self._take(
-                (request,), lambda: carry_out(Task(self._session, self._skills, request, report))
+                _grasp_of(request),
+                lambda: carry_out(Task(self._session, self._skills, request, report)),
+                moves=not request.dry_run,
             )
         except OpenArmError as error:
             self._refused(f"grasp of {request.label!r}", error)
@@ -150,8 +167,9 @@ class GraspNode(BaseNode[GraspConfig]):
         robots: dict[Side, RobotInterface] = {arm: self._robot.next_to_other() for arm in ARMS}
         try:
             outcome = await self._take(
-                requests,
+                _grasp_of(*requests),
                 lambda: carry_out_pair(Pair(self._session, self._skills, robots, requests, report, carry_out)),
+                moves=not requests[0].dry_run,
             )
         except OpenArmError as error:
             self._refused(f"grasp of {requests[0].label!r} and {requests[1].label!r}", error)
@@ -160,22 +178,21 @@ class GraspNode(BaseNode[GraspConfig]):
             self._report(answer)
         return replace(outcome, recording=await self._flight_recorder.save(outcome, requests))
 
-    async def _take(self, requests: tuple[GraspRequest, ...], work: Callable[[], Awaitable[AnswerT]]) -> AnswerT:
-        """Carry requests out, one or two at a time.
+    async def _take(self, what: str, work: Callable[[], Awaitable[AnswerT]], *, moves: bool) -> AnswerT:
+        """Carry out one thing at a time.
 
         Raises:
-            OpenArmError: BUSY, NOT_READY or INVALID_ARGUMENT, when they are not taken; CANCELLED before they began.
+            OpenArmError: BUSY, NOT_READY or INVALID_ARGUMENT, when it is not taken; CANCELLED before it began.
         """
         if self._running:
-            labels = " and ".join(repr(request.label) if request.label else "an object" for request in self._running)
-            raise OpenArmError(Code.BUSY, f"a grasp of {labels} is running; cancel it or wait until it has ended")
-        self._running = requests
+            raise OpenArmError(Code.BUSY, f"{self._running} is running; cancel it or wait until it has ended")
+        self._running = what
         try:
-            await self._robot.begin(moves=not requests[0].dry_run)
+            await self._robot.begin(moves=moves)
             return await work()
         finally:
             self._robot.end()
-            self._running = ()
+            self._running = ""
 
     def _refused(self, what: str, error: OpenArmError) -> None:
         self.get_logger().warning(f"{what} refused: {error}")
@@ -226,6 +243,10 @@ class GraspNode(BaseNode[GraspConfig]):
         answered = before is not None and before.plan is not None
         if status.candidates or status.plan or answered:
             self._marker_topic.publish(messages.status_markers(status, self.description, t_ns))
+
+
+def _grasp_of(*requests: GraspRequest) -> str:
+    return "a grasp of " + " and ".join(repr(one.label) if one.label else "an object" for one in requests)
 
 
 def main() -> None:

@@ -16,6 +16,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.strategies.direct import direct
 from openarm_grasp.strategies.hand_over import hand_over
+from openarm_grasp.strategies.in_hand import take_up
 from openarm_grasp.strategies.pair import ENDS, Pair, in_turn, simultaneous
 from openarm_grasp.strategies.push import push
 from openarm_grasp.strategies.request import GraspOutcome, PairOutcome
@@ -37,6 +38,7 @@ async def carry_out(task: Task) -> GraspOutcome:
     Raises:
         OpenArmError: INVALID_ARGUMENT or NOT_READY, when the request is not taken.
     """
+    await take_up(task.session, task.robot, task.request)
     for route, strategy in STRATEGIES.items():
         try:
             outcome = await strategy(task)
@@ -69,6 +71,7 @@ async def carry_out_pair(pair: Pair) -> PairOutcome:
         OpenArmError: INVALID_ARGUMENT or NOT_READY, when a request is not taken; CANCELLED, TIMEOUT or ROBOT_LOST,
             when both ended before an object was touched.
     """
+    await take_up(pair.session, pair.robot, *pair.requests)
     pair.check()
     outcome = await simultaneous(pair)
     return await in_turn(pair) if outcome is None else outcome

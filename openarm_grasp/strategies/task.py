@@ -12,6 +12,7 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.drift import DriftWatch
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Sighting
+from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.robot.skills import Skills
@@ -61,17 +62,44 @@ class GraspSession:
         """
         if request.dry_run:
             return
-        hand, closed = self.context.config.hand, self.context.config.held.closed_below
         for arm, kept in list(self.kept.items()):
-            aperture = robot.aperture(arm)
-            if not closed < aperture < 2.0 * (hand.opening - hand.open_tolerance):
+            if not self.partly_open(robot, arm):
                 del self.kept[arm]  # taken or dropped meanwhile
             elif request.phase != "place":
+                label, aperture = kept.sighting.target.label, robot.aperture(arm)
                 raise OpenArmError(
                     Code.NOT_READY,
-                    f"the {arm} hand still holds {kept.sighting.target.label!r} (gap {aperture * 1e3:.0f} mm); ask for"
-                    f" phase place first, or open it with /{arm}_gripper_controller/gripper_cmd where that is safe",
+                    f"the {arm} hand still holds {label!r} (gap {aperture * 1e3:.0f} mm); put it down with phase place"
+                    f" (`openarm pick --phase place`), or {release_command(arm)}",
                 )
+
+    def partly_open(self, robot: Skills, arm: str) -> bool:
+        """Whether the fingers are neither closed on nothing nor wide open, so that something may be between them."""
+        hand, aperture = self.context.config.hand, robot.aperture(arm)
+        return self.context.config.held.closed_below < aperture < 2.0 * (hand.opening - hand.open_tolerance)
+
+    async def release(self, robot: Skills, arm: str) -> str:
+        """Open a hand where it is, and forget what it held; return what was done, in a sentence.
+
+        Args:
+            robot: Carries out.
+            arm: Whose hand; "": of the one arm that holds something.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for no arm or when both hold something; NOT_READY, when no hand does.
+        """
+        holding = [name for name in ARMS if name in self.kept or self.partly_open(robot, name)]
+        if arm not in ("", *ARMS):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"arm is {arm!r}; valid: {', '.join(ARMS)}, or none")
+        if not arm and len(holding) != 1:
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT if holding else Code.NOT_READY,
+                "both hands hold something: say which, left or right" if holding else "no hand holds anything",
+            )
+        arm = arm or holding[0]
+        await robot.grip(arm, self.context.config.hand.opening, "release")
+        kept = self.kept.pop(arm, None)
+        return f"the {arm} hand is open" + (f"; it held {kept.sighting.target.label!r}" if kept else "")
 
     def to_place(self, request: GraspRequest) -> Grasp:
         """What a request for phase place is about.
@@ -90,6 +118,11 @@ class GraspSession:
             Code.INVALID_ARGUMENT,
             f"asked to place {request.label or 'an object'!r} with arm {request.arm!r}, but it is {held}",
         )
+
+
+def release_command(arm: str) -> str:
+    """Sentence that names the command that opens a hand."""
+    return f"open the hand where it is with `openarm grasp release --arm {arm}`: what it holds falls from there"
 
 
 # --- what is reported

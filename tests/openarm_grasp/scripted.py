@@ -107,6 +107,7 @@ class World(Skills):
 
     Attributes:
         slips: Closes that get nothing.
+        carried, effort: What the planner carries by arm; force of the fingers that hold nothing known, N.
         scene, q: Version of the planning scene, joints.
         near_off: How far off the camera on the hand sees objects, m.
         followed: Trajectories, in their order.
@@ -119,6 +120,8 @@ class World(Skills):
         self.t_ns = 1_000_000_000
         self.gap = 0.0
         self.held: str | None = None
+        self.carried: dict[str, Box] = {}
+        self.effort = 0.0
         self.faults: list[Fault] = []
         self.log: list[tuple[float, Call]] = []
         self.status: list[Status] = []
@@ -312,7 +315,13 @@ class World(Skills):
     ) -> Evidence:
         self.call(Measure(arm, expected, T_base_tcp is not None))
         error = self.tcp_error if T_base_tcp is not None else 0.0
-        return Evidence(self.gap, expected, -30.0 if self.held else 0.0, 0.0, error)
+        return Evidence(self.gap, expected, self.effort if self.held is None else -30.0, 0.0, error)
+
+    def held_box(self, arm: str) -> Box | None:
+        return self.carried.get(arm)
+
+    def T_base_tcp(self, arm: str) -> np.ndarray:
+        return se3.make(p=(0.26, 0.2, 0.6))
 
     # --- the world
     def move_gripper(self, position: float) -> None:

@@ -15,7 +15,9 @@ from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig, HandConfig, HeldConfig
 from openarm_grasp.strategies.pick_and_place import pick_and_place
+from openarm_grasp.strategies.registry import carry_out
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
+from openarm_grasp.strategies.task import GraspSession
 
 BOX = SceneObject(name="blue_box", shape="box", size=(0.045, 0.068, 0.06), color="blue", position=(0.26, -0.2), yaw=0.4)
 CUBE = SceneObject(name="red_cube", shape="box", size=(0.05, 0.05, 0.05), color="red", position=(0.26, 0.2))
@@ -90,6 +92,36 @@ def test_a_place_puts_it_down_at_position_and_yaw(picked: Bench) -> None:
     assert not picked.trials.session.kept
     with pytest.raises(OpenArmError, match="no hand holds anything"):
         picked.ask("", phase="place")
+
+
+@pytest.mark.requirement("P-01")
+def test_a_new_session_takes_up_what_the_hand_holds_and_places_it_or_releases_it() -> None:
+    bench = Bench(BOX, CUBE)
+    trials = bench.trials
+    assert bench.ask("blue", phase="pick").success
+
+    def whole(label: str, **kwargs) -> GraspOutcome:
+        return trials.link.run(carry_out(trials.grasp_task(GraspRequest(label, **kwargs))))
+
+    trials.session = GraspSession(trials.session.context)  # as after a restart
+    with pytest.raises(OpenArmError, match="right hand still holds 'blue'"):
+        whole("red")
+    outcome = whole("", phase="place", place=(0.30, -0.30))
+    assert outcome.success, outcome.message
+    assert np.linalg.norm(bench.position("blue_box")[:2] - (0.30, -0.30)) < 0.02
+
+    assert bench.ask("blue", phase="pick").success
+    trials.session = GraspSession(trials.session.context)
+    trials.robot.motion.memory.hold("right", ())  # the planner was restarted, too
+    for phase in ("all", "place"):
+        with pytest.raises(OpenArmError, match=r"right hand presses with .* `openarm grasp release --arm right`"):
+            whole("blue", phase=phase)
+    assert bench.position("blue_box")[2] > 0.50
+    assert trials.link.run(trials.session.release(trials.skills, "")) == "the right hand is open"
+    trials.robot.pass_time(1.0)
+    assert bench.position("blue_box")[2] < 0.45
+    outcome = whole("red")
+    assert outcome.success, outcome.message
 
 
 def test_a_yaw_that_one_hold_cannot_give_is_given_by_another() -> None:

@@ -68,6 +68,14 @@ def test_the_camera_verifies_a_push(robot) -> None:
 
 
 @pytest.mark.requirement("N-13")
+def test_after_a_push_the_object_is_looked_for_where_it_was_pushed_to_not_where_the_request_said(robot) -> None:
+    two = robot(0.46, 0.02)
+    two.far = 0.40
+    outcome = two.ask(object_at=(0.46, 0.02))
+    assert (outcome.code, outcome.route) == (Code.OK, "push"), outcome.message
+
+
+@pytest.mark.requirement("N-13")
 def test_an_object_that_is_lost_in_a_push_is_reported(robot) -> None:
     two = robot(0.46, 0.02)
     two.far = 0.44

@@ -13,11 +13,11 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.candidates import propose
+from openarm_grasp.planning.candidates import Box, propose
 from openarm_grasp.strategies.pair import check_pair
 from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome, Proof
 from openarm_grasp.strategies.task import Grasp, GraspSession
-from tests.openarm_grasp.scripted import GoHome
+from tests.openarm_grasp.scripted import GoHome, Grip, World, standing
 
 
 def kept(arm: str, label: str) -> Grasp:
@@ -129,3 +129,59 @@ def test_two_requests_for_what_may_be_one_object_are_refused() -> None:
     assert "90 mm apart, expected more than 100 mm" in refusal(here, near)
     assert "phase 'pick' is of one alone" in refusal(red, GraspRequest("blue", phase="pick"))
     assert "valid: auto, left, right" in refusal(red, GraspRequest("blue", arm="middle"))
+
+
+BOX = Box("target/blue", np.eye(4), np.array([0.05, 0.04, 0.06]))
+
+
+@pytest.mark.parametrize(
+    ("gap", "effort", "box", "use_effort", "found"),
+    [
+        (0.0, -30.0, None, True, ""),  # closed on nothing, pressing on itself
+        (0.0, -30.0, BOX, True, ""),  # the planner is wrong: it fell
+        (0.088, 30.0, BOX, True, ""),  # wide open
+        (0.045, 0.0, None, True, ""),  # half open, by command
+        (0.045, 1.5, BOX, True, ""),  # noise of an effort
+        (0.045, -30.0, BOX, True, "blue"),
+        (0.045, -30.0, None, True, "something 45 mm wide"),
+        (0.020, -30.0, BOX, True, "something 20 mm wide"),  # too narrow for it
+        (0.045, 0.0, BOX, False, "blue"),  # a driver without efforts: the planner decides
+        (0.045, 0.0, None, False, ""),
+    ],
+)
+@pytest.mark.requirement("P-01")
+def test_a_session_that_begins_with_a_full_hand_says_so_and_never_claims_an_empty_one(
+    gap, effort, box, use_effort, found
+) -> None:
+    world = World(standing("red", 0.26, -0.2), held={"use_effort": use_effort})
+    world.gap, world.effort, world.carried = gap, effort, {} if box is None else {"right": box}
+    world.aperture = lambda arm: gap if arm == "right" else 0.0
+    if not found:
+        assert world.ask("red").code is not Code.NOT_READY
+        assert not world.session.kept
+        return
+    with pytest.raises(OpenArmError, match=f"the right hand .*{found}.*`openarm grasp release --arm right`") as error:
+        world.ask("red")
+    assert error.value.code is Code.NOT_READY
+    assert not world.done(Grip)
+    assert list(world.session.kept) == (["right"] if found == "blue" else [])
+
+
+def test_the_arm_of_a_release_is_the_one_that_holds_and_must_be_said_when_both_do(world) -> None:
+    def release(arm: str = "") -> str:
+        with pytest.raises(StopIteration) as end:
+            world.session.release(world, arm).send(None)
+        return end.value.value
+
+    for arm, code in (("middle", Code.INVALID_ARGUMENT), ("", Code.NOT_READY)):
+        with pytest.raises(OpenArmError) as error:
+            release(arm)
+        assert error.value.code is code
+    world.session.kept = {arm: kept(arm, label) for arm, label in (("right", "red"), ("left", "blue"))}
+    with pytest.raises(OpenArmError, match="say which"):
+        release()
+    assert release("left") == "the left hand is open; it held 'blue'"
+    world.gap = 0.0
+    assert release() == "the right hand is open; it held 'red'"
+    assert [grip.arm for grip in world.done(Grip)] == ["left", "right"]
+    assert not world.session.kept

@@ -7,9 +7,15 @@ from threading import Thread
 
 import pytest
 from rclpy.task import Future
+from visualization_msgs.msg import MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.node import QOS_LATCHED
 from openarm_grasp.ros.client import GraspClient
+from openarm_motion.collision.solids import box_from
+from openarm_motion.ros.convert import held_markers
+from tests.nodes.grasp.conftest import Bench
 
 
 def test_the_client_picks_from_plain_python(bench):
@@ -137,3 +143,32 @@ def test_the_client_says_when_no_server_answers(ros):
     with GraspClient(timeout=0.2) as grasp, pytest.raises(OpenArmError, match="is the graph up") as error:
         grasp.pick("red")
     assert error.value.code is Code.NOT_READY
+
+
+@pytest.mark.requirement("P-01")
+def test_a_node_that_starts_with_a_full_hand_names_what_it_holds_and_the_client_releases_it(ros) -> None:
+    robot = RobotDescription.load()
+    finger, tcp = robot.finger_joint("right"), robot.tcp_link("right")
+    box = held_markers({"right": (tcp, [box_from("target/mug", (0.0, 0.0, 0.0), (0.05, 0.05, 0.08))])})
+    ros.node.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED).publish(box)
+    bench = Bench(ros)
+    bench.world.q[finger], bench.world.efforts[finger] = 0.025, -30.0
+    bench.until(lambda: bench.node.count_publishers("/motion/attached_objects") == 1)
+    results = []
+
+    def script() -> None:
+        with GraspClient() as grasp:
+            results.append(grasp.pick("red"))
+            results.append(grasp.release())
+            results.append(grasp.release())
+
+    thread = Thread(target=script)
+    thread.start()
+    bench.until(lambda: not thread.is_alive(), 60.0, "the script ends")
+    thread.join()
+    refused, released, nothing = results
+    assert (refused.outcome, refused.code) == ("REFUSED", Code.NOT_READY)
+    assert "the right hand still holds 'mug'" in refused.message
+    assert (released.success, released.message) == (True, "the right hand is open; it held 'mug'")
+    assert bench.world.log == ["gripper 0.044"]
+    assert (nothing.code, nothing.message) == (Code.NOT_READY, "no hand holds anything")
