@@ -201,6 +201,9 @@ class World(Skills):
     def stop_observing(self) -> None:
         pass
 
+    def expect_near(self) -> None:
+        pass
+
     def call(self, call: Call) -> None:
         if self.stopped is not None:
             raise OpenArmError(self.stopped, "stopped by injection")
