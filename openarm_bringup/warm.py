@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m openarm_bringup.warm`: compile what the nodes run, kernels and byte code, so that none waits for it."""
+"""`python -m openarm_bringup.warm`: compile what the nodes run, kernels and byte code: no start waits for it."""
 
 from __future__ import annotations
 

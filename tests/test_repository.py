@@ -112,7 +112,7 @@ def test_the_viewer_example_says_what_to_do_without_a_display(environ: dict[str,
 
 @pytest.mark.requirement("B-02")
 def test_the_interfaces_of_all_parts_are_documented() -> None:
-    """tests/graph/test_contract.py holds these tables against the running graph."""
+    """tests/graph/test_graph.py holds these tables against the running graph."""
     text = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
     for part in ("/overhead/color/image_raw", "/detections_3d", "/tf_static", "/motion/execute", "gripper_cmd"):
         assert part in text, part

@@ -36,6 +36,7 @@ class NodeProcess:
     def __init__(self, process: asyncio.subprocess.Process, log: LogFile) -> None:
         self._process = process
         self._log = log
+        log.write(())  # a node that says nothing has one too
         self.tail: deque[str] = deque(maxlen=40)
         self.killed = False
         self._pump = asyncio.create_task(self._copy_output())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole graph as processes: a grasp by service, faults, and an end that leaves nothing."""
+"""The whole graph as processes: what docs/interfaces.md states of it, a grasp, faults, an end that leaves nothing."""
 
 from __future__ import annotations
 
@@ -18,8 +18,11 @@ import pytest
 import rclpy
 from geometry_msgs.msg import Point
 from openarm_interfaces.srv import ClearFaults, Grasp, InjectFault, QueryMap
+from rcl_interfaces.srv import ListParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from tf2_msgs.msg import TFMessage
 
 from openarm_bringup.bags.bag import open_bag
 from openarm_bringup.commands.record import check
@@ -27,12 +30,14 @@ from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.shm import names_of, unused
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code
+from openarm_common.ros.node import QOS_STATIC_TF, QOS_TF
 from openarm_common.scene.scene import load_scene
 from openarm_evaluation.judging.arm_clearance import LEAST_CLEARANCE, least_clearance
 from openarm_evaluation.judging.judge import JudgeConfig, judge
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import run_pair, wait_scene
 from openarm_grasp.ros.client import GraspClient
+from tests.graph import contract
 from tests.graph.asking import Asked
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow, pytest.mark.alone]
@@ -66,6 +71,18 @@ def observer(domain: int) -> Iterator[Observer]:
 def client(domain: int) -> Iterator[GraspClient]:
     with GraspClient() as asking:
         yield asking
+
+
+@pytest.fixture(scope="module")
+def visitor(up: Any) -> Iterator[Node]:
+    """A node that looks at the graph, spun by tests."""
+    rclpy.init(domain_id=up.domain)
+    node = rclpy.create_node("visitor")
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
 
 
 def call(domain: int, kind: Any, name: str, /, **fields: object) -> Any:
@@ -117,6 +134,89 @@ def test_one_command_brings_up_every_node(up: Any) -> None:
     assert set(record["nodes"]) == set(load_graph("sim").nodes)
     for name in record["nodes"]:
         assert Path(record["run_dir"], "logs", f"{name}.log").is_file()
+
+
+def test_topics_have_the_stated_type_publishers_and_qos(visitor: Node) -> None:
+    topics = contract.settled(visitor)
+    rows = [row for row in contract.ROW.findall(contract.INTERFACES) if "/msg/" in row[1]]
+    assert len(rows) >= 25
+    assert {name: contract.publishers(visitor, name) for name, _, _ in rows} == contract.stated_publishers()
+    for name, kind, rest in rows:
+        assert topics[name] == [kind], name
+        for info in visitor.get_publishers_info_by_topic(name):
+            qos = (info.qos_profile.reliability, info.qos_profile.durability)
+            assert qos == contract.QOS[rest.split("|")[0].strip()], name
+
+
+def test_every_topic_is_stated(visitor: Node) -> None:
+    stated = {name for name, _, _ in contract.ROW.findall(contract.INTERFACES)}
+    missing = [name for name in contract.settled(visitor) if name not in stated and not contract.IMPLICIT.search(name)]
+    assert missing == []
+
+
+def test_services_and_actions_have_the_stated_type_and_node(visitor: Node) -> None:
+    contract.settled(visitor)
+    rows = {
+        name: (kind, rest.split("|")[0].strip())
+        for name, kind, rest in contract.ROW.findall(contract.INTERFACES)
+        if "/msg/" not in kind
+    }
+    assert len(rows) >= 14
+    for _ in range(200):
+        found = contract.services(visitor)
+        if found == rows:
+            break
+        rclpy.spin_once(visitor, timeout_sec=0.1)
+    assert found == rows
+
+
+def test_parameters_exist_at_their_nodes(visitor: Node) -> None:
+    stated = contract.stated_parameters()
+    assert {"mujoco_bridge", "detector", "octomap", "motion", "grasp"} <= stated.keys()
+    for node, names in stated.items():
+        client = visitor.create_client(ListParameters, f"/{node}/list_parameters")
+        assert client.wait_for_service(timeout_sec=20.0), node
+        answer = client.call_async(ListParameters.Request())
+        rclpy.spin_until_future_complete(visitor, answer, timeout_sec=20.0)
+        assert answer.done(), f"no answer of {node}"
+        assert names <= set(answer.result().result.names), node
+
+
+@pytest.mark.requirement("P-31")
+def test_who_takes_images_unasked_is_a_lifecycle_node(visitor: Node) -> None:
+    contract.settled(visitor)
+    managed = {
+        node for name, (kind, node) in contract.services(visitor).items() if kind == "lifecycle_msgs/srv/ChangeState"
+    }
+    assert managed == {"octomap", "flight_recorder"}
+    for topic in ("/overhead/color/image_raw", "/overhead/depth/image_raw", "/wrist/depth/image_raw"):
+        taking = {info.node_name for info in visitor.get_subscriptions_info_by_topic(topic)}
+        assert taking <= managed, topic
+
+
+@pytest.mark.requirement("A-73")
+def test_one_publisher_for_each_edge_of_the_frame_tree(visitor: Node) -> None:
+    parents: dict[str, set[tuple[str, str]]] = {}
+
+    def note(kind: str, message: TFMessage) -> None:
+        for edge in message.transforms:
+            parents.setdefault(edge.child_frame_id, set()).add((edge.header.frame_id, kind))
+
+    taken = [
+        visitor.create_subscription(TFMessage, "/tf", lambda m: note("/tf", m), QOS_TF),
+        visitor.create_subscription(TFMessage, "/tf_static", lambda m: note("/tf_static", m), QOS_STATIC_TF),
+    ]
+    wanted = {"overhead_color_optical_frame", "wrist_link", "openarm_right_hand_tcp", "openarm_left_link7", "table"}
+    for _ in range(100):
+        rclpy.spin_once(visitor, timeout_sec=0.1)
+        if wanted <= parents.keys():
+            break
+    for subscription in taken:
+        visitor.destroy_subscription(subscription)
+    assert wanted <= parents.keys()
+    assert {child: edges for child, edges in parents.items() if len(edges) > 1} == {}
+    roots = {parent for edges in parents.values() for parent, _ in edges} - parents.keys()
+    assert roots == {"world"}
 
 
 @pytest.mark.requirement("R-24")

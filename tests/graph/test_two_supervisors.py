@@ -38,7 +38,7 @@ def test_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_hold
     """The nodes of `sim` by two supervisors; detectors that are lost for good leave a graph that refuses by name."""
     eyes = tmp_path / "eyes.yaml"
     eyes.write_text(EYES)
-    control = start_graph("control")
+    control = start_graph("control", "--set", "flight_recorder.image_rate=1.0")
     vision = start_graph(str(eyes), joining=control)
     control.wait_ready()
     nodes = vision.wait_ready()["nodes"]

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from openarm_bringup.supervision.log import LogFile
+from openarm_bringup.supervision.process import NodeProcess
 
 
 def texts(path: Path) -> list[str]:
@@ -62,3 +64,12 @@ def test_a_folder_that_has_gone_is_a_fault_like_a_full_disk(tmp_path: Path) -> N
     log = LogFile(tmp_path / "gone" / "node.log", said.append)
     log.write(["of two\nlines"])
     assert (log.lost, said) == (2, ["No such file or directory"])
+
+
+def test_a_process_that_says_nothing_has_a_log(tmp_path: Path) -> None:
+    async def run() -> int:
+        process = await NodeProcess.start(["true"], {}, LogFile(tmp_path / "node.log", str))
+        return await process.wait()
+
+    assert asyncio.run(run()) == 0
+    assert (tmp_path / "node.log").read_bytes() == b""
