@@ -30,6 +30,8 @@ from openarm_octomap.kernels import OCCUPIED, UNKNOWN
 
 #: Beyond any workspace, and still a whole number of cells, m.
 _FAR = 1e6
+#: Of map files.
+SUFFIXES = (".bt", ".ot")
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +246,7 @@ class Mapper:
         Raises:
             OpenArmError: INVALID_ARGUMENT, for another suffix or a folder that can't be written.
         """
-        if path.suffix not in (".bt", ".ot"):
+        if path.suffix not in SUFFIXES:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"{str(path)!r} needs the suffix .bt or .ot")
         with self._lock:
             payload = self._grid.full() if path.suffix == ".ot" else self._grid.binary()

@@ -19,8 +19,9 @@ from openarm_calibration.handeye.offline import Result
 from openarm_calibration.handeye.verdict import estimate_delay
 from openarm_calibration.ros.image_capture import wait_until
 from openarm_calibration.sampling.next_pose import PoseSearch
-from openarm_calibration.sampling.samples import Sample, session_path
+from openarm_calibration.sampling.samples import SESSION_SUFFIXES, Sample
 from openarm_common import se3
+from openarm_common.asked_files import file_to_write
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import matrix_to_pose, vector
 from openarm_common.types import Array
@@ -263,7 +264,7 @@ class _Run:
         goal, result, node = self._goal, self._result, self._node
         self._report("solving", f"{len(node.samples)} samples")
         if goal.session:
-            node.samples.save(session_path(goal.session))
+            node.samples.save(file_to_write(goal.session, SESSION_SUFFIXES))
         solved: Result = await node.solve()
         fill(result, solved, node.camera.link_frame)
         if goal.measure_delay:

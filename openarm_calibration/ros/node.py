@@ -35,9 +35,10 @@ from openarm_calibration.ros.auto_server import AutoCalibrateServer, fill
 from openarm_calibration.ros.image_capture import ImageCapture, grey
 from openarm_calibration.sampling.gate import Matched, match
 from openarm_calibration.sampling.next_pose import advice
-from openarm_calibration.sampling.samples import Sample, SampleSet, SessionHead, head_of, load_session, session_path
+from openarm_calibration.sampling.samples import SESSION_SUFFIXES, Sample, SampleSet, SessionHead, head_of, load_session
 from openarm_calibration.store.records import default_folder, now
 from openarm_calibration.store.store import CalibrationStore
+from openarm_common.asked_files import file_to_read, file_to_write
 from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.answers import answer_async
@@ -228,12 +229,12 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
         return f"{len(self.samples)} samples of {self.camera.name!r} and {self.samples.board.label}"
 
     async def _on_save_samples(self, request: SampleFile.Request, _: SampleFile.Response) -> str:
-        digest = self.samples.save(session_path(request.path))
+        digest = self.samples.save(file_to_write(request.path, SESSION_SUFFIXES))
         return f"{len(self.samples)} samples in {request.path}, hash {digest[:12]}"
 
     async def _on_load_samples(self, request: SampleFile.Request, _: SampleFile.Response) -> str:
         self._require_idle()
-        samples, digest = load_session(session_path(request.path), self.description)
+        samples, digest = load_session(file_to_read(request.path, SESSION_SUFFIXES), self.description)
         if samples.head.camera != self.camera.name or samples.head.parent != self.camera.parent:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,

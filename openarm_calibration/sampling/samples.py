@@ -38,6 +38,8 @@ from openarm_common.types import Array
 
 #: Half the step of the derivative of the robot's pose by time, s.
 _RATE_STEP_NS = 10_000_000
+#: Of session files.
+SESSION_SUFFIXES = (".npz",)
 
 
 class SessionHead(Config):
@@ -233,7 +235,7 @@ class SampleSet:
         Raises:
             OpenArmError: ENVIRONMENT, when it can't be written; INVALID_ARGUMENT, for a name that is not .npz.
         """
-        if path.suffix != ".npz":
+        if path.suffix not in SESSION_SUFFIXES:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"session file {path}: expected a name that ends in .npz")
         text = self._text()
         arrays: dict[str, NDArray[Any]] = {}
@@ -389,16 +391,3 @@ def _joints(state: Mapping[str, Any]) -> dict[str, float]:
     if not all(math.isfinite(value) for value in joints.values()):
         raise ValueError("a joint position is not finite")
     return joints
-
-
-def session_path(text: str) -> Path:
-    """Return the path of a session file that was asked for.
-
-    Raises:
-        OpenArmError: INVALID_ARGUMENT, when it is empty.
-    """
-    if not text:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT, "path is empty; expected the name of a session file that ends in .npz"
-        )
-    return Path(text).expanduser()

@@ -7,7 +7,6 @@ Boxes and points are in the base frame, m.
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,13 +15,14 @@ from openarm_interfaces.srv import ClearMap, MapFile, QueryMap
 from rclpy.node import Node
 from std_srvs.srv import Empty
 
+from openarm_common.asked_files import file_to_read, file_to_write
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.lattice import DEPTH
 from openarm_common.ros.answers import answering
 from openarm_common.ros.convert import ns_to_stamp, xyz
 from openarm_octomap.config import UnknownPolicy
 from openarm_octomap.kernels import FREE, UNKNOWN
-from openarm_octomap.mapper import Mapper
+from openarm_octomap.mapper import SUFFIXES, Mapper
 from openarm_octomap.ros import convert
 
 _STATES = {"free": FREE, "unknown": UNKNOWN}
@@ -104,12 +104,12 @@ class MapServices:
         return f"{int(found.blocked.sum())} of {len(points)} points are blocked at {found.resolution:g} m"
 
     def _save(self, request: MapFile.Request, response: MapFile.Response) -> str:
-        path = _path(request.path)
+        path = file_to_write(request.path, SUFFIXES)
         response.nodes = self._mapper.save(path)
         return f"{path}: {response.nodes} nodes"
 
     def _load(self, request: MapFile.Request, response: MapFile.Response) -> str:
-        path = _path(request.path)
+        path = file_to_read(request.path, SUFFIXES)
         response.nodes, response.outside = self._mapper.load(path)
         self._show()
         return f"{path}: {response.nodes} nodes; {response.outside} leaves outside of the workspace"
@@ -122,9 +122,3 @@ def _choose(field: str, value: str, choices: dict[str, ChoiceT]) -> ChoiceT:
     if value not in choices:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{field} is {value!r}; valid: {', '.join(choices)}")
     return choices[value]
-
-
-def _path(text: str) -> Path:
-    if not text:
-        raise OpenArmError(Code.INVALID_ARGUMENT, "path is empty; expected a file that ends in .bt or .ot")
-    return Path(text).expanduser()

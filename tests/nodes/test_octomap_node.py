@@ -143,15 +143,24 @@ def test_maps_are_saved_and_loaded_and_damaged_files_leave_the_map_alone(bench, 
         return bench.call(MapFile, f"/octomap/{name}", MapFile.Request(path=str(path)))
 
     assert "path is empty" in bench.call(MapFile, "/octomap/save").message
-    assert "needs the suffix" in file("save", tmp_path / "map.pcd").message
+    assert "expected a file that ends in .bt or .ot" in file("save", tmp_path / "map.pcd").message
     for suffix in (".bt", ".ot"):
         answer = file("save", tmp_path / f"map{suffix}")
         assert answer.success, answer.message
         assert answer.nodes > 1000
     (tmp_path / "damaged.bt").write_bytes((tmp_path / "map.bt").read_bytes()[:-5])
-    (tmp_path / "map.pcd").write_text("VERSION .7")
+    (tmp_path / "cloud.bt").write_text("VERSION .7")
+    (tmp_path / "link.bt").symlink_to("cloud.bt")
+    assert "link" in file("save", tmp_path / "link.bt").message
+    assert (tmp_path / "cloud.bt").read_text() == "VERSION .7"
     before = bytes(bench.call(GetOctomap, "octomap_full").map.data)
-    for name, text in (("damaged.bt", "octree is damaged"), ("map.pcd", "not an octree"), ("none.bt", "can't be read")):
+    refused = {
+        "damaged.bt": "octree is damaged",
+        "cloud.bt": "not an octree",
+        "none.bt": "No such file",
+        "a.pcd": "suffix",
+    }
+    for name, text in refused.items():
         answer = file("load", tmp_path / name)
         assert (answer.success, answer.code) == (False, "INVALID_ARGUMENT")
         assert text in answer.message

@@ -116,6 +116,6 @@ def test_refusals_come_with_a_code_and_the_node_goes_on(ros, posed_robot, store)
     assert call(SetAlgorithm, "set_algorithm", algorithm="tsai").success
     assert "algorithms: REFINED, TSAI" in call(SetAlgorithm, "set_algorithm", algorithm="tsay").message
     assert call(ListAlgorithms, "list_algorithms").current == "TSAI"
-    assert call(SampleFile, "load_samples", path="/nowhere.npz").code == "CONFIG_INVALID"
+    assert call(SampleFile, "load_samples", path="/nowhere.npz").code == "INVALID_ARGUMENT"
     assert call(SampleFile, "save_samples", path="").code == "INVALID_ARGUMENT"
     assert call(ComputeCalibration, "compute_calibration").code == "DEGENERATE"
