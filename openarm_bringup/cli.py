@@ -174,7 +174,8 @@ def _show(outcome: Outcome, sink: str | None) -> int:
         try:
             runs.write_json(Path(sink), outcome.as_json())
         except OpenArmError as error:
-            outcome = replace(outcome, success=False, code=error.code, message=f"{outcome.message}; {error.message}")
+            text = "; ".join(filter(None, (outcome.message, error.message)))
+            outcome = replace(outcome, success=False, code=error.code, message=text)
     if outcome.text:
         _print(outcome.text)
     if outcome.success:

@@ -124,6 +124,15 @@ def test_every_graph_of_the_suite_is_sound() -> None:
         assert not checked.data["foreign"], name
 
 
+def test_a_report_that_the_disk_does_not_take_is_a_failure_in_a_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "full.json").symlink_to("/dev/full")
+    assert cli.run(["graph", "list", "--json", str(tmp_path / "full.json")]) == 1
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert sentence == f"openarm: ENVIRONMENT: can't write {tmp_path}/full.json: No space left on device"
+
+
 def test_draw_writes_json_to_a_file_and_text_to_stdout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sink = tmp_path / "deep" / "graph.json"
     assert cli.run(["graph", "draw", "sim", "--form", "mermaid", "--json", str(sink)]) == 0
