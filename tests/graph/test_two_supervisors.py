@@ -38,7 +38,8 @@ def test_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_hold
     """The nodes of `sim` by two supervisors; detectors that are lost for good leave a graph that refuses by name."""
     eyes = tmp_path / "eyes.yaml"
     eyes.write_text(EYES)
-    control = start_graph("control", "--set", "flight_recorder.image_rate=1.0")
+    quick = ("grasp.velocity_scale=1.0", "flight_recorder.image_rate=1.0")
+    control = start_graph("control", *(word for setting in quick for word in ("--set", setting)))
     vision = start_graph(str(eyes), joining=control)
     control.wait_ready()
     nodes = vision.wait_ready()["nodes"]
@@ -91,5 +92,6 @@ def test_eyes_and_hands_started_apart_grasp_as_one_and_without_eyes_the_arm_hold
     assert recording.name in listed[0]["observed"], "what the failed grasp has left"
     states = {name: node["state"] for name, node in vision.record()["nodes"].items()}
     assert {name for name, state in states.items() if state != "ready"} == {"detector", "wrist_detector"}
-    assert vision.stop() == 0
+    vision.process.send_signal(signal.SIGINT)
     assert control.stop() == 0
+    assert vision.process.wait(timeout=30.0) == 0
