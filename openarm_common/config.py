@@ -7,6 +7,7 @@ no error repeats more than a few words of them.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Hashable, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code, OpenArmError, said
 
 
 class Config(BaseModel):
@@ -30,6 +31,8 @@ ConfigT = TypeVar("ConfigT", bound=BaseModel)
 #: Longest file or text, bytes, and deepest nesting.
 MAX_YAML_BYTES, MAX_YAML_DEPTH = 4 * 2**20, 32
 
+#: Most faults that an error names.
+_FAULTS = 12
 #: Longest representation of a value in an error, characters.
 _BRIEF = 80
 
@@ -40,6 +43,11 @@ def brief(value: object) -> str:
         text = repr(value)
     except ValueError:  # an integer of more than 4300 digits
         return f"a {type(value).__name__}"
+    return brief_text(text)
+
+
+def brief_text(text: str) -> str:
+    """Return a text, cut where it is long."""
     return text if len(text) <= _BRIEF else f"{text[: _BRIEF - 1]}…"
 
 
@@ -87,12 +95,65 @@ def parse_yaml(text: str, where: str, code: Code = Code.CONFIG_INVALID) -> Any:
         OpenArmError: With `code`, when it is not YAML, too long, or nested too deeply.
     """
     if len(text) > MAX_YAML_BYTES:
-        raise OpenArmError(code, f"{where} is longer than {MAX_YAML_BYTES // 2**20} MiB, expected a configuration")
+        raise OpenArmError(code, f"{where} is longer than {MAX_YAML_BYTES // 2**20} MiB")
     try:
         return yaml.load(text, Loader=_Loader)
     # a date or a number that is none ends in errors of datetime and int
     except (yaml.YAMLError, ValueError, TypeError, OverflowError) as error:
-        raise OpenArmError(code, f"{where} is not valid YAML: {error}") from error
+        raise OpenArmError(code, f"{where} is not valid YAML: {_fault(error)}") from error
+
+
+def _fault(error: Exception) -> str:
+    """What is wrong with a document, and where."""
+    mark = error.problem_mark if isinstance(error, yaml.MarkedYAMLError) else None
+    if mark is None or not isinstance(error, yaml.MarkedYAMLError):
+        return said(error)
+    context = f"{error.context}: " if error.context else ""
+    return f"{brief_text(context + str(error.problem))}, line {mark.line + 1}, column {mark.column + 1}"
+
+
+def read_text(path: Path, code: Code = Code.CONFIG_INVALID, most: int = MAX_YAML_BYTES) -> str:
+    """Read a text file.
+
+    Args:
+        path: File to read.
+        code: Of the error.
+        most: Longest file, bytes.
+
+    Raises:
+        OpenArmError: With `code`, when the file is missing, longer, or not UTF-8.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(most + 1)
+    except FileNotFoundError as error:
+        raise OpenArmError(code, f"{path} does not exist") from error
+    except (OSError, ValueError) as error:
+        raise OpenArmError(code, f"can't read {brief_text(str(path))}: {said(error)}") from error
+    if len(content) > most:
+        raise OpenArmError(code, f"{path} is longer than {most // 2**20} MiB")
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        at = f"byte {error.start} is 0x{content[error.start]:02x}"
+        raise OpenArmError(code, f"{path} is no text in UTF-8: {at}") from error
+
+
+def load_json(path: Path, code: Code = Code.INVALID_ARGUMENT) -> Any:
+    """Read JSON.
+
+    Raises:
+        OpenArmError: With `code`, as `read_text`, and when it is not JSON, or nested too deeply.
+    """
+    return parse_json(read_text(path, code), str(path), code)
+
+
+def parse_json(text: str, where: str, code: Code = Code.INVALID_ARGUMENT) -> Any:
+    """Parse JSON; as `parse_yaml`."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise OpenArmError(code, f"{where} is not valid JSON: {said(error)}") from error
 
 
 def load_yaml(path: Path, code: Code = Code.CONFIG_INVALID) -> dict[str, Any]:
@@ -105,16 +166,7 @@ def load_yaml(path: Path, code: Code = Code.CONFIG_INVALID) -> dict[str, Any]:
     Raises:
         OpenArmError: With `code`, when the file is missing, is not YAML, or is not a mapping; see `parse_yaml`.
     """
-    try:
-        with path.open("rb") as file:
-            text = file.read(MAX_YAML_BYTES + 1).decode()
-    except FileNotFoundError as error:
-        raise OpenArmError(code, f"{path} does not exist") from error
-    except OSError as error:
-        raise OpenArmError(code, f"can't read {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise OpenArmError(code, f"{path} is not valid YAML: {error}") from error
-    data = parse_yaml(text, str(path), code)
+    data = parse_yaml(read_text(path, code), str(path), code)
     if data is None:
         return {}
     if not isinstance(data, dict):
@@ -184,13 +236,15 @@ def describe_faults(error: ValidationError, where: str, model: type[BaseModel]) 
     faults: list[str] = []
     for item in error.errors():
         key = ".".join(str(part) for part in item["loc"]) or "(top level)"
+        key = key if key.isprintable() and len(key) < 2 * _BRIEF else brief(key)
         text = item["msg"].removeprefix("Value error, ")
         if item["type"] == "extra_forbidden":
             text = "unknown key" + (f"; valid keys: {', '.join(model.model_fields)}" if len(item["loc"]) == 1 else "")
         elif item["type"] != "missing":
             text += f", got {brief(item['input'])}"
         faults.append(f"{where}:{key}: {text}")
-    return "; ".join(faults)
+    more = [f"and {len(faults) - _FAULTS} more"] if len(faults) > _FAULTS else []
+    return "; ".join(faults[:_FAULTS] + more)
 
 
 def load_config(path: Path, model: type[ConfigT]) -> ConfigT:

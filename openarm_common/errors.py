@@ -48,6 +48,16 @@ class Code(StrEnum):
     INTERNAL = "INTERNAL"
 
 
+#: Longest message of an error, characters: it may quote what others gave.
+_LONGEST = 3000
+
+
+def said(error: BaseException, longest: int = 300) -> str:
+    """Return what an error of a library says, in one line, cut where it is long."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= longest else f"{text[: longest - 1]}…"
+
+
 class OpenArmError(Exception):
     """Anything that the suite refuses or could not do.
 
@@ -57,9 +67,10 @@ class OpenArmError(Exception):
     """
 
     def __init__(self, code: Code, message: str) -> None:
-        super().__init__(f"{code}: {message}")
+        text = message if len(message) <= _LONGEST else f"{message[:_LONGEST]}…"
+        super().__init__(f"{code}: {text}")
         self.code = code
-        self.message = message
+        self.message = text
 
     def __reduce__(self) -> tuple[type[OpenArmError], tuple[Code, str]]:
         """Let the error cross process borders (worker pools pickle it)."""

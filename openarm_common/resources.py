@@ -41,6 +41,11 @@ def config_dir() -> Path:
     return resource_root() / "config"
 
 
+def is_file(path: Path) -> bool:
+    """Whether a path is that of a file; what can't be a path (too long, with a NUL) is none."""
+    return os.path.isfile(path)
+
+
 def write_whole(path: Path, data: bytes, code: Code = Code.ENVIRONMENT) -> None:
     """Write a file under another name, then rename it: a reader gets the old or the new one, never a part.
 
@@ -60,4 +65,4 @@ def write_whole(path: Path, data: bytes, code: Code = Code.ENVIRONMENT) -> None:
                 Path(file.name).unlink(missing_ok=True)  # nothing of it stays on a full disk
                 raise
     except OSError as error:
-        raise OpenArmError(code, f"can't write {path}: {error.strerror}") from error
+        raise OpenArmError(code, f"can't write {str(path)[:200]}: {error.strerror}") from error

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,7 @@ from openarm_bringup.bags.definitions import definition, nested_types
 from openarm_bringup.bags.mcap import DAMAGE, is_closed, mend, unpack
 from openarm_bringup.messages import interface
 from openarm_common.config import MAX_YAML_BYTES, load_yaml
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code, OpenArmError, said
 
 #: This much of the disk is left free, so that the bag can still be closed.
 SPARE_BYTES = 200 * 2**20
@@ -249,11 +249,16 @@ def open_bag(path: Path) -> Iterator[Bag]:
                 source = _unpacked(source, stack)
             reader = Reader(source)
             reader.open()
-            stack.callback(reader.close)
+            stack.callback(_close, reader)
             bag = Bag(path, reader, mended)
         except (*DAMAGE, OSError) as error:
             raise damaged(path, error) from error
         yield bag
+
+
+def _close(reader: Reader) -> None:
+    with suppress(*DAMAGE):  # what damaged metadata say of it, the reader tidies up
+        reader.close()
 
 
 def _unpacked(path: Path, stack: ExitStack) -> Path:
@@ -287,5 +292,4 @@ def _unpacked(path: Path, stack: ExitStack) -> Path:
 
 def damaged(path: Path, error: Exception) -> OpenArmError:
     """Return the error of a bag whose content is not what its format says, in one sentence."""
-    text = " ".join(f"{type(error).__name__}: {error}".split())
-    return OpenArmError(Code.INVALID_ARGUMENT, f"{path} can't be read as a bag: {text[:300]}")
+    return OpenArmError(Code.INVALID_ARGUMENT, f"{path} can't be read as a bag: {type(error).__name__}: {said(error)}")

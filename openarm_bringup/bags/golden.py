@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from openarm_bringup.supervision import runs
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.config import load_json
+from openarm_common.errors import Code, OpenArmError, said
 
 #: How far a number may be off when it is computed again, by the unit its name ends in; others have to be equal.
 TOLERANCES = {"_mm": 0.5, "_deg": 0.3, "_px": 0.05}
@@ -63,18 +63,17 @@ def read(path: Path) -> dict[str, dict[str, float]]:
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the file is missing or something else.
     """
+    if not path.exists():
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"there are no golden numbers at {path}; --update writes them")
+    data: Any = load_json(path)
     try:
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
         return {
             str(name): {key: float(entry[key]) for key in ("value", "tolerance")}
             for name, entry in data["numbers"].items()
         }
-    except FileNotFoundError:
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT, f"there are no golden numbers at {path}; --update writes them"
-        ) from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} holds no golden numbers: {error!r}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        text = f"{path} holds no golden numbers: {type(error).__name__}: {said(error)}"
+        raise OpenArmError(Code.INVALID_ARGUMENT, text) from error
 
 
 def write(path: Path, numbers: Mapping[str, float], before: Mapping[str, Mapping[str, float]]) -> None:

@@ -20,7 +20,7 @@ from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.storage_mcap import DECOMPRESSORS, decompress, zstd
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code, OpenArmError, said
 
 #: What is raised where the content of a file is not what its format says.
 DAMAGE = (
@@ -100,7 +100,7 @@ def mend(path: Path) -> int | None:
     try:
         return _give_end(path, size)
     except DAMAGE as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} was cut short and is damaged: {error}") from error
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{path} was cut short and is damaged: {said(error)}") from error
 
 
 def _give_end(path: Path, size: int) -> int:

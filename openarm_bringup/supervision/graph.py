@@ -20,7 +20,7 @@ from openarm_bringup.supervision.discovery import LAST_DOMAIN, Discovery
 from openarm_bringup.supervision.params import flatten, read_params, substitute
 from openarm_common.config import Config, ConfigT, brief, load_yaml, parse_yaml, validate
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import config_dir
+from openarm_common.resources import config_dir, is_file
 
 ConditionKind = Literal["topic", "message", "service", "action"]
 
@@ -191,10 +191,10 @@ def find_graph(name: str) -> Path:
     """
     known = config_dir() / "graphs" / f"{name}.yaml"
     for path in (known, Path(name)):
-        if path.is_file():
+        if is_file(path):
             return path
     raise OpenArmError(
-        Code.INVALID_ARGUMENT, f"there is no graph {name!r}; give a file, or one of {', '.join(graph_names())}"
+        Code.INVALID_ARGUMENT, f"there is no graph {brief(name)}; give a file, or one of {', '.join(graph_names())}"
     )
 
 
@@ -236,14 +236,21 @@ def _read(path: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
         )
     graph: dict[str, Any] = {"name": path.stem, **load_yaml(path)}
     base_name, only = graph.pop("extends", None), graph.pop("only", None)
+    _require_mappings(graph.get("nodes"), path)
     if base_name is not None:
+        if not isinstance(base_name, str) or not isinstance(only or [], list):
+            raise OpenArmError(
+                Code.CONFIG_INVALID, f"{path}: expected the name of a graph in `extends`, a list in `only`"
+            )
         sibling = path.parent / f"{base_name}.yaml"
-        base = _read(sibling if sibling.is_file() else find_graph(str(base_name)), (*trail, path))
+        base = {"nodes": {}, **_read(sibling if is_file(sibling) else find_graph(base_name), (*trail, path))}
         if only is not None:
-            unknown = [node for node in only if node not in base["nodes"]]
+            unknown = [node for node in only if node not in list(base["nodes"])]
             if unknown:
                 known = ", ".join(base["nodes"])
-                raise OpenArmError(Code.CONFIG_INVALID, f"{path}:only: unknown node {unknown[0]!r}; nodes are {known}")
+                raise OpenArmError(
+                    Code.CONFIG_INVALID, f"{path}:only: unknown node {brief(unknown[0])}; nodes are {known}"
+                )
             base["nodes"] = {node: spec for node, spec in base["nodes"].items() if node in only}
         own = graph.pop("nodes", None) or {}
         for node, spec in own.items():
@@ -252,6 +259,15 @@ def _read(path: Path, trail: tuple[Path, ...]) -> dict[str, Any]:
     elif only is not None:
         raise OpenArmError(Code.CONFIG_INVALID, f"{path}:only: needs `extends`")
     return graph
+
+
+def _require_mappings(nodes: Any, path: Path) -> None:
+    """Refuse nodes that are no mappings, before they are merged with those of another file."""
+    found: Any = {} if nodes is None else nodes
+    if not isinstance(found, dict) or not all(isinstance(spec, dict) for spec in found.values()):  # pyright: ignore
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"{path}:nodes: expected a mapping of names, each with a mapping of keys"
+        )
 
 
 def _check_needs(graph: Graph, where: str) -> None:

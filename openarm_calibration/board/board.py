@@ -199,7 +199,7 @@ def parse_board(data: dict[str, Any], where: str = "board") -> Board:
     """
     kind = data.get("kind", "circles")
     if kind not in KINDS:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{where}:kind: no board {kind!r}; boards: {', '.join(KINDS)}")
+        raise OpenArmError(Code.CONFIG_INVALID, f"{where}:kind: no board {brief(kind)}; boards: {', '.join(KINDS)}")
     try:
         return _ADAPTER.validate_python({**data, "kind": kind})
     except ValidationError as error:

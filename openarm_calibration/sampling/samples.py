@@ -13,6 +13,7 @@ import io
 import json
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -23,7 +24,7 @@ from typing import IO, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from openarm_calibration.board.board import Board, parse_board
 from openarm_calibration.board.detect import BoardDetection, guess_pose
@@ -31,7 +32,7 @@ from openarm_calibration.handeye.problem import Problem, View, assemble, differe
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config, validate
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.errors import Code, OpenArmError, said
 from openarm_common.resources import write_whole
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
@@ -54,6 +55,15 @@ class SessionHead(Config):
     board: dict[str, Any] = Field(description="keys of the board")
     mount_seed: int | None = Field(default=None, description="of the simulated mounts")
     created: str = Field(default="", description="when, as ISO 8601")
+
+    @field_validator("intrinsics")
+    @classmethod
+    def _of_a_camera(
+        cls, value: tuple[int, int, float, float, float, float]
+    ) -> tuple[int, int, float, float, float, float]:
+        if fault := Intrinsics(*value).fault():
+            raise ValueError(fault)
+        return value
 
     @property
     def optics(self) -> Intrinsics:
@@ -294,15 +304,16 @@ def load_session(path: Path, description: RobotDescription) -> tuple[SampleSet, 
                 out.add(_sample(entry, {name: data[f"{name}_{k}"] for name in _ARRAYS}, out))
     except _DAMAGED as error:
         raise OpenArmError(
-            Code.CONFIG_INVALID, f"{path} is no session file, or damaged: {type(error).__name__}: {error}"
+            Code.CONFIG_INVALID, f"{path} is no session file, or damaged: {type(error).__name__}: {said(error)}"
         ) from error
     return out, hashlib.sha256(text.encode()).hexdigest()
 
 
-#: What reading an altered archive of JSON and arrays ends in; RuntimeError: encrypted, or nested too deeply.
+#: What reading an altered archive of JSON and arrays ends in; RuntimeError: encrypted, or nested too deeply;
+#: TokenError: a header of numpy, which is text of Python.
 _DAMAGED = (
     AttributeError, EOFError, LookupError, OSError, OverflowError, RuntimeError, TypeError, ValueError, struct.error,
-    zipfile.BadZipFile, zlib.error,
+    tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 #: Largest array, and the sum of all, unpacked, bytes.
 _MAX_ARRAY, _MAX_SESSION = 64 * 2**20, 512 * 2**20
@@ -361,6 +372,8 @@ def _sample(entry: dict[str, Any], arrays: Mapping[str, NDArray[Any]], samples: 
     name = str(entry["name"])
     if arrays["ids"].dtype.kind not in "iu":
         raise ValueError(f"sample {name} has ids of type {arrays['ids'].dtype}, expected integers")
+    if any(arrays[key].dtype.kind not in "iuf" for key in ("pixels", "pose")):
+        raise ValueError(f"sample {name} has pixels or a pose that are no numbers")
     ids, pixels = arrays["ids"].astype(np.int64), arrays["pixels"].astype(np.float64)
     pose = arrays["pose"].astype(np.float64)
     if pixels.shape != (len(ids), 2) or not np.isfinite(pixels).all() or len(ids) < 4:

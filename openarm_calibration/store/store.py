@@ -93,8 +93,8 @@ class StoredCalibration(Record):
     @field_validator("intrinsics")
     @classmethod
     def _of_a_camera(cls, value: Intrinsics | None) -> Intrinsics | None:
-        if value is not None and not (np.isfinite(value.matrix).all() and min(value.fx, value.fy, value.width) > 0):
-            raise ValueError("expected a size, focal lengths above 0 and a principal point")
+        if value is not None and (fault := value.fault()):
+            raise ValueError(fault)
         return value
 
     @property

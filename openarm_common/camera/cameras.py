@@ -29,6 +29,10 @@ Vector3 = tuple[float, float, float]
 T_LINK_OPTICAL: Array = se3.make(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 
 
+#: Of any camera: largest image, longest focal length and offset of the principal point, pixels.
+_LARGEST_PX, _LONGEST_PX = 16_384, 1e5
+
+
 @dataclass(frozen=True)
 class Intrinsics:
     """Pinhole camera without distortion; lengths in pixels."""
@@ -39,6 +43,16 @@ class Intrinsics:
     fy: float
     cx: float
     cy: float
+
+    def fault(self) -> str:
+        """Return why these are not the intrinsics of any camera; empty when they may be."""
+        if not (0 < self.width <= _LARGEST_PX and 0 < self.height <= _LARGEST_PX):
+            return f"{self.width}×{self.height} pixels, expected 1 .. {_LARGEST_PX} each way"
+        if not (1.0 <= self.fx <= _LONGEST_PX and 1.0 <= self.fy <= _LONGEST_PX):
+            return f"fx={self.fx:g}, fy={self.fy:g}, expected 1 .. {_LONGEST_PX:g} pixels"
+        if not (abs(self.cx) <= _LONGEST_PX and abs(self.cy) <= _LONGEST_PX):
+            return f"cx={self.cx:g}, cy={self.cy:g}, expected a point in or near the image"
+        return ""
 
     @classmethod
     def from_fovy(cls, width: int, height: int, fovy_deg: float) -> Intrinsics:

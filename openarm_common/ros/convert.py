@@ -8,6 +8,7 @@ for a 640×480 depth image, an `array.array` 0.2 ms); they are read through view
 from __future__ import annotations
 
 import array
+import math
 import sys
 from collections.abc import Sequence
 from typing import cast
@@ -17,13 +18,14 @@ from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, TransformStamped, Vector3
 from numpy.typing import ArrayLike, NDArray
 from rclpy.duration import Duration as RclDuration
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2, PointField
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
+from openarm_common.config import brief, brief_text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.held import HeldBox
 from openarm_common.types import Array, Bytes, Floats
@@ -36,6 +38,11 @@ ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
     "16UC1": (np.uint16, 1),
     "32FC1": (np.float32, 1),
 }
+
+#: Nothing that a message speaks of is further away, m.
+_FAR = 1e4
+#: No joint is further from its zero, rad or m.
+_FARTHEST = 1e4
 
 
 # --- time
@@ -59,16 +66,19 @@ def pose_to_matrix(pose: Pose) -> Array:
     """Convert a pose to (4, 4).
 
     Raises:
-        OpenArmError: INVALID_ARGUMENT, when a coordinate is not finite or the quaternion is zero.
+        OpenArmError: INVALID_ARGUMENT, when a coordinate is not finite or the quaternion is zero or not finite.
     """
-    p, q = pose.position, pose.orientation
+    return _matrix("pose", pose.position, pose.orientation)
+
+
+def _matrix(what: str, p: Point | Vector3, q: Quaternion) -> Array:
     position = (p.x, p.y, p.z)
-    if not np.all(np.isfinite(position)):
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"pose position {position} is not finite")
+    if not all(abs(v) <= _FAR for v in position):
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{what} position {position} is not finite, or beyond {_FAR:g} m")
     try:
         return se3.make(se3.matrix_from_quat_xyzw((q.x, q.y, q.z, q.w)), position)
     except ValueError as error:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"pose orientation: {error}") from error
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{what} orientation: {error}") from error
 
 
 def matrix_to_pose(T: Array) -> Pose:
@@ -99,9 +109,12 @@ def xyz(message: Point | Vector3) -> Array:
 
 
 def transform_to_matrix(transform: Transform) -> Array:
-    """Convert a transform message to (4, 4)."""
-    t, q = transform.translation, transform.rotation
-    return se3.make(se3.matrix_from_quat_xyzw((q.x, q.y, q.z, q.w)), (t.x, t.y, t.z))
+    """Convert a transform message to (4, 4).
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, as `pose_to_matrix`.
+    """
+    return _matrix("transform", transform.translation, transform.rotation)
 
 
 def matrix_to_transform(parent: str, child: str, T_parent_child: Array, t_ns: int) -> TransformStamped:
@@ -125,7 +138,7 @@ def image_to_array(message: Image) -> NDArray[np.generic]:
         OpenArmError: BAD_IMAGE, when the encoding is unknown or the data do not have the size that the header says.
     """
     if message.encoding not in ENCODINGS:
-        raise _bad_image(f"image encoding {message.encoding!r} is not supported; valid: {', '.join(ENCODINGS)}")
+        raise _bad_image(f"image encoding {brief(message.encoding)} is not supported; valid: {', '.join(ENCODINGS)}")
     dtype, channels = ENCODINGS[message.encoding]
     size = np.dtype(dtype).itemsize
     row = message.width * channels * size
@@ -207,11 +220,12 @@ def intrinsics_from_info(info: CameraInfo) -> Intrinsics:
         OpenArmError: BAD_IMAGE, when the camera is not calibrated (K is zero) or has distortion that is not removed.
     """
     k, name = info.k, f"camera_info of {info.header.frame_id!r}"
-    if not (k[0] > 0.0 and k[4] > 0.0 and info.width > 0 and info.height > 0):
-        raise _bad_image(f"{name} is not calibrated: fx={k[0]}, fy={k[4]}, expected > 0")
+    intrinsics = Intrinsics(info.width, info.height, k[0], k[4], k[2], k[5])
+    if fault := intrinsics.fault():
+        raise _bad_image(f"{name} is not calibrated: {fault}")
     if any(d != 0.0 for d in info.d):
-        raise _bad_image(f"{name} has distortion {list(info.d)}; rectify the image first")
-    return Intrinsics(info.width, info.height, k[0], k[4], k[2], k[5])
+        raise _bad_image(f"{name} has distortion {brief(list(info.d))}; rectify the image first")
+    return intrinsics
 
 
 def info_from_intrinsics(intrinsics: Intrinsics, frame_id: str, t_ns: int) -> CameraInfo:
@@ -278,14 +292,42 @@ def points_from_cloud(message: PointCloud2) -> Floats:
     Raises:
         OpenArmError: INVALID_ARGUMENT, for another layout.
     """
-    layout = [(f.name, f.offset, f.datatype) for f in message.fields[:3]]
+    layout = [(brief_text(f.name), f.offset, f.datatype) for f in message.fields[:3]]
     if layout != [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]:
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"cloud fields {layout} are not supported, expected float32 x, y, z first"
         )
-    rows = np.frombuffer(message.data, dtype=np.float32).reshape(message.height, message.width, message.point_step // 4)
+    step, size = message.point_step, message.height * message.width
+    if step < 12 or step % 4 or message.row_step != step * message.width or len(message.data) != step * size:
+        raise OpenArmError(
+            Code.INVALID_ARGUMENT,
+            f"cloud of {message.width}×{message.height} points has steps {step} and {message.row_step} and"
+            f" {len(message.data)} bytes, expected steps of 4-byte fields without gaps",
+        )
+    rows = np.frombuffer(message.data, dtype=np.float32).reshape(message.height, message.width, step // 4)
     points = rows[..., :3]
     return points[0] if message.height == 1 else points
+
+
+# --- joint states
+def joints_from_msg(message: JointState) -> JointState:
+    """Return joint states whose fields fit together: a finite position of each name, other fields of as many, or none.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, for others.
+    """
+    names, positions = message.name, message.position
+    count = len(names)
+    if len(positions) != count or len(set(names)) != count:
+        text = f"{len(positions)} positions of {count} joints, {len(set(names))} of them different"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"joint states have {text}; expected one position of each joint")
+    for field, values in (("velocities", message.velocity), ("efforts", message.effort)):
+        if len(values) not in (0, count):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"joint states have {len(values)} {field} of {count} joints")
+    if (count and not max(map(abs, positions)) <= _FARTHEST) or not math.isfinite(sum(positions)):
+        wrong = next(name for name, value in zip(names, positions, strict=True) if not abs(value) <= _FARTHEST)
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"joint states have a position of {brief(wrong)} that is not one")
+    return message
 
 
 # --- trajectories

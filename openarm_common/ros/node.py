@@ -8,9 +8,12 @@ import signal
 import socket
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future as ThreadFuture
 from concurrent.futures import ThreadPoolExecutor
+from functools import wraps
+from inspect import iscoroutinefunction
 from typing import Any, Generic, ParamSpec, TypeVar, get_args
 
 import rclpy
@@ -18,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -29,7 +33,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from openarm_common.config import AT_RUN_TIME, Config, validate
+from openarm_common.config import AT_RUN_TIME, Config, brief, validate
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 
@@ -101,6 +105,8 @@ class BaseNode(Node, Generic[ConfigT]):
     REPORT_PERIOD_S = 1.0
 
     def __init__(self, name: str, model: type[ConfigT], **kwargs: Any) -> None:
+        #: Messages that were refused, by topic.
+        self.__refused = Counter[str]()
         super().__init__(name, **kwargs)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         data = _declare(self, model, "")
@@ -140,6 +146,39 @@ class BaseNode(Node, Generic[ConfigT]):
         status.level = level
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
         self.__status = status
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
+    ) -> Any:
+        """Subscribe; what the callback refuses with an OpenArmError is counted, and reported now and then."""
+
+        @wraps(callback)
+        def take(*given: Any) -> Any:
+            try:
+                return callback(*given)
+            except OpenArmError as error:
+                self.__refuse(topic, error)
+
+        @wraps(callback)
+        async def take_async(*given: Any) -> Any:
+            try:
+                return await callback(*given)
+            except OpenArmError as error:
+                self.__refuse(topic, error)
+
+        guarded: Any = take_async if iscoroutinefunction(callback) else take
+        return super().create_subscription(msg_type, topic, guarded, *args, **kwargs)
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **kwargs: Any) -> Any:
+        """Offer a service; those that set parameters refuse a value of an unknown type, which would end rclpy."""
+        if srv_type in (SetParameters, SetParametersAtomically):
+            callback = _refusing_unknown_types(callback)
+        return super().create_service(srv_type, srv_name, callback, **kwargs)
+
+    def __refuse(self, topic: str, error: OpenArmError) -> None:
+        self.__refused[topic] += 1
+        text = f"message of {topic} refused, {self.__refused[topic]} so far: {error.message}"
+        self.get_logger().warning(text, throttle_duration_sec=5.0)
 
     def accept_changes(self, take: Callable[[ConfigT], None]) -> None:
         """Let parameters marked `AT_RUN_TIME` change: `take` gets the new configuration before it takes effect.
@@ -199,9 +238,30 @@ class BaseNode(Node, Generic[ConfigT]):
         self.__pool.shutdown(wait=True, cancel_futures=True)
 
     def __publish_diagnostics(self) -> None:
-        message = DiagnosticArray(status=[self.__status])
+        status = self.__status
+        refused = [KeyValue(key=f"refused/{topic}", value=str(count)) for topic, count in self.__refused.items()]
+        status.values = [value for value in status.values if not value.key.startswith("refused/")] + refused
+        message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self.__diagnostics.publish(message)
+
+
+def _refusing_unknown_types(callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    known = {kind.value for kind in Parameter.Type}
+
+    def answer(request: Any, response: Any) -> Any:
+        wrong = [one for one in request.parameters if one.value.type not in known]
+        if not wrong:
+            return callback(request, response)
+        text = f"parameter {brief(wrong[0].name)} has a value of type {wrong[0].value.type}, expected 0 .. {max(known)}"
+        refusal = SetParametersResult(successful=False, reason=text)
+        if hasattr(response, "results"):
+            response.results = [refusal] * len(request.parameters)
+        else:
+            response.result = refusal
+        return response
+
+    return answer
 
 
 def _declare(node: Node, model: type[BaseModel], prefix: str) -> dict[str, Any]:

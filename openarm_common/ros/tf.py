@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
@@ -19,7 +20,7 @@ from visualization_msgs.msg import MarkerArray
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.posture import PostureTracker
-from openarm_common.ros.convert import held_from_msg, stamp_to_ns, transform_to_matrix
+from openarm_common.ros.convert import held_from_msg, joints_from_msg, stamp_to_ns, transform_to_matrix
 from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF, reliable
 
 #: Its origin is on the table top below the base; where the table is, for every node.
@@ -94,24 +95,31 @@ class RobotStateListener:
         return self.tracker.age_s(time.monotonic())
 
     def _on_joints(self, message: JointState) -> None:
+        joints_from_msg(message)
         t_ns = stamp_to_ns(message.header.stamp)
         self.tracker.add(t_ns, message.name, message.position, time.monotonic(), message.velocity)
         self.efforts = dict(zip(message.name, message.effort, strict=False))
         self._notify()
 
     def _on_static(self, message: TFMessage) -> None:
+        refused: OpenArmError | None = None
         for edge in message.transforms:
-            self.buffer.set_static(edge.header.frame_id, edge.child_frame_id, transform_to_matrix(edge.transform))
-        height = table_height(message)
-        if height is not None and self._on_table is not None:
-            self._on_table(height)
+            try:
+                self._add_edge(edge)
+            except OpenArmError as error:
+                refused = error
         self._notify()
+        if refused is not None:
+            raise refused
+
+    def _add_edge(self, edge: TransformStamped) -> None:
+        T = transform_to_matrix(edge.transform)
+        self.buffer.set_static(edge.header.frame_id, edge.child_frame_id, T)
+        if edge.child_frame_id == TABLE_FRAME and self._on_table is not None:
+            self._on_table(float(T[2, 3]))
 
     def _on_held(self, message: MarkerArray) -> None:
-        try:
-            self.tracker.held = held_from_msg(message)
-        except OpenArmError as error:
-            self._node.get_logger().warning(f"what the hands hold is as it was: {error.message}")
+        self.tracker.held = held_from_msg(message)
 
     def _notify(self) -> None:
         for on_news in self._watchers:

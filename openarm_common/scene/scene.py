@@ -19,9 +19,9 @@ import numpy as np
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from openarm_common import se3
-from openarm_common.config import Config, load_yaml, validate
+from openarm_common.config import Config, brief, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import models_dir
+from openarm_common.resources import is_file, models_dir
 from openarm_common.types import Array
 
 Rgba = tuple[float, float, float, float]
@@ -278,11 +278,11 @@ def load_scene(source: str | Path, seed: int = 0) -> Scene:
     path = Path(source)
     if path.suffix not in (".yaml", ".yml"):
         path = folder / f"{source}.yaml"
-    if not path.is_file():
+    if not is_file(path):
         names = sorted(file.stem for file in folder.glob("*.yaml"))
         raise OpenArmError(
             Code.SCENE_INVALID,
-            f"no scene {str(source)!r}; scenes: {', '.join([*names, 'random'])}, or the path of a YAML",
+            f"no scene {brief(str(source))}; scenes: {', '.join([*names, 'random'])}, or the path of a YAML",
         )
     return parse_scene({"name": path.stem} | load_yaml(path, Code.SCENE_INVALID), str(path))
 

@@ -7,13 +7,13 @@ the same arm in as many attempts. Times and place errors are compared, but decid
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_evaluation.campaign.rows import ROWS, CompareRow, read_lines
 from openarm_evaluation.judging.statistics import interval
 
 Row = Mapping[str, Any]
@@ -25,10 +25,10 @@ def rows_of(folder: Path) -> list[Row]:
     Raises:
         OpenArmError: INVALID_ARGUMENT, when the folder has none.
     """
-    path = folder / "rows.jsonl"
+    path = folder / ROWS
     if not path.is_file():
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{folder} is no folder of a campaign: it has no {path.name}")
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line[-1] == "\n"]
+    return [*read_lines(path, CompareRow)[0]]
 
 
 def compare(rows: Sequence[Row], others: Sequence[Row]) -> dict[str, Any]:

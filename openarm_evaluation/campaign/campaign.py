@@ -19,15 +19,15 @@ from pathlib import Path
 from typing import Any
 
 from openarm_bringup.supervision import runs
+from openarm_common.config import brief, load_json
 from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.campaign import cluster, report
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.parameters import suite_config
+from openarm_evaluation.campaign.rows import ROWS, ReportRow, read_lines
 from openarm_evaluation.campaign.tasks.suites import make_task
 from openarm_evaluation.campaign.trial import run_one
 from openarm_evaluation.judging import provenance
-
-ROWS = "rows.jsonl"
 
 
 @dataclass
@@ -133,20 +133,21 @@ def read_rows(folder: Path, options: CampaignOptions) -> list[Row]:
     kept, path = folder / "settings.json", folder / ROWS
     settings = options.settings()
     if kept.is_file():
-        before = json.loads(kept.read_text(encoding="utf-8"))
+        found = load_json(kept)
+        before: dict[str, Any] = found if isinstance(found, dict) else {}
         if before != settings:
-            changed = ", ".join(f"{key} was {before.get(key)}" for key in settings if before.get(key) != settings[key])
+            changed = ", ".join(
+                f"{key} was {brief(before.get(key))}" for key in settings if before.get(key) != settings[key]
+            )
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"{folder} holds rows of another campaign ({changed}); choose another --out"
             )
     runs.write_json(kept, settings)
     if not path.is_file():
         return []
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    whole = [line for line in lines if line.endswith("\n")]
-    if len(whole) != len(lines):  # the last line was being written when the power went
-        path.write_text("".join(whole), encoding="utf-8")
-    rows = [json.loads(line) for line in whole]
+    rows, whole = read_lines(path, ReportRow)
+    if len(whole.encode()) != path.stat().st_size:  # the last line was being written when the power went
+        path.write_text(whole, encoding="utf-8")
     return [row for row in rows if row["seed"] in set(options.seeds)]
 
 

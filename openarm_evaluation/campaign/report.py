@@ -87,7 +87,7 @@ def _states(grasps: Sequence[Row]) -> dict[str, float]:
     """Mean time a placed object spent in each state, s."""
     total: dict[str, float] = defaultdict(float)
     for grasp in grasps:
-        for step in grasp["states"]:
+        for step in grasp.get("states", ()):
             total[step["state"]] += float(step["seconds"])
     return {state: round(seconds / len(grasps), 2) for state, seconds in total.items()}
 

@@ -14,9 +14,12 @@ from pathlib import Path
 import coal
 import numpy as np
 
-from openarm_common.errors import Code, OpenArmError
+from openarm_common.config import read_text
+from openarm_common.errors import Code, OpenArmError, said
+from openarm_common.resources import is_file
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.urdf import origin
+from openarm_common.robot.xml_text import floats, parse_root
 from openarm_common.types import Array
 
 #: A cut must make the boxes smaller by this share in all, and there are so many cuts in a row at most.
@@ -39,9 +42,9 @@ def load_robot(urdf: Path, srdf: Path | None = None, packages: Mapping[str, Path
         OpenArmError: CONFIG_INVALID, naming the file that is missing or a mesh that can't be read.
     """
     for path in (urdf, *([] if srdf is None else [srdf])):
-        if not path.is_file():
+        if not is_file(path):
             raise OpenArmError(Code.CONFIG_INVALID, f"there is no file {path}")
-    robot = ET.fromstring(urdf.read_text(encoding="utf-8"))
+    robot = parse_root(read_text(urdf), str(urdf))
     for link in robot.findall("link"):
         for seen in link.findall("visual"):
             link.remove(seen)
@@ -50,7 +53,7 @@ def load_robot(urdf: Path, srdf: Path | None = None, packages: Mapping[str, Path
             if mesh is not None:
                 link.remove(shape)
                 link.extend(_boxed(shape, mesh, link.get("name", ""), urdf, packages or {}))
-    text = "" if srdf is None else srdf.read_text(encoding="utf-8")
+    text = "" if srdf is None else read_text(srdf)
     return RobotDescription.from_urdf(ET.tostring(robot, encoding="unicode"), text)
 
 
@@ -101,13 +104,18 @@ def _boxed(
     """Collision elements of boxes in place of one of a mesh."""
     name = mesh.get("filename", "")
     path = _found(name, urdf, packages)
-    scale = np.array([float(x) for x in mesh.get("scale", "1 1 1").split()])
+    scale = np.array(floats(mesh.get("scale", "1 1 1"), 3, mesh))
     try:
         loaded = coal.MeshLoader().load(str(path), scale)
     except (RuntimeError, ValueError) as error:
-        raise OpenArmError(Code.CONFIG_INVALID, f"{urdf}: link {link!r}: can't read mesh {path}: {error}") from error
+        raise OpenArmError(
+            Code.CONFIG_INVALID, f"{urdf}: link {link!r}: can't read mesh {path}: {said(error)}"
+        ) from error
     vertices = np.array([loaded.vertex(i) for i in range(loaded.num_vertices)], dtype=np.float64)
     corners = [[loaded.tri_indices(i)[k] for k in range(3)] for i in range(loaded.num_tris)]
+    if not corners or not np.isfinite(vertices).all():
+        text = "has points that are not finite" if corners else "has no triangle"
+        raise OpenArmError(Code.CONFIG_INVALID, f"{urdf}: link {link!r}: mesh {path} {text}")
     T, placed = origin(shape), shape.find("origin")
     rpy = "0 0 0" if placed is None else placed.get("rpy", "0 0 0")
     out: list[ET.Element] = []
@@ -132,7 +140,7 @@ def _found(name: str, urdf: Path, packages: Mapping[str, Path]) -> Path:
         path = packages[package] / rest
     else:
         path = urdf.parent / name.removeprefix("file://")
-    if not path.is_file():
+    if not is_file(path):
         raise OpenArmError(Code.CONFIG_INVALID, f"{urdf}: there is no mesh {path}")
     return path
 

@@ -19,8 +19,8 @@ from pydantic import Field
 
 from openarm_common.config import Config, RunTimeField, brief, load_yaml
 from openarm_common.detection import KINDS
-from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import models_dir
+from openarm_common.errors import Code, OpenArmError, said
+from openarm_common.resources import is_file, models_dir
 from openarm_perception.detection.boxes import Candidates, Letterbox, blob, decode
 from openarm_perception.detection.detector import Detection2D, Image, require_rgb
 
@@ -157,7 +157,7 @@ class NetworkDetector:
             outputs = self._session.run(None, {self._input: image})
         # onnxruntime raises types of its own, which it does not document
         except Exception as error:
-            raise self._wrong(f"it does not run on a {self.size[0]}x{self.size[1]} image: {error}") from error
+            raise self._wrong(f"it does not run on a {self.size[0]}x{self.size[1]} image: {said(error)}") from error
         first = np.asarray(outputs[0])
         if first.ndim != 3 or first.shape[0] != 1 or first.shape[1] < 5 or first.shape[1] > first.shape[2]:
             hint = ""
@@ -176,7 +176,11 @@ class NetworkDetector:
         if self.config.names:
             names, where = self.config.names, "the parameter names"
         else:
-            names, where = _names_of(self.path, dict(self._session.get_modelmeta().custom_metadata_map))
+            try:
+                metadata = dict(self._session.get_modelmeta().custom_metadata_map)
+            except UnicodeDecodeError as error:
+                raise self._wrong(f"its metadata are no text: {said(error)}") from error
+            names, where = _names_of(self.path, metadata)
         if not names:
             raise self._wrong(
                 f"its {classes} classes have no names: give them in the parameter names, or in"
@@ -198,10 +202,10 @@ def model_path(model: str) -> Path:
     """
     folder = models_dir() / "detector"
     path = Path(model) if model.endswith(".onnx") else folder / f"{model}.onnx"
-    if not path.is_file():
+    if not is_file(path):
         names = ", ".join(sorted(file.stem for file in folder.glob("*.onnx"))) or "none"
         raise OpenArmError(
-            Code.CONFIG_INVALID, f"there is no network {path}; models: {names}, or the path of an ONNX file"
+            Code.CONFIG_INVALID, f"there is no network {brief(str(path))}; models: {names}, or the path of an ONNX file"
         )
     return path
 
@@ -223,7 +227,7 @@ def _open(path: Path) -> Any:
     except Exception as error:
         raise OpenArmError(
             Code.CONFIG_INVALID,
-            f"network {path} ({path.stat().st_size} bytes) is damaged or no ONNX file: {error}; export or copy it"
+            f"network {path} ({path.stat().st_size} bytes) is damaged or no ONNX file: {said(error)}; export or copy it"
             " again",
         ) from error
 

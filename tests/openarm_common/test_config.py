@@ -89,7 +89,7 @@ def test_what_is_no_file_of_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "latin.yaml").write_bytes(b"a: \xff")
     for path, part in (
         (tmp_path, "can't read"),
-        (tmp_path / "latin.yaml", "not valid YAML"),
+        (tmp_path / "latin.yaml", "is no text in UTF-8: byte 3 is 0xff"),
         (Path("/dev/zero"), "longer than"),
     ):
         with pytest.raises(OpenArmError, match=part):

@@ -1,0 +1,387 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Readers of files, and sound files to alter for them."""
+
+from __future__ import annotations
+
+import functools
+import json
+import random
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from benchmarks.fuzz.alter import altered_archive, altered_bytes, altered_json, altered_xml, altered_yaml
+from benchmarks.fuzz.judge import Tally
+from openarm_common.resources import config_dir, models_dir
+from openarm_common.robot.description import RobotDescription
+
+Alter = Callable[[bytes, random.Random], bytes]
+#: The bag of the repository.
+BAG = Path(__file__).parents[2] / "tests/data/demo_pick"
+#: Joint states of the bag are used that are not further from an image.
+_NEAR_NS = 60_000_000
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One way in for files.
+
+    Args:
+        name: Of the file that is written; its suffix matters to some readers.
+        sound: What is altered.
+        alter: How.
+        read: Takes the path of the altered file.
+    """
+
+    name: str
+    sound: tuple[bytes, ...]
+    alter: Alter
+    read: Callable[[Path], object]
+
+    def attempt(self, folder: Path, rng: random.Random) -> Callable[[], object]:
+        """Write one altered file; return the work of reading it."""
+        path = folder / self.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists():
+            path.unlink()
+        path.write_bytes(self.alter(rng.choice(self.sound), rng))
+        return functools.partial(self.read, path)
+
+
+# --- bags
+def _bags(folder: Path) -> list[Reader]:
+    from rclpy.serialization import serialize_message
+    from sensor_msgs.msg import JointState
+
+    from openarm_bringup.bags.bag import BagWriter, open_bag
+    from openarm_bringup.bags.ros.listener import from_profile
+    from openarm_bringup.bags.ros.messages import messages_of
+    from openarm_common.ros.node import QOS_COMMAND
+
+    def read(path: Path) -> None:
+        with open_bag(path) as bag:
+            messages_of(bag, bag.topics)
+
+    sound: list[bytes] = []
+    for name, compress in (("packed", True), ("plain", False)):
+        with BagWriter(folder / name, {"graph": "sim"}, compress=compress) as bag:
+            bag.add_topic("/joint_states", "sensor_msgs/msg/JointState", from_profile(QOS_COMMAND))
+            for k in range(40):
+                message = JointState(name=[f"joint{i}" for i in range(7)], position=[0.1 * k] * 7)
+                bag.write("/joint_states", k * 10**7, serialize_message(message))
+        sound.append((folder / name / f"{name}.mcap").read_bytes())
+    whole = (folder / "packed" / "metadata.yaml").read_bytes()
+
+    def cut(data: bytes, rng: random.Random) -> bytes:
+        return altered_bytes(data[: rng.randrange(len(data) // 3, len(data))], rng)
+
+    def about(path: Path) -> None:
+        (path.parent / "packed.mcap").write_bytes(sound[0])
+        read(path.parent)
+
+    return [
+        Reader("altered.mcap", tuple(sound), altered_bytes, read),
+        Reader("cut.mcap", tuple(sound), cut, read),
+        Reader("about/metadata.yaml", (whole,), altered_yaml, about),
+    ]
+
+
+def _contents(folder: Path) -> list[Reader]:
+    """Bags whose messages are altered, read by what computes with them."""
+    from openarm_bringup.bags.bag import Bag, BagWriter, open_bag
+    from openarm_bringup.bags.ros.bag import numbers_of
+    from openarm_bringup.bags.ros.listener import from_profile
+    from openarm_bringup.calibration.ros.samples import samples_of
+    from openarm_calibration.board.board import CircleGrid
+    from openarm_common.ros.node import QOS_COMMAND
+
+    used = (
+        "/joint_states", "/tf_static", "/robot_description", "/overhead/color/image_raw", "/overhead/color/camera_info",
+        "/overhead/depth/image_raw", "/overhead/depth/camera_info",
+    )  # fmt: skip
+    with open_bag(BAG) as bag:
+        images = [record.t_ns for record in bag.records(["/overhead/color/image_raw"])]
+        records = [
+            record
+            for record in bag.records(used)
+            if record.topic != used[0] or any(abs(record.t_ns - t_ns) < _NEAR_NS for t_ns in images)
+        ]
+        kinds = {record.topic: record.type for record in records}
+    numbers = iter(range(10**9))
+
+    def write(_: bytes, rng: random.Random) -> bytes:
+        path = folder / f"bag{next(numbers)}"
+        chosen = rng.choice(used)
+        with BagWriter(path, {}, compress=False) as bag:
+            for topic, kind in kinds.items():
+                bag.add_topic(topic, kind, from_profile(QOS_COMMAND))
+            for record in sorted(records, key=lambda record: record.t_ns):
+                data = record.data
+                if record.topic == chosen:
+                    # where the fields are; in the pixels it would change nothing
+                    data = altered_bytes(data[:400], rng) + data[400:]
+                bag.write(record.topic, record.t_ns, data)
+        return str(path).encode()
+
+    def read(use: Callable[[Bag], object], path: Path) -> None:
+        with open_bag(Path(path.read_text())) as bag:
+            use(bag)
+
+    def sampled(bag: Bag) -> None:
+        samples_of(bag, "overhead", CircleGrid(), "openarm_right_link7", None)
+
+    return [Reader("path", (b"",), write, functools.partial(read, use)) for use in (numbers_of, sampled)]
+
+
+# --- maps
+def _maps(folder: Path) -> list[Reader]:
+    from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
+    from openarm_octomap.kernels import FREE
+    from openarm_octomap.mapper import Mapper
+
+    def mapper() -> Mapper:
+        return Mapper(RobotDescription.load(), GridConfig(), FilterConfig(enabled=False), FieldConfig())
+
+    one = mapper()
+    one.clear_box((0.2, -0.3, 0.0), (0.6, 0.3, 0.4), FREE)
+    one.save(folder / "map.bt")
+    one.save(folder / "map.ot")
+    target = mapper()
+    return [
+        Reader(f"altered{suffix}", ((folder / f"map{suffix}").read_bytes(),), altered_bytes, target.load)
+        for suffix in (".bt", ".ot")
+    ] + [Reader("wrong.bt", ((folder / "map.ot").read_bytes(),), altered_bytes, target.load)]
+
+
+# --- text
+def _yaml(folder: Path) -> list[Reader]:
+    from trajectory_msgs.msg import JointTrajectory
+
+    from openarm_bringup.messages import fill
+    from openarm_bringup.supervision.graph import load_graph
+    from openarm_bringup.supervision.params import read_params
+    from openarm_calibration.board.board import read_board
+    from openarm_calibration.store.store import CalibrationStore
+    from openarm_calibration.store.table import StoredTable, TableStore
+    from openarm_common.camera.cameras import load_cameras
+    from openarm_common.config import load_config, parse_yaml
+    from openarm_common.scene.scene import load_scene
+    from openarm_evaluation.detector.yolo_text import read_classes
+    from openarm_grasp.strategies.orders import load_bins
+    from openarm_perception.detection.detector import ColorDetectorConfig
+    from openarm_sim_bridge.faults.faults import FAULTS, parse_fault
+
+    def of(*folders: Path) -> tuple[bytes, ...]:
+        return tuple(path.read_bytes() for folder in folders for path in sorted(folder.glob("*.yaml")))
+
+    def stored(path: Path) -> object:
+        CalibrationStore(path.parent).load("wrist")
+        return CalibrationStore(path.parent).history("wrist")
+
+    def measured(path: Path) -> object:
+        return TableStore(path.parents[1]).load("table")
+
+    TableStore(folder).save_level(StoredTable(height=0.4, configured=0.4))
+    faults = [
+        yaml.safe_dump({"name": name, "parameters": model().model_dump(mode="json")}).encode()
+        for name, model in FAULTS.items()
+        if not any(field.is_required() for field in model.model_fields.values())
+    ]
+
+    def fault(path: Path) -> None:
+        for name in rng_names:
+            parse_fault(name, path.read_text("utf-8", "replace"))
+
+    rng_names = tuple(FAULTS)[:4]
+    words = b"joint_names: [a, b]\npoints: [{positions: [0.1, 0.2], time_from_start: {sec: 1, nanosec: 5}}]\n"
+    params = b"/**:\n  ros__parameters: {a: 1, b: {c: [1, 2]}}\nnode:\n  ros__parameters: {d: text}\n"
+    bins = b"bins: {left: [0.3, 0.2], right: [0.3, -0.2]}\nclasses: {red: left}\nrest: right\n"
+    return [
+        Reader("scene.yaml", of(models_dir() / "scenes"), altered_yaml, load_scene),
+        Reader("graph.yaml", of(config_dir() / "graphs"), altered_yaml, lambda path: load_graph(str(path))),
+        Reader("params.yaml", (params,), altered_yaml, lambda path: read_params(path, "node")),
+        Reader("cameras.yaml", ((config_dir() / "params/cameras.yaml").read_bytes(),), altered_yaml, load_cameras),
+        Reader(
+            "detector.yaml", ((config_dir() / "params/detector.yaml").read_bytes(),), altered_yaml,
+            lambda path: load_config(path, ColorDetectorConfig),
+        ),
+        Reader("store/wrist.yaml", of(config_dir() / "calibration/mount_seed_1"), altered_yaml, stored),
+        Reader("tables/table/table.yaml", ((folder / "table/table.yaml").read_bytes(),), altered_yaml, measured),
+        Reader("bins.yaml", (bins,), altered_yaml, load_bins),
+        Reader(
+            "board.yaml", (b"kind: circles\nrows: 11\ncolumns: 4\n", b"kind: charuco\n"), altered_yaml,
+            lambda path: read_board(path.read_text("utf-8", "replace")),
+        ),
+        Reader("fault.yaml", tuple(faults) or (b"{}",), altered_yaml, fault),
+        Reader("dataset.yaml", (b"train: images\nnames: [a, b]\n", b"names: {0: a, 1: b}\n"), altered_yaml,
+               lambda path: read_classes(path.parent)),
+        Reader(
+            "message.yaml", (words,), altered_yaml,
+            lambda path: fill(JointTrajectory(), parse_yaml(path.read_text("utf-8", "replace"), "the message")),
+        ),
+    ]  # fmt: skip
+
+
+def _json(folder: Path) -> list[Reader]:
+    from openarm_bringup.bags import golden
+    from openarm_evaluation.campaign import agree
+    from openarm_evaluation.campaign.campaign import read_rows
+    from openarm_evaluation.campaign.options import CampaignOptions
+    from openarm_evaluation.campaign.report import summarise
+
+    grasp = {"label": "red", "arm": "left", "attempts": 1, "placed": True, "place_error_mm": 1.0, "sim_s": 9.0}
+    row = {
+        "set": "nominal", "seed": 0, "scene_hash": "a", "outcome": "placed", "code": "OK", "grasps": [grasp],
+        "detector": "color", "kind": "demo", "expected": ["placed"], "as_expected": True, "placed": True,
+        "false_success": False, "attempts": 1,
+    }  # fmt: skip
+    rows = b"".join(json.dumps({**row, "seed": seed}).encode() + b"\n" for seed in range(3))
+    options = CampaignOptions(seeds=(0, 1, 2))
+    settings = options.settings()
+    known = json.loads(json.dumps([{**row, "seed": seed} for seed in range(3)]))
+
+    def line(data: bytes, rng: random.Random) -> bytes:
+        lines = data.splitlines(keepends=True)
+        at = rng.randrange(len(lines))
+        lines[at] = altered_json(lines[at], rng) + b"\n"
+        return b"".join(lines)
+
+    def compared(path: Path) -> None:
+        agree.text_of(agree.compare(agree.rows_of(path.parent), known))
+
+    def resumed(path: Path) -> None:
+        (path.parent / "rows.jsonl").write_bytes(rows)
+        summarise(read_rows(path.parent, options))
+
+    def cut_off(path: Path) -> None:
+        (path.parent / "settings.json").unlink(missing_ok=True)
+        summarise(read_rows(path.parent, options))
+
+    return [
+        Reader("golden.json", ((BAG / "golden.json").read_bytes(),), altered_json,
+               lambda path: golden.compare(golden.read(path), {"frames": 1.0})),
+        Reader("campaign/rows.jsonl", (rows,), line, compared),
+        Reader("resumed/settings.json", (json.dumps(settings).encode(),), altered_json, resumed),
+        Reader("again/rows.jsonl", (rows,), line, cut_off),
+    ]  # fmt: skip
+
+
+# --- archives, networks, robots
+def _npz(folder: Path) -> list[Reader]:
+    from openarm_calibration.sampling.samples import load_session
+    from tests.openarm_calibration.known_session import make_session
+
+    sound: list[bytes] = []
+    for setup in ("in_hand", "to_hand"):
+        make_session(setup, count=3).samples.save(folder / f"{setup}.npz")
+        sound.append((folder / f"{setup}.npz").read_bytes())
+    robot = RobotDescription.load()
+
+    def read(path: Path) -> None:
+        samples, _ = load_session(path, robot)
+        samples.problem()
+
+    return [Reader("session.npz", tuple(sound), altered_archive, read)]
+
+
+def _onnx(folder: Path) -> list[Reader]:
+    from openarm_perception.detection.network import NetworkConfig, NetworkDetector
+
+    image = np.zeros((120, 160, 3), np.uint8)
+
+    def read(path: Path) -> None:
+        NetworkDetector(NetworkConfig(model=str(path))).detect(image)
+
+    def alter(data: bytes, rng: random.Random) -> bytes:
+        """Where structure is: at both ends, and in what is text."""
+        way = rng.random()
+        if way < 0.3:
+            return altered_bytes(data[:4000], rng) + data[4000:]
+        if way < 0.6:
+            return data[:-6000] + altered_bytes(data[-6000:], rng)
+        if way < 0.75 and b"names" in data:
+            at = data.rindex(b"names")
+            return data[:at] + altered_bytes(data[at : at + 200], rng) + data[at + 200 :]
+        return altered_bytes(data, rng)
+
+    sound = ((models_dir() / "detector/shapes_320x256.onnx").read_bytes(),)
+    return [Reader("altered.onnx", sound, alter, read)]
+
+
+def _robots(folder: Path) -> list[Reader]:
+    from openarm_motion.collision.mesh_boxes import load_robot
+
+    robot = RobotDescription.load()
+    mesh = (
+        b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+        b"facet normal 0 0 1\nouter loop\nvertex 0 0 1\nvertex 1 0 1\nvertex 0 1 1\nendloop\nendfacet\nendsolid\n"
+    )
+    obj = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 3 4\nf 1 2 4\nf 2 3 4\n"
+    facets = np.random.default_rng(0).random((2, 12), np.float32)
+    binary = bytes(80) + (2).to_bytes(4, "little") + b"".join(facet.tobytes() + bytes(2) for facet in facets)
+    small = (
+        '<robot name="a"><link name="b"><collision><geometry><mesh filename="FILE" scale="1 1 1"/></geometry>'
+        '</collision><collision><origin xyz="0 0 1" rpy="0 0 0"/><geometry><box size="1 1 1"/></geometry></collision>'
+        "</link></robot>"
+    )
+
+    def srdf(path: Path) -> object:
+        return RobotDescription.from_urdf(robot.urdf, path.read_text("utf-8", "replace"))
+
+    def meshed(path: Path) -> object:
+        urdf = path.with_suffix(".urdf")
+        urdf.write_text(small.replace("FILE", path.name))
+        return load_robot(urdf)
+
+    def described(path: Path) -> None:
+        one = load_robot(path)
+        one.link_poses(dict.fromkeys(one.joints, 0.1))
+
+    (folder / "robot").mkdir()
+    (folder / "robot/mesh.obj").write_bytes(obj)
+    return [
+        Reader(
+            "robot/robot.urdf",
+            (robot.urdf.encode(), small.replace("FILE", "mesh.obj").encode()),
+            altered_xml,
+            described,
+        ),
+        Reader("robot.srdf", (robot.srdf.encode(),), altered_xml, srdf),
+        Reader("mesh.stl", (mesh, binary), altered_bytes, meshed),
+        Reader("mesh.obj", (obj,), altered_bytes, meshed),
+    ]
+
+
+#: By kind: makes the readers, with a folder for sound files.
+KINDS: Mapping[str, Callable[[Path], list[Reader]]] = {
+    "bags": _bags,
+    "contents": _contents,
+    "maps": _maps,
+    "yaml": _yaml,
+    "json": _json,
+    "npz": _npz,
+    "onnx": _onnx,
+    "robots": _robots,
+}
+
+
+def read_altered(kind: str, count: int, seed: int) -> Tally:
+    """Read altered files of a kind.
+
+    Args:
+        kind: Of `KINDS`.
+        count: How many.
+        seed: The same files for the same seed.
+    """
+    rng, tally = random.Random(f"{kind}{seed}"), Tally(kind)
+    with tempfile.TemporaryDirectory() as folder:
+        sound = Path(folder, "sound")
+        sound.mkdir()
+        readers = KINDS[kind](sound)
+        for k in range(count):
+            tally.take(readers[k % len(readers)].attempt(Path(folder), rng))
+    return tally

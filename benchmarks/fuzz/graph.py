@@ -1,0 +1,409 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes of the graph in one process, each in a thread of its own, and what can be sent to them."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from benchmarks.fuzz.alter import HOSTILE, altered_bytes
+from benchmarks.fuzz.files import BAG
+from benchmarks.fuzz.hostile import hostile, plausible
+from benchmarks.fuzz.judge import Tally, peak_mib, reset_peak, where
+from openarm_bringup.messages import interface
+from openarm_common.config import validate
+from openarm_common.domain import release_domain, reserve_domain
+from openarm_common.errors import OpenArmError
+
+#: What is sent before the nodes are asked whether they still answer.
+BATCH = 10
+#: A node answers within this time, s of wall clock; a request or the result of a cancelled goal.
+ALIVE_S, ANSWER_S = 2.0, 20.0
+#: A goal is cancelled after this time, s.
+_GOAL_S = 1.0
+#: Written by what should not happen.
+_DEFECT = re.compile(r"^.*(Error raised in|physics thread ended|Exception in|exception was never).*$", re.MULTILINE)
+_CAMERA = re.compile(r"/(?P<camera>\w+)/(?P<stream>color|depth)/(image_raw|camera_info)")
+
+
+class Nodes:
+    """All nodes, and a probe.
+
+    Args:
+        folder: For what they write; the working folder of the process.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+        from rclpy.parameter import Parameter
+
+        from openarm_bringup.bags.ros.flight_recorder import FlightRecorder
+        from openarm_calibration.ros.node import CalibrationNode
+        from openarm_calibration.ros.publisher import PublisherNode
+        from openarm_grasp.ros.node import GraspNode
+        from openarm_motion.ros.node import MotionNode
+        from openarm_octomap.ros.node import OctomapNode
+        from openarm_perception.ros.cloud_node import CloudNode
+        from openarm_perception.ros.detector_node import DetectNode
+        from openarm_sim_bridge.ros.node import MujocoBridge
+
+        rclpy.init()
+        self._executor = SingleThreadedExecutor
+        self._ending = False
+        self._threads: list[threading.Thread] = []
+        #: Errors that came out of a callback, by node.
+        self.errors: list[str] = []
+        self.nodes: list[Any] = []
+        self.probe: Any = Node("probe")
+        self._spin(self.probe)
+        self._alive = {}
+        store = str(folder / "store")
+        for kind, parameters in (
+            (MujocoBridge, {"images": False}),
+            (PublisherNode, {"store": store}),
+            (CloudNode, {}),
+            (DetectNode, {}),
+            (OctomapNode, {}),
+            (MotionNode, {}),
+            (GraspNode, {}),
+            (CalibrationNode, {"store": store, "camera": "wrist"}),
+            (FlightRecorder, {"folder": str(folder / "recordings")}),
+        ):
+            overrides = [Parameter(name, value=value) for name, value in parameters.items()]
+            node: Any = kind(parameter_overrides=overrides)
+            self.nodes.append(node)
+            self._spin(node)
+        self._listen()
+
+    def _spin(self, node: Any) -> None:
+        executor = self._executor()
+        executor.add_node(node)
+
+        def spin() -> None:
+            while not self._ending:
+                try:
+                    executor.spin_once(timeout_sec=0.1)
+                # Anything that comes out of a callback is what this looks for: it would end the process.
+                except Exception as error:
+                    if not self._ending:
+                        self.errors.append(f"{node.get_name()}: {where(error)}")
+
+        thread = threading.Thread(target=spin, name=node.get_name(), daemon=True)
+        thread.start()
+        self._threads.append(thread)
+
+    def _listen(self) -> None:
+        """Subscribe to all that the nodes publish: some of them work only while it is wanted."""
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+        profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self.newest_ns = 0
+        for node in self.nodes:
+            for publisher in node.publishers:
+                if publisher.topic_name in ("/rosout", "/parameter_events"):
+                    continue
+                take = self._take_state if publisher.topic_name == "/joint_states" else lambda _: None
+                self.probe.create_subscription(publisher.msg_type, publisher.topic_name, take, profile)
+
+    def _take_state(self, message: Any) -> None:
+        self.newest_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+    def silent(self) -> list[str]:
+        """Return the nodes that do not answer a request for a parameter in time, and note the longest time."""
+        from rcl_interfaces.srv import GetParameters
+
+        waiting: dict[str, Any] = {}
+        for node in self.nodes:
+            name = node.get_fully_qualified_name()
+            if name not in self._alive:
+                self._alive[name] = self.probe.create_client(GetParameters, f"{name}/get_parameters")
+                self._alive[name].wait_for_service(timeout_sec=10.0)
+            waiting[name] = self._alive[name].call_async(GetParameters.Request(names=["use_sim_time"]))
+        deadline = time.monotonic() + ALIVE_S
+        while time.monotonic() < deadline and not all(future.done() for future in waiting.values()):
+            time.sleep(0.005)
+        return [name for name, future in waiting.items() if not future.done()]
+
+    def close(self) -> None:
+        """End everything."""
+        import rclpy
+
+        self._ending = True
+        for thread in self._threads:
+            thread.join(timeout=5.0)
+        for node in self.nodes:
+            node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+class Sender:
+    """Hostile inputs for the nodes.
+
+    Args:
+        nodes: Running.
+        rng: Source of all choices.
+    """
+
+    def __init__(self, nodes: Nodes, rng: random.Random) -> None:
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        self._nodes, self._rng = nodes, rng
+        self._probe = nodes.probe
+        self._profile = QoSProfile(depth=2, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._made: dict[Any, Any] = {}
+        self._sound, self._mounts = _recorded()
+        self._actions: list[tuple[str, Any]] = []
+
+    # --- topics
+    def restore(self) -> None:
+        """Undo what would keep inputs from being worked on: other camera mounts, a pause, an emergency stop."""
+        from openarm_interfaces.srv import SetPause
+        from std_srvs.srv import Trigger
+
+        for name, kind in (("/sim/set_pause", SetPause), ("/mujoco_bridge/reset", Trigger)):
+            client = self._made.get(name) or self._made.setdefault(name, self._probe.create_client(kind, name))
+            if client.wait_for_service(timeout_sec=5.0):
+                client.call_async(kind.Request())
+        kind = type(self._mounts[0])
+        for message in self._mounts:
+            self._publisher("/tf_static", kind).publish(message)
+
+    def message(self) -> Callable[[], object]:
+        """One message on one subscription."""
+        heard = {
+            (s.topic_name, s.msg_type)
+            for node in self._nodes.nodes
+            for s in list(node.subscriptions)
+            if s.topic_name not in ("/clock", "/parameter_events")
+        }
+        topic, kind = self._rng.choice(sorted(heard, key=lambda item: item[0]))
+        return partial(self._publish, topic, kind)
+
+    def _publish(self, topic: str, kind: Any) -> None:
+        from rclpy.serialization import serialize_message
+
+        match = _CAMERA.fullmatch(topic)
+        others = [t for t in self._sound if match and t.startswith(f"/{match['camera']}/")]
+        stamp = self._nodes.newest_ns
+        for other in others:  # of the same stamp, without which a frame is not taken up
+            if other != topic:
+                self._publisher(other, type(self._sound[other])).publish(_stamped(self._sound[other], stamp))
+        sound = self._sound.get(topic)
+        sound = plausible(kind, self._rng) if sound is None or not isinstance(sound, kind) else _stamped(sound, stamp)
+        publisher = self._publisher(topic, kind)
+        message = hostile(sound, self._rng)
+        if self._rng.random() < 0.2:
+            data = serialize_message(sound)
+            publisher.publish(data[:4] + altered_bytes(data[4:400], self._rng) + data[400:])
+        else:
+            publisher.publish(message)
+
+    def _publisher(self, topic: str, kind: Any) -> Any:
+        if topic not in self._made:
+            self._made[topic] = self._probe.create_publisher(kind, topic, self._profile)
+            deadline = time.monotonic() + 2.0
+            while not self._made[topic].get_subscription_count() and time.monotonic() < deadline:
+                time.sleep(0.01)
+        return self._made[topic]
+
+    # --- services and actions
+    def request(self) -> Callable[[], object]:
+        """One request to one service."""
+        offered = [
+            (node.resolve_service_name(s.srv_name), s.srv_type) for node in self._nodes.nodes for s in node.services
+        ]
+        name, kind = self._rng.choice(offered)
+        request = hostile(plausible(kind.Request, self._rng), self._rng)
+        return partial(self._call, name, kind, request)
+
+    def _call(self, name: str, kind: Any, request: Any) -> None:
+        if name.endswith("/change_state") and request.transition.id not in range(5):
+            request.transition.id = 200  # no transition; a shutdown would end the node for good
+        client = self._made.get(name) or self._made.setdefault(name, self._probe.create_client(kind, name))
+        client.wait_for_service(timeout_sec=5.0)
+        answer = _wait(client.call_async(request), ANSWER_S, f"no answer of {name}")
+        if not getattr(answer, "success", True):
+            raise OpenArmError(getattr(answer, "code", "") or "REFUSED", getattr(answer, "message", ""))
+
+    def goal(self) -> Callable[[], object]:
+        """One goal of one action; cancelled after a while."""
+        from rclpy.action import get_action_server_names_and_types_by_node
+
+        if not self._actions:
+            for node in self._nodes.nodes:
+                found = get_action_server_names_and_types_by_node(self._probe, node.get_name(), node.get_namespace())
+                self._actions += [(name, interface(kinds[0])) for name, kinds in found]
+        name, kind = self._rng.choice(self._actions)
+        return partial(self._send, name, kind, hostile(plausible(kind.Goal, self._rng), self._rng))
+
+    def _send(self, name: str, kind: Any, goal: Any) -> None:
+        from rclpy.action import ActionClient
+
+        client = self._made.get(name) or self._made.setdefault(name, ActionClient(self._probe, kind, name))
+        client.wait_for_server(timeout_sec=5.0)
+        handle = _wait(client.send_goal_async(goal), ANSWER_S, f"no answer of {name}")
+        if not handle.accepted:
+            raise OpenArmError("REJECTED", "")
+        result = handle.get_result_async()
+        try:
+            done = _wait(result, _GOAL_S, "")
+        except _SilentError:
+            handle.cancel_goal_async()
+            done = _wait(result, ANSWER_S, f"no result of {name}")
+        if not getattr(done.result, "success", not getattr(done.result, "error_code", 0)):
+            raise OpenArmError(getattr(done.result, "code", "") or "REFUSED", getattr(done.result, "message", ""))
+
+    # --- parameters
+    def parameter(self) -> Callable[[], object]:
+        """One parameter: of a running node, or of one that starts."""
+        node = self._rng.choice(self._nodes.nodes)
+        if self._rng.random() < 0.5:
+            return partial(self._start, node)
+        return partial(self._set, node)
+
+    def _start(self, node: Any) -> None:
+        data = node.config.model_dump()
+        place: Any = data
+        while True:
+            key = self._rng.choice(list(place))
+            if not isinstance(place[key], dict) or not place[key] or self._rng.random() < 0.1:
+                break
+            place = place[key]
+        place[key] = self._rng.choice(HOSTILE)
+        validate(type(node.config), data, "parameters")
+
+    def _set(self, node: Any) -> None:
+        from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+        from rcl_interfaces.srv import SetParameters
+
+        name = self._rng.choice(sorted(node._parameters))
+        before = node.get_parameter(name).get_parameter_value()
+        value = hostile(plausible(ParameterValue, self._rng), self._rng)
+        value.type = self._rng.choice((before.type, self._rng.randrange(11)))
+        if name == "use_sim_time" and value.type == ParameterType.PARAMETER_BOOL:
+            value.type = ParameterType.PARAMETER_STRING
+        service = f"{node.get_fully_qualified_name()}/set_parameters"
+        client = self._made.get(service) or self._made.setdefault(
+            service, self._probe.create_client(SetParameters, service)
+        )
+        client.wait_for_service(timeout_sec=5.0)
+        request = SetParameters.Request(parameters=[Parameter(name=name, value=value)])
+        answer = _wait(client.call_async(request), ANSWER_S, f"no answer of {service}").results[0]
+        if not answer.successful:
+            raise OpenArmError("REFUSED", answer.reason)
+        back = SetParameters.Request(parameters=[Parameter(name=name, value=before)])
+        _wait(client.call_async(back), ANSWER_S, f"no answer of {service}")
+
+
+class _SilentError(Exception):
+    """No answer came in time."""
+
+
+def _wait(future: Any, seconds: float, what: str) -> Any:
+    deadline = time.monotonic() + seconds
+    while not future.done():
+        if time.monotonic() > deadline:
+            raise _SilentError(f"{what} within {seconds:g} s")
+        time.sleep(0.002)
+    return future.result()
+
+
+def _recorded() -> tuple[dict[str, Any], list[Any]]:
+    """One message of each topic of the bag of the repository, of those types that are as they were; all of mounts."""
+    from openarm_bringup.bags.bag import open_bag
+    from openarm_bringup.bags.ros.messages import message_of, messages_of
+
+    found: dict[str, Any] = {}
+    with open_bag(BAG) as bag:
+        for topic in bag.topics:
+            try:
+                found[topic] = message_of(bag, next(bag.records([topic])))
+            except OpenArmError:
+                continue
+        return found, messages_of(bag, ["/tf_static"])["/tf_static"]
+
+
+def _stamped(message: Any, t_ns: int) -> Any:
+    if hasattr(message, "header"):
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(t_ns, 10**9)
+    return message
+
+
+#: By kind: which of the sender's.
+KINDS: dict[str, Callable[[Sender], Callable[[], object]]] = {
+    "messages": Sender.message,
+    "requests": Sender.request,
+    "goals": Sender.goal,
+    "parameters": Sender.parameter,
+}
+
+
+@contextmanager
+def _running() -> Iterator[tuple[Nodes, Path]]:
+    domain = reserve_domain()
+    os.environ["ROS_DOMAIN_ID"] = str(domain)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ.setdefault("MUJOCO_GL", "egl")
+    with tempfile.TemporaryDirectory() as folder:
+        home = Path(folder, "a/b/c")  # hostile paths lead out of it, not out of the folder
+        home.mkdir(parents=True)
+        os.chdir(home)
+        nodes = Nodes(home)
+        try:
+            yield nodes, home
+        finally:
+            nodes.close()
+            os.chdir("/")
+            release_domain(domain)
+
+
+def send_hostile(counts: dict[str, int], seed: int) -> list[Tally]:
+    """Send hostile inputs of some kinds, in this process.
+
+    Args:
+        counts: Inputs by kind.
+        seed: Of all choices; what nodes do meanwhile depends on the machine.
+    """
+    tallies: list[Tally] = []
+    with ExitStack() as stack:
+        log = stack.enter_context(tempfile.NamedTemporaryFile(suffix=".log"))
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+        nodes, _ = stack.enter_context(_running())
+        nodes.silent()
+        for kind, count in counts.items():
+            rng = random.Random(f"{kind}{seed}")
+            sender, tally = Sender(nodes, rng), Tally(kind)
+            tallies.append(tally)
+            done = 0
+            while done < count:
+                before = reset_peak()
+                sender.restore()
+                for _ in range(min(BATCH, count - done)):
+                    tally.take(KINDS[kind](sender), bounded=False)
+                    done += 1
+                began = time.monotonic()
+                for name in nodes.silent():
+                    tally.raw[f"{name} did not answer for {ALIVE_S:g} s"] += 1
+                tally.worst_s = max(tally.worst_s, time.monotonic() - began)
+                tally.worst_mib = max(tally.worst_mib, peak_mib() - before)
+                while nodes.errors:
+                    tally.raw[nodes.errors.pop()] += 1
+            tally.notes += [f"{node.get_name()}: {node._BaseNode__status.message[:150]}" for node in nodes.nodes]
+            at = Path(log.name)
+            for found in _DEFECT.finditer(at.read_text("utf-8", "replace")):
+                tally.raw[found.group()[:300]] += 1
+            os.truncate(log.name, 0)
+    return tallies
