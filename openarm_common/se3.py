@@ -38,6 +38,16 @@ def inverse(T: Array) -> Array:
     return out
 
 
+def is_pose(T: Array) -> bool:
+    """Whether (4, 4) is a rotation and a translation, to six digits."""
+    return bool(
+        np.isfinite(T).all()
+        and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
+        and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))
+        and np.linalg.det(T[:3, :3]) > 0.0
+    )
+
+
 def apply(T: Array, points: ArrayLike) -> Array:
     """Map points (..., 3) through `T`."""
     return np.asarray(points, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]

@@ -94,7 +94,7 @@ def _places(tree: Any) -> Any:
 def _near(value: Any, rng: random.Random) -> Any:
     if isinstance(value, bool):
         return not value
-    if isinstance(value, int | float):
+    if isinstance(value, int | float) and abs(value) < 1e300:
         return rng.choice((-value, value * 1e6, value + 1, value * 1e-6, str(value), [value], 0))
     if isinstance(value, str):
         return rng.choice((value + "x", value.upper(), value * 100, value[:1], [value], value + "\n"))

@@ -64,6 +64,8 @@ def _bags(folder: Path) -> list[Reader]:
 
     def read(path: Path) -> None:
         with open_bag(path) as bag:
+            for topic in bag.topics:
+                bag.why_not(topic)
             messages_of(bag, bag.topics)
 
     sound: list[bytes] = []

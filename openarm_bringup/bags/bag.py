@@ -23,7 +23,7 @@ from rosbags.rosbag2.errors import ReaderError
 from rosbags.rosbag2.storage_mcap import McapWriter, zstd
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from openarm_bringup.bags.definitions import definition, nested_types
+from openarm_bringup.bags.definitions import changed_type, definition, nested_types
 from openarm_bringup.bags.mcap import DAMAGE, is_closed, mend, unpack
 from openarm_bringup.messages import interface
 from openarm_common.config import MAX_YAML_BYTES, load_yaml
@@ -187,9 +187,20 @@ class Bag:
             profiles: Sequence[Qos] = getattr(connection.ext, "offered_qos_profiles", [])
             self.topics[connection.topic] = (connection.msgtype, profiles[0] if profiles else None)
             self.counts[connection.topic] = self.counts.get(connection.topic, 0) + connection.msgcount
+        self._definitions = {connection.topic: connection.msgdef for connection in reader.connections}
         self.custom: Mapping[str, str] = reader.storage.metadata.custom or {}
         self.start_ns = reader.start_time
         self.duration_s = max(0, reader.duration - 1) * 1e-9
+
+    def why_not(self, topic: str) -> str:
+        """Return why the messages of a topic are not of the installed type of that name; empty when they are.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when no installed package has the type.
+        """
+        kind, _ = self.topics[topic]
+        changed = changed_type(self._definitions[topic], kind)
+        return f"{topic} was recorded with other fields of {changed} than the installed ones" if changed else ""
 
     def records(self, topics: Sequence[str] | None = None, start_s: float = 0.0) -> Iterator[Record]:
         """Messages in the order in which they were received.

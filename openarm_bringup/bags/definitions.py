@@ -6,9 +6,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
+
+from openarm_bringup.bags.mcap import DAMAGE
 from openarm_bringup.messages import SEQUENCE, interface
 
 _LINE = "=" * 80
+#: Definitions that are longer are not parsed, characters.
+_LONGEST = 200_000
 _PRIMITIVES = {"float": "float32", "double": "float64", "boolean": "bool", "octet": "byte"}
 
 
@@ -66,3 +72,25 @@ def full_definition(message: type[Any]) -> str:
         parts.append(f"{_LINE}\nMSG: {name.replace('/msg/', '/')}\n{definition(kind)}")
         waiting += nested_types(kind)
     return "".join(parts)
+
+
+def changed_type(recorded: MessageDefinition, kind: str) -> str:
+    """Return the first type whose fields are not those of the installed one; empty where all are, or none is known.
+
+    Constants are left out of it: they are not in the bytes of a message.
+
+    Args:
+        recorded: As it is in a bag.
+        kind: Of the messages, such as `sensor_msgs/msg/Image`; installed.
+    """
+    if len(recorded.data) > _LONGEST:
+        return kind
+    if recorded.format is MessageDefinitionFormat.NONE or not recorded.data.strip():
+        return ""
+    msg = recorded.format is MessageDefinitionFormat.MSG
+    try:
+        theirs = get_types_from_msg(recorded.data, kind) if msg else get_types_from_idl(recorded.data)
+    except (TypesysError, *DAMAGE):
+        return kind
+    ours = get_types_from_msg(full_definition(interface(kind)), kind)
+    return next((name for name, (_, fields) in ours.items() if theirs.get(name, ((), ()))[1] != fields), "")

@@ -129,12 +129,13 @@ def replay(
                 player.wait_idle(1.0, 60.0)
         mended = f"; it was cut short: {opened.mended} bytes at its end were not whole" if opened.mended else ""
     data = {"bag": str(bag), "messages": player.published, "late_ms": player.late_ms}
-    data |= {"unknown_types": player.unknown, "left_to_graph": player.left}
+    data |= {"unknown_types": player.unknown, "changed_types": player.changed, "left_to_graph": player.left}
     if stop.is_set():
         return Outcome(False, f"stopped after {player.published} messages", Code.CANCELLED, data)
     if player.published == 0:
         return Outcome(False, f"nothing to replay in {bag}{mended}", Code.NOTHING_DETECTED, data)
     left = f"; left to the graph, which makes them itself: {', '.join(player.left)}" if player.left else ""
+    left += f"; left out: {'; '.join(player.changed)}" if player.changed else ""
     left += f"; not installed, left out: {', '.join(player.unknown)}" if player.unknown else ""
     return Outcome(True, f"{player.published} messages of {bag}{mended}{left}", data=data)
 

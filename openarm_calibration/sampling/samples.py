@@ -380,7 +380,7 @@ def _sample(entry: dict[str, Any], arrays: Mapping[str, NDArray[Any]], samples: 
         raise ValueError(f"sample {name} has {len(ids)} ids and pixels {pixels.shape}; expected 4 or more, all finite")
     if len(np.unique(ids)) != len(ids) or ids.min() < 0 or ids.max() >= len(samples.board.points):
         raise ValueError(f"sample {name} has marks that its board does not have, or twice")
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+    if pose.shape != (4, 4) or not se3.is_pose(pose):
         raise ValueError(f"sample {name} has a pose {pose.shape} that is none")
     joints = _joints(entry["joints"])
     missing = [joint for joint in samples.joint_names if joint not in joints]

@@ -13,6 +13,8 @@ import threading
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from pydantic import Field
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
@@ -49,6 +51,19 @@ def test_parameters_come_from_the_model_and_take_overrides(ros) -> None:
 def test_a_wrong_parameter_is_named_with_its_value(ros) -> None:
     with pytest.raises(OpenArmError, match=r"/example:rate: .*greater than 0.*got -1"):
         BaseNode("example", _Example, parameter_overrides=[Parameter("rate", value=-1.0)])
+
+
+def test_a_value_of_an_unknown_type_is_refused_and_the_node_goes_on(ros) -> None:
+    """It ends rclpy's own service, and with it the process."""
+    ros.add(BaseNode("example", _Example))
+    client = ros.node.create_client(SetParameters, "/example/set_parameters")
+    value = ParameterMessage(name="rate")
+    value.value.type = 255
+    (answer,) = ros.call(client, SetParameters.Request(parameters=[value])).results
+    assert not answer.successful
+    assert answer.reason == "parameter 'rate' has a value of type 255, expected 0 .. 9"
+    atomic = ros.node.create_client(SetParametersAtomically, "/example/set_parameters_atomically")
+    assert not ros.call(atomic, SetParametersAtomically.Request(parameters=[value])).result.successful
 
 
 def test_diagnostics_are_published_each_second(ros) -> None:

@@ -177,3 +177,11 @@ def test_replay_refuses_what_makes_no_sense(ros, tmp_path: Path) -> None:
         with pytest.raises(OpenArmError, match=said):
             replay(tmp_path / "bag", **keywords)
     assert time.monotonic() - began < 5.0
+
+
+def test_a_topic_whose_type_has_changed_since_is_left_out_of_a_replay(ros) -> None:
+    with open_bag(Path(__file__).parents[1] / "data" / "demo_pick") as bag:
+        player = Player(bag, ["/grasp/status", "/robot_description"], {}, clock=True)
+        player.close()
+    (why,) = player.changed
+    assert why.startswith("/grasp/status was recorded with other fields of openarm_interfaces/msg/GraspStatus")

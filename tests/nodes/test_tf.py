@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import JointState
+from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.config import Config
@@ -50,11 +53,41 @@ def test_a_damaged_message_of_what_is_held_changes_nothing(ros) -> None:
     publisher.publish(marker("openarm_right_hand_tcp", 0.04))
     ros.spin_until(lambda: [box.name for box in listener.tracker.held] == ["right/red"], what="it is held")
     rejected: list[str] = []
-    listener._node.get_logger().warning = rejected.append
+    listener._node.get_logger().warning = lambda text, **_: rejected.append(text)
     publisher.publish(marker("openarm_right_hand_tcp", -1.0))
     ros.spin_until(lambda: rejected, what="the damaged message is named")
     assert "expected a cube with edges" in rejected[0]
     assert [box.link for box in listener.tracker.held] == ["openarm_right_hand_tcp"]
+
+
+def test_joint_states_and_transforms_of_wrong_form_are_counted_and_change_nothing(ros, monkeypatch) -> None:
+    monkeypatch.setattr(BaseNode, "REPORT_PERIOD_S", 0.1)
+    listener = RobotStateListener(ros.add(BaseNode("eye", Config)), RobotDescription.load())
+    joints = ros.node.create_publisher(JointState, "/joint_states", reliable(100))
+    edges = ros.node.create_publisher(TFMessage, "/tf_static", QOS_LATCHED)
+    reports: list[DiagnosticArray] = []
+    ros.node.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 10)
+    ros.spin_until(joints.get_subscription_count, what="the eye listens")
+    good = JointState(name=["a", "b"], position=[0.1, 0.2])
+    good.header.stamp = ns_to_stamp(5)
+    for wrong in ([0.1], [0.1, 0.2, 0.3], [0.1, float("nan")], [1e308, 1e308]):
+        joints.publish(JointState(name=["a", "b"], position=wrong))
+    joints.publish(JointState(name=["a", "a"], position=[0.1, 0.2]))
+    joints.publish(JointState(name=["a"], position=[0.1], effort=[1.0, 2.0]))
+    joints.publish(good)
+    bad, sound = TransformStamped(child_frame_id="eye_link"), TransformStamped(child_frame_id="table")
+    bad.transform.rotation.w = 0.0
+    sound.header.frame_id, sound.transform.translation.z = "openarm_body_link0", 0.3
+    edges.publish(TFMessage(transforms=[bad, sound]))
+
+    def counts() -> dict[str, str]:
+        return {v.key: v.value for v in reports[-1].status[0].values} if reports else {}
+
+    ros.spin_until(lambda: counts().get("refused//tf_static"), what="the transform is reported")
+    ros.spin_until(lambda: counts().get("refused//joint_states") == "6", what="six joint states are reported")
+    ros.spin_until(lambda: listener.buffer._states, what="the good one")
+    assert listener.buffer.latest() == (5, {"a": 0.1, "b": 0.2})
+    assert list(listener.buffer._static) == ["table"]
 
 
 def test_joint_states_are_subscribed_to_while_any_user_wants_them(ros) -> None:

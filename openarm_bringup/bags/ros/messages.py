@@ -27,6 +27,10 @@ def message_of(bag: Bag, record: Record) -> Any:
         raise
     # rclpy raises types of its own, and those of the middleware's parser
     except Exception as error:
+        if why := bag.why_not(record.topic):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT, f"{bag.path}: {why}; read it with the version that made it"
+            ) from error
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
             f"{bag.path} has a message of {record.topic} at {record.t_ns} ns that is no {record.type}"

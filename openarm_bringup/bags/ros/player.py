@@ -47,6 +47,7 @@ class Player(ContextNode):
     Attributes:
         published: Messages so far.
         unknown: Types that no installed package has.
+        changed: Why topics are left out whose type has other fields now: subscribers would misread the bytes.
         left: Topics that the graph publishes itself, and that are left to it.
         late_ms: The most that a message was published after its time.
     """
@@ -61,6 +62,7 @@ class Player(ContextNode):
         with profiled(profile):
             super().__init__("openarm_player")
         self._publishers: dict[str, Publisher] = {}
+        self.changed: list[str] = []
         missing: set[str] = set()
         for topic, (kind, qos) in bag.topics.items():
             if topics is not None and topic not in topics:
@@ -69,6 +71,9 @@ class Player(ContextNode):
                 message = interface(kind)
             except OpenArmError:
                 missing.add(kind)
+                continue
+            if why := bag.why_not(topic):
+                self.changed.append(why)
                 continue
             self._publishers[topic] = self._node.create_publisher(message, names.get(topic, topic), to_profile(qos))
         self.unknown = sorted(missing)

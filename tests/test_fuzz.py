@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small part of what `python -m benchmarks.fuzz` does at length."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
+from openarm_interfaces.msg import CollisionObject
+from sensor_msgs.msg import CameraInfo, Image, JointState, PointCloud2
+from tf2_msgs.msg import TFMessage
+from trajectory_msgs.msg import JointTrajectory
+from vision_msgs.msg import Detection3DArray
+from visualization_msgs.msg import MarkerArray
+
+from benchmarks.fuzz.files import KINDS, read_altered
+from benchmarks.fuzz.hostile import hostile, plausible
+from benchmarks.fuzz.judge import Tally
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros import convert
+from openarm_common.ros.detections import detections_from_msg
+from openarm_motion.ros import convert as motion
+
+
+@pytest.mark.requirement("R-22")
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "contents"])
+def test_altered_files_are_read_or_refused_in_a_sentence(kind: str) -> None:
+    tally = read_altered(kind, 60, 11)
+    assert not tally.raw, tally.raw
+    assert not tally.hangs
+    assert tally.accepted
+    assert tally.refused > 10
+
+
+def _edges(message: TFMessage) -> None:
+    for edge in message.transforms:
+        convert.transform_to_matrix(edge.transform)
+
+
+def _solid(message: CollisionObject) -> None:
+    motion.solid_from_msg(message, lambda T, _: T)
+
+
+#: Where messages become data of the cores.
+_DOORS: list[tuple[type[Any], Callable[[Any], object]]] = [
+    (JointState, convert.joints_from_msg),
+    (TFMessage, _edges),
+    (Image, convert.rgb_image),
+    (Image, convert.depth_image),
+    (CameraInfo, convert.intrinsics_from_info),
+    (PointCloud2, convert.points_from_cloud),
+    (JointTrajectory, convert.trajectory_from_msg),
+    (MarkerArray, convert.held_from_msg),
+    (Detection3DArray, detections_from_msg),
+    (CollisionObject, _solid),
+    (PlanApproach.Goal, motion.approach_request),
+    (MoveArm.Goal, motion.move_request),
+    (MoveArms.Goal, motion.move_arms_request),
+    (ExecuteTrajectory.Goal, motion.execute_request),
+]
+
+
+@pytest.mark.requirement("R-22")
+def test_hostile_messages_become_data_or_are_refused() -> None:
+    rng, refused = random.Random(3), 0
+    for kind, read in _DOORS:
+        for _ in range(40):
+            message = hostile(plausible(kind, rng), rng)
+            try:
+                read(message)
+            except OpenArmError:
+                refused += 1
+    assert refused > 200
+
+
+def test_what_is_no_sentence_is_counted_as_a_raw_error() -> None:
+    tally = Tally("test")
+
+    def refuse(text: str) -> None:
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
+
+    for work in (lambda: None, lambda: refuse("no"), lambda: refuse("one\ntwo"), lambda: [][0]):
+        tally.take(work)
+    assert (tally.inputs, tally.accepted, tally.refused, tally.raw.total()) == (4, 1, 2, 2)
