@@ -130,10 +130,10 @@ class RosProbe:
         self.spin_until(client.service_is_ready, timeout, f"service {client.srv_name} is there")
         return self.result(client.call_async(request), timeout, f"an answer of {client.srv_name}")
 
-    def send_goal(self, client, goal, timeout: float = 10.0, feedback_callback=None):
+    def send_goal(self, client, goal, timeout: float = 10.0, **kwargs):
         """Send an action goal and return (goal handle, result future or, when it was rejected, None)."""
         self.spin_until(client.server_is_ready, timeout, "the action server is there")
-        handle = self.result(client.send_goal_async(goal, feedback_callback=feedback_callback), timeout, "goal answer")
+        handle = self.result(client.send_goal_async(goal, **kwargs), timeout, "goal answer")
         return handle, handle.get_result_async() if handle.accepted else None
 
     def hear_all(self, client, goal, heard: list, last: Callable[[], object], timeout: float = 10.0):

@@ -37,6 +37,7 @@ FROM_WHEELS = {
     "std_msgs",
     "std_srvs",
     "trajectory_msgs",
+    "unique_identifier_msgs",
     "visualization_msgs",
 }
 FROM_INTERFACES = {path.parent.name for path in (ROOT / "interfaces").glob("*/package.xml")}

@@ -16,6 +16,7 @@ from typing import Any
 from rclpy.action import ActionClient
 from rclpy.subscription import Subscription
 from rclpy.task import Future
+from unique_identifier_msgs.msg import UUID
 from vision_msgs.msg import Detection3DArray
 
 from openarm_common.errors import Code, OpenArmError
@@ -155,7 +156,13 @@ class GraphClients:
             await self.tick()
 
     async def goal(
-        self, client: ActionClient, goal: object, limit: float, what: str, guard: Callable[[], None] | None = None
+        self,
+        client: ActionClient,
+        goal: object,
+        limit: float,
+        what: str,
+        guard: Callable[[], None] | None = None,
+        goal_id: UUID | None = None,
     ) -> Any:
         """Send a goal and return its result message; whatever ends the wait early cancels the goal.
 
@@ -169,7 +176,7 @@ class GraphClients:
             if error.code is Code.TIMEOUT:
                 raise OpenArmError(Code.NOT_READY, f"{what}: its action server is not there") from error
             raise
-        sent = client.send_goal_async(goal)
+        sent = client.send_goal_async(goal, goal_uuid=goal_id)
         try:
             await self.until(sent.done, limits.answer_timeout, f"{what}: acceptance of the goal")
         except OpenArmError:

@@ -18,6 +18,7 @@ from rclpy.task import Future
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.ros.holds import Holder
 from openarm_common.ros.node import BASE_FRAME, BaseNode
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
@@ -40,6 +41,7 @@ class GraphRobot:
         self._node = node
         self._config = config
         self._nodes = GraphClients(node, config)
+        self._holder = Holder(node)
         self._plan = ActionClient(node, PlanApproach, "/motion/plan_approach")
         self._execute = ActionClient(node, ExecuteTrajectory, "/motion/execute")
         self._move = ActionClient(node, MoveArm, "/motion/move")
@@ -60,16 +62,22 @@ class GraphRobot:
         return robot
 
     # --- begin, end, cancel
-    async def begin(self, *, moves: bool) -> None:
+    async def begin(self, what: str, *, moves: bool) -> None:
         """Listen to the robot and wait until every node that a grasp needs is there.
+
+        Args:
+            what: That begins, for other clients of the arms that it will move.
+            moves: It will move arms.
 
         Raises:
             OpenArmError: NOT_READY, naming what is missing; CANCELLED.
         """
+        self._holder.name = f"the grasp node ({what})"
         await self._nodes.begin(lambda: self._missing(moves))
 
     def end(self) -> None:
-        """Stop listening."""
+        """Stop listening, and leave the arms to others."""
+        self._holder.release()
         self._nodes.end()
 
     def follow_table(self, on_height: Callable[[float], None]) -> None:
@@ -229,18 +237,19 @@ class GraphRobot:
     ) -> None:
         """Ask /motion/execute."""
         goal = ExecuteTrajectory.Goal(arm=arm, trajectory=trajectory, max_start_delay=self.max_start_delay)
-        await self._moved(self._execute, goal, what, guard)
+        await self._moved(arm, self._execute, goal, what, guard)
 
     async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = ()) -> None:
         """Ask /motion/move."""
         goal = messages.move_goal(arm, to, obstacles, self._config.velocity_scale, self.max_start_delay)
-        await self._moved(self._move, goal, what)
+        await self._moved(arm, self._move, goal, what)
 
     async def _moved(
-        self, client: ActionClient, goal: object, what: str, guard: Callable[[], None] | None = None
+        self, arm: str, client: ActionClient, goal: object, what: str, guard: Callable[[], None] | None = None
     ) -> None:
+        self._holder.hold(arm)
         limit = self._config.limits.move_timeout + self.max_start_delay
-        result = await self._nodes.goal(client, goal, limit, what, self._watched(guard))
+        result = await self._nodes.goal(client, goal, limit, what, self._watched(guard), self._holder.goal_id())
         if not result.success:
             code = messages.code_from_text(result.code, Code.EXECUTION_FAILED)
             raise OpenArmError(code, f"{what}: {result.message or 'failed'}")
@@ -248,6 +257,7 @@ class GraphRobot:
     async def grip(self, arm: str, joint: str, position: float, what: str, effort: float = 0.0) -> bool:
         """Ask the gripper's controller."""
         goal = messages.gripper_goal(self._config.gripper_action, joint, position, effort)
-        limit = self._config.limits.gripper_timeout
-        result = await self._nodes.goal(self._grippers[arm], goal, limit, what, self._watched(None))
+        self._holder.hold(arm)
+        limit, goal_id = self._config.limits.gripper_timeout, self._holder.goal_id()
+        result = await self._nodes.goal(self._grippers[arm], goal, limit, what, self._watched(None), goal_id)
         return bool(result.stalled or result.reached_goal)

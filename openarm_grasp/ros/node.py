@@ -188,7 +188,7 @@ class GraspNode(BaseNode[GraspConfig]):
             raise OpenArmError(Code.BUSY, f"{self._running} is running; cancel it or wait until it has ended")
         self._running = what
         try:
-            await self._robot.begin(moves=moves)
+            await self._robot.begin(what, moves=moves)
             return await work()
         finally:
             self._robot.end()

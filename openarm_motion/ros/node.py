@@ -21,6 +21,7 @@ from visualization_msgs.msg import MarkerArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.distance_field import DistanceFieldReader, field_path
 from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix
+from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
 from openarm_motion.config import MotionConfig
@@ -28,11 +29,20 @@ from openarm_motion.ros import convert
 from openarm_motion.ros.robot import NodeRobot
 from openarm_motion.service.faults import PlanFaults
 from openarm_motion.service.motion_service import MotionService, Report, make_arms, table_box
-from openarm_motion.service.requests import ApproachAnswer, MotionAnswer, MoveAnswer, MoveArmsAnswer
+from openarm_motion.service.requests import (
+    ApproachAnswer,
+    ExecuteRequest,
+    MotionAnswer,
+    MoveAnswer,
+    MoveArmsAnswer,
+    MoveArmsRequest,
+    MoveRequest,
+)
 from openarm_motion.timing.trajectory import Trajectory
 
 AnswerT = TypeVar("AnswerT", bound=MotionAnswer)
 RequestT = TypeVar("RequestT")
+MovingT = TypeVar("MovingT", ExecuteRequest, MoveRequest, MoveArmsRequest)
 
 #: Pace of feedback while planning, s.
 _FEEDBACK = 0.1
@@ -46,7 +56,8 @@ class MotionNode(BaseNode[MotionConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("motion", MotionConfig, **kwargs)
         config = self.config
-        self.robot = NodeRobot(self, config)
+        self._holds = HoldListener(self)
+        self.robot = NodeRobot(self, config, self._holds)
         self._table = load_scene(config.scene).table if config.scene else None
         arms = make_arms(config, self.description, [table_box(self._table)] if self._table else [])
         field = DistanceFieldReader(field_path(config.map.name or str(self.context.get_domain_id())))
@@ -110,7 +121,9 @@ class MotionNode(BaseNode[MotionConfig]):
 
     async def _on_move(self, handle: ServerGoalHandle) -> MoveArm.Result:
         report = _reporter(handle, MoveArm.Feedback())
-        answer = await _answered(MoveAnswer, handle, convert.move_request, self.service.move, report)
+        answer = await _answered(
+            MoveAnswer, handle, self._of_holder(handle, convert.move_request), self.service.move, report
+        )
         result = MoveArm.Result(start_delay=answer.start_delay)
         if answer.trajectory is not None:
             result.trajectory = convert.trajectory_msg(answer.trajectory)
@@ -118,7 +131,9 @@ class MotionNode(BaseNode[MotionConfig]):
 
     async def _on_move_arms(self, handle: ServerGoalHandle) -> MoveArms.Result:
         report = _reporter(handle, MoveArms.Feedback())
-        answer = await _answered(MoveArmsAnswer, handle, convert.move_arms_request, self.service.move_arms, report)
+        answer = await _answered(
+            MoveArmsAnswer, handle, self._of_holder(handle, convert.move_arms_request), self.service.move_arms, report
+        )
         result = MoveArms.Result()
         if answer.plan is not None:
             result.start_delays, result.clearance = list(answer.plan.start_delays), answer.plan.clearance
@@ -127,8 +142,22 @@ class MotionNode(BaseNode[MotionConfig]):
 
     async def _on_execute(self, handle: ServerGoalHandle) -> ExecuteTrajectory.Result:
         report = _reporter(handle, ExecuteTrajectory.Feedback())
-        answer = await _answered(MotionAnswer, handle, convert.execute_request, self.service.execute, report)
+        answer = await _answered(
+            MotionAnswer, handle, self._of_holder(handle, convert.execute_request), self.service.execute, report
+        )
         return _end(handle, ExecuteTrajectory.Result(start_delay=answer.start_delay), answer)
+
+    def _of_holder(self, handle: ServerGoalHandle, convert_goal: Callable[[Any], MovingT]) -> Callable[[Any], MovingT]:
+        """The conversion of a goal, which refuses one that would move an arm that another client holds."""
+
+        def convert_held(message: Any) -> MovingT:
+            request = convert_goal(message)
+            if not getattr(request, "plan_only", False):
+                for arm in [t.arm for t in request.targets] if isinstance(request, MoveArmsRequest) else [request.arm]:
+                    self._holds.check(arm, bytes(handle.goal_id.uuid))
+            return request
+
+        return convert_held
 
     # --- services
     def _on_ik(self, request: ComputeIK.Request, response: ComputeIK.Response) -> ComputeIK.Response:

@@ -5,15 +5,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionClient
 from rclpy.task import Future, Task
+from unique_identifier_msgs.msg import UUID
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import ns_to_stamp, trajectory_to_msg
+from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
 from openarm_motion.config import MotionConfig
@@ -39,12 +42,15 @@ class NodeRobot:
     Args:
         node: Owns clients, timer, executor and threads.
         config: Parameters.
+        holds: Which client each arm serves.
     """
 
-    def __init__(self, node: BaseNode[Any], config: MotionConfig) -> None:
+    def __init__(self, node: BaseNode[Any], config: MotionConfig, holds: HoldListener) -> None:
         self._node = node
         self.listener = RobotStateListener(node, node.description)
-        self._controllers = {arm: Controller(node, config.controller.format(arm=arm)) for arm in config.arms}
+        self._controllers = {
+            arm: Controller(node, config.controller.format(arm=arm), partial(holds.goal_id, arm)) for arm in config.arms
+        }
         self._waiting, self._wake = 0, Future(executor=node.executor)
         self._timer = node.create_timer(_PERIOD, self._on_timer, clock=node.steady_clock)
         self._timer.cancel()
@@ -103,10 +109,12 @@ class Controller:
     Args:
         node: Owns the client.
         name: Of the action.
+        goal_id: Makes the id of a goal.
     """
 
-    def __init__(self, node: BaseNode[Any], name: str) -> None:
+    def __init__(self, node: BaseNode[Any], name: str, goal_id: Callable[[], UUID]) -> None:
         self.name = name
+        self._goal_id = goal_id
         self._client = ActionClient(node, FollowJointTrajectory, name)
 
     def ready(self) -> bool:
@@ -117,7 +125,8 @@ class Controller:
         """Send a trajectory; its stamp is where it begins."""
         message = trajectory_to_msg(motion.names, motion.t, motion.q, motion.v, motion.a)
         message.header.stamp = ns_to_stamp(begin_ns)
-        return _Goal(self._client.send_goal_async(FollowJointTrajectory.Goal(trajectory=message)))
+        goal = FollowJointTrajectory.Goal(trajectory=message)
+        return _Goal(self._client.send_goal_async(goal, goal_uuid=self._goal_id()))
 
 
 class _Goal:

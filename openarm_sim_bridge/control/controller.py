@@ -102,6 +102,11 @@ class RobotController:
             known[name] = float(position)
         return PositionCommand(known, tuple(name for name in names if name not in self._limits))
 
+    def sides(self, command: PositionCommand) -> tuple[str, ...]:
+        """Return the sides whose arm or gripper a command moves."""
+        followers = (*self.arms.items(), *self.grippers.items())
+        return tuple({side: None for side, f in followers if not command.positions.keys().isdisjoint(f.group.names)})
+
     def busy(self, command: PositionCommand) -> tuple[str, ...]:
         """Return the joints of a command that are ignored because their arm or gripper follows a goal."""
         return tuple(name for f, _ in self._followers if f.busy for name in f.group.names if name in command.positions)

@@ -25,6 +25,7 @@ class ControllerServer(ABC, Generic[OutcomeT]):
     Args:
         node: Owner.
         simulation: Whose thread runs the controller.
+        check: Refuses a goal, by its id, while another client holds the arm.
         label: Names arm or gripper in the log.
         kind: Type of the action.
         name: Absolute name of the action.
@@ -35,6 +36,7 @@ class ControllerServer(ABC, Generic[OutcomeT]):
         self,
         node: BaseNode[Any],
         simulation: Simulation,
+        check: Callable[[bytes], None],
         label: str,
         kind: type,
         name: str,
@@ -42,6 +44,7 @@ class ControllerServer(ABC, Generic[OutcomeT]):
     ) -> None:
         self._node = node
         self._simulation = simulation
+        self._check = check
         self._label = label
         self._cancel = cancel
         self._server = ActionServer(
@@ -71,8 +74,10 @@ class ControllerServer(ABC, Generic[OutcomeT]):
             start: Starts it; is given the function that takes the outcome.
 
         Raises:
-            OpenArmError: What `start` raised; CANCELLED, when the simulation shuts down.
+            OpenArmError: BUSY, when another client holds the arm; what `start` raised; CANCELLED, when the simulation
+                shuts down.
         """
+        self._check(bytes(handle.goal_id.uuid))
         ended: ThreadFuture[OutcomeT] = ThreadFuture()
         started = self._simulation.call(lambda: start(ended.set_result))
         if handle.is_cancel_requested:

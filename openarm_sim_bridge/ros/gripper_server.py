@@ -44,18 +44,25 @@ class GripperServer(ControllerServer[GripperOutcome]):
         side: left or right.
         gripper: Its controller.
         simulation: Whose thread runs the controller.
+        check: Refuses a goal, by its id, while another client holds the arm.
         action: parallel (ParallelGripperCommand) or classic (GripperCommand).
     """
 
     def __init__(
-        self, node: BaseNode[Any], side: str, gripper: GripperFollower, simulation: Simulation, action: GripperAction
+        self,
+        node: BaseNode[Any],
+        side: str,
+        gripper: GripperFollower,
+        simulation: Simulation,
+        check: Callable[[bytes], None],
+        action: GripperAction,
     ) -> None:
         self._gripper = gripper
         self._type = _TYPES[action]
         self._joint = gripper.group.names[0]
         self._column = simulation.world.joint_names.index(self._joint)
         name = f"/{side}_gripper_controller/gripper_cmd"
-        super().__init__(node, simulation, f"{side} gripper", self._type.action, name, gripper.cancel)
+        super().__init__(node, simulation, check, f"{side} gripper", self._type.action, name, gripper.cancel)
 
     def _on_goal(self, request: Any) -> GoalResponse:
         try:

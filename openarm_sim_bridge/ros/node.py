@@ -13,6 +13,7 @@ import os
 import sys
 import traceback
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from std_srvs.srv import Trigger
 from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
+from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import QOS_COMMAND, BaseNode, reliable, run
 from openarm_common.scene.scene import load_scene
 from openarm_sim_bridge.cameras.camera_feed import CameraFeed
@@ -84,9 +86,15 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
 
         self.create_subscription(JointState, "/joint_commands", self._on_command, QOS_COMMAND)
-        self._arms = [TrajectoryServer(self, side, arm, self._simulation) for side, arm in controller.arms.items()]
+        self._holds = HoldListener(self)
+        self._arms = [
+            TrajectoryServer(self, side, arm, self._simulation, partial(self._holds.check, side))
+            for side, arm in controller.arms.items()
+        ]
         self._grippers = [
-            GripperServer(self, side, gripper, self._simulation, config.gripper_action)
+            GripperServer(
+                self, side, gripper, self._simulation, partial(self._holds.check, side), config.gripper_action
+            )
             for side, gripper in controller.grippers.items()
         ]
         self.create_service(Trigger, "/stop", self._on_stop)
@@ -143,6 +151,8 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         try:
             self._simulation.check_able()
             command = self._controller.check_command(message.name, message.position)
+            for side in self._controller.sides(command):
+                self._holds.check(side)
         except OpenArmError as error:
             logger.error(f"/joint_commands refused: {error}", throttle_duration_sec=1.0)
             return
@@ -231,6 +241,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             joint_state_period_max_ms=f"{period.max_ms:.2f}",
             scheduling=self._scheduling,
             commands_per_s=commands,
+            refused_of_held_arms=self._holds.refused,
             wall_time_skipped_s=f"{simulation.skipped_s:.2f}",
             faults_active=" ".join(self._faults.active),
             frames_dropped=images.dropped if images is not None else 0,

@@ -36,9 +36,17 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         side: left or right.
         arm: Its controller.
         simulation: Whose thread runs the controller.
+        check: Refuses a goal, by its id, while another client holds the arm.
     """
 
-    def __init__(self, node: BaseNode[Any], side: str, arm: TrajectoryFollower, simulation: Simulation) -> None:
+    def __init__(
+        self,
+        node: BaseNode[Any],
+        side: str,
+        arm: TrajectoryFollower,
+        simulation: Simulation,
+        check: Callable[[bytes], None],
+    ) -> None:
         self._arm = arm
         self._running: ServerGoalHandle | None = None
         self._columns = [simulation.world.joint_names.index(name) for name in arm.group.names]
@@ -49,6 +57,7 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         super().__init__(
             node,
             simulation,
+            check,
             f"{side} arm",
             FollowJointTrajectory,
             f"{controller}/follow_joint_trajectory",
@@ -62,6 +71,7 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
     async def _on_trajectory(self, message: JointTrajectory) -> None:
         """Follow a trajectory that comes as a message; a refusal goes to the log."""
         try:
+            self._check(b"")
             trajectory = self._arm.check(_trajectory_of(FollowJointTrajectory.Goal(trajectory=message)))
             await self._node.awaitable(self._simulation.call(lambda: self._start(trajectory, self._on_end)))
         except OpenArmError as error:

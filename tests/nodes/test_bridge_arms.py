@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
@@ -10,10 +12,12 @@ from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
+from unique_identifier_msgs.msg import UUID
 
 from openarm_common.ros.convert import (
     stamp_to_ns,
 )
+from openarm_common.ros.holds import Holder
 from openarm_common.ros.node import QOS_COMMAND
 
 
@@ -170,3 +174,33 @@ def test_bad_position_commands_are_refused_as_a_whole(bench, bad: float) -> None
     publisher.publish(JointState(name=["openarm_right_joint4", "openarm_right_joint1"], position=[1.5, bad]))
     bench.spin_sim(0.5)
     assert bench.position("openarm_right_joint4") == pytest.approx(bench.HOME[3], abs=0.01)
+
+
+@pytest.mark.requirement("P-21")
+def test_a_held_arm_and_its_hand_follow_their_holder_alone(bench) -> None:
+    holder = Holder(bench.node)
+    holder.name = "the grasp node (a grasp of 'red')"
+    commands = bench.ros.node.create_publisher(JointState, "/joint_commands", QOS_COMMAND)
+    bench.ros.spin_until(commands.get_subscription_count, 20.0, "the bridge")
+
+    def ask(arm: str, goal_id: UUID | None = None) -> tuple[int, str]:
+        holder.hold(arm)
+        bench.ros.spin_until(lambda: bench.node._holds._holds.key_of(arm, time.monotonic()), 20.0, "the hold")
+        result = bench.ros.result(bench.follow(bench.goal((1.0, bench.NEAR_HOME)), goal_uuid=goal_id)[1], 20.0).result
+        return result.error_code, result.error_string
+
+    code, text = ask("right")
+    assert code == Result.INVALID_GOAL
+    assert text.startswith("BUSY: the right arm is held by the grasp node (a grasp of 'red')")
+    before, refused = bench.arm.copy(), bench.node._holds.refused
+    commands.publish(JointState(name=[bench.ARM[3], bench.FINGER], position=[1.5, 0.02]))
+    bench.ros.spin_until(lambda: bench.node._holds.refused > refused, 20.0, "the command")
+    assert bench.grip(0.02).status == GoalStatus.STATUS_ABORTED
+    bench.spin_sim(0.3)
+    np.testing.assert_allclose(bench.arm, before, atol=0.005)
+    assert bench.position(bench.FINGER) < 0.005
+
+    assert ask("right", holder.goal_id())[0] == Result.SUCCESSFUL
+    holder.release()
+    bench.ros.spin_until(lambda: not bench.node._holds._holds.key_of("right", time.monotonic()), 20.0, "the release")
+    assert bench.grip(0.02).status == GoalStatus.STATUS_SUCCEEDED

@@ -52,6 +52,7 @@ class FakeGraph(Node):
         slips: Closes that get nothing.
         scene: Version of the planning scene.
         executed: Trajectories.
+        goal_ids: Of motions.
         silent: No joint states any more.
     """
 
@@ -71,6 +72,7 @@ class FakeGraph(Node):
         self.log: list[str] = []
         self.asked: list[tuple[str, str, float]] = []
         self.cancelled: list[str] = []
+        self.goal_ids: list[bytes] = []
         self._waiting: dict[bytes, Future] = {}
         self.efforts: dict[str, float] = {}
         self.q: dict[str, float] = {}
@@ -208,6 +210,7 @@ class FakeGraph(Node):
 
     async def _interrupted(self, goal, what: str) -> bool:
         self.log.append(what)
+        self.goal_ids.append(bytes(goal.goal_id.uuid))
         self.asked.append((goal.request.arm, what, goal.request.max_start_delay))
         waiting = self.during(what)
         if waiting is not None:

@@ -41,6 +41,9 @@ def test_a_grasp_by_service_places_the_object_and_publishes_its_states(bench):
 @pytest.mark.requirement("B-51", "B-53", "B-71")
 def test_order_of_hand_and_arm(bench):
     near: list[int] = []
+    holds: list[DiagnosticStatus] = []
+    bench.ros.node.create_subscription(DiagnosticStatus, "/arm_holds", holds.append, 10)
+    bench.until(lambda: bench.ros.node.count_publishers("/arm_holds"), 20.0, "the holder")
     bench.world.during = lambda _: near.append(bench.world.count_subscribers("/wrist/detections_3d"))
     assert bench.ask().success
     assert near[:2] == [1, 0]  # the detector of the camera on the hand wakes during the motion to the pre-grasp
@@ -56,6 +59,10 @@ def test_order_of_hand_and_arm(bench):
         "execute",  # leave
         "move home",
     ]
+    bench.until(lambda: holds and not holds[-1].values, 20.0, "the arm is left to others")
+    assert {hold.name for hold in holds} == {"the grasp node (a grasp of 'red')"}
+    assert {tuple(value.key for value in hold.values) for hold in holds} == {("right",), ()}
+    assert {goal_id[:8].hex() for goal_id in bench.world.goal_ids} == {holds[0].hardware_id}
 
 
 @pytest.mark.requirement("P-01")

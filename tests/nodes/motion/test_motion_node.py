@@ -9,8 +9,8 @@ import time
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, Vector3
-from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
-from openarm_interfaces.msg import ApproachTarget, CollisionBox
+from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
+from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox
 from openarm_interfaces.srv import ComputeIK
 from rclpy.parameter import Parameter
 
@@ -19,6 +19,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import (
     matrix_to_pose,
 )
+from openarm_common.ros.holds import Holder
 from openarm_common.scene.scene import load_scene
 from openarm_motion.planning.planner import PlannedPath, PlanQuery
 from openarm_motion.service.motion_service import table_box
@@ -290,3 +291,29 @@ def test_a_search_ends_with_the_node(bench) -> None:
     begin = time.monotonic()
     bench.node.close()
     assert time.monotonic() - begin < 1.0
+
+
+@pytest.mark.requirement("P-21")
+def test_an_arm_that_a_client_holds_moves_for_that_client_alone_and_its_controller_sees_whose_goal_it_is(bench) -> None:
+    holder = Holder(bench.node)
+    holder.name = "the grasp node (a grasp of 'red')"
+    holder.hold("right")
+    key = bytes(holder.goal_id().uuid[:8])
+    bench.ros.spin_until(lambda: bytes(bench.node._holds.goal_id("right").uuid[:8]) == key, 20.0, "the hold")
+    for client, goal in (
+        (bench.move_client, bench.named("right")),
+        (
+            bench.both_client,
+            MoveArms.Goal(
+                targets=[ArmTarget(arm=arm, kind=ArmTarget.NAMED, named="home") for arm in ("left", "right")]
+            ),
+        ),
+    ):
+        refused = bench.run(client, goal)
+        assert (refused.success, refused.code) == (False, "BUSY"), refused.message
+        assert refused.message.startswith("the right arm is held by the grasp node (a grasp of 'red')")
+    assert bench.run(bench.move_client, bench.named("right", plan_only=True)).success
+    assert bench.run(bench.move_client, bench.named("left", "home")).success
+    assert bench.run(bench.move_client, bench.named("right", "home"), goal_uuid=holder.goal_id()).success
+    assert bench.robot.goal_ids[-1][:8] == key
+    holder.release()
