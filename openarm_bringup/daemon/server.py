@@ -154,8 +154,10 @@ class Daemon:
             code = 1
             try:
                 code = cli.run(argv)
-            except Exception:
-                client.say("err", traceback.format_exc())
+            except Exception as error:
+                print(traceback.format_exc(), file=sys.__stderr__)  # the log of the daemon
+                what = type(error).__name__
+                client.say("err", f"INTERNAL: a defect of this command ({what}); `openarm logs daemon` shows where\n")
             client.say("exit", code)
 
 

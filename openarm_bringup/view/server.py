@@ -9,7 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
+from collections import defaultdict
 from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -40,6 +44,9 @@ _HEADERS = {
 }
 _MAX_PAGES = 8
 _MAX_BYTES = 4096
+#: Requests of one kind that are answered at the same time; each kind has threads of its own.
+_MOST_AT_ONCE = 2
+_LOG = logging.getLogger(__name__)
 
 
 class Order(Config):
@@ -62,7 +69,7 @@ class Reset(Config):
     """A reset of the simulation that a page asks for."""
 
     scene: str = Field(default="", max_length=64, pattern=r"^[A-Za-z0-9_]*$", description="empty = the present one")
-    seed: int = Field(default=0, ge=0, description="of a random scene")
+    seed: int = Field(default=0, ge=0, lt=2**63, description="of a random scene")
 
 
 class Wants(Config):
@@ -108,6 +115,8 @@ class ViewServer:
         self._pages: set[_Page] = set()
         self._kept: dict[str, Item] = {}
         self._picking: asyncio.Task[None] | None = None
+        self._threads = defaultdict[str, ThreadPoolExecutor](lambda: ThreadPoolExecutor(_MOST_AT_ONCE))
+        self._asked = defaultdict[str, int](int)
         self._files = {str(path.relative_to(PAGE)) for path in PAGE.rglob("*.*")} - {"index.html"}
 
     def app(self) -> web.Application:
@@ -118,8 +127,10 @@ class ViewServer:
         app.router.add_get("/socket", self._socket)
         app.router.add_post("/pick", self._pick)
         app.router.add_post("/confirm", self._confirm)
-        app.router.add_post("/cancel", self._cancel)
         app.router.add_post("/reset", self._reset)
+        for name, ask in (("cancel", self._view.cancel), ("stop", self._view.stop), ("release", self._view.release)):
+            app.router.add_post(f"/{name}", partial(self._urgent, name, ask))
+        app.on_cleanup.append(self._end_threads)
         app.router.add_get("/{name:.+}", self._file)
         return app
 
@@ -145,7 +156,14 @@ class ViewServer:
                 self.guard.check_token(request.query.get("token") or (bearer if scheme == "Bearer" else None))
         except OpenArmError as error:
             return web.json_response(_failed(error), status=403)
-        return await handler(request)
+        try:
+            return await handler(request)
+        except (web.HTTPException, asyncio.CancelledError):
+            raise
+        except Exception:
+            _LOG.exception("request %s", request.path)
+            fault = OpenArmError(Code.INTERNAL, "a defect of this server; its log has the traceback")
+            return web.json_response(_failed(fault), status=500)
 
     # --- layers
     async def _page(self, _: web.Request) -> web.FileResponse:
@@ -220,9 +238,12 @@ class ViewServer:
     async def _do_pick(self, order: Order) -> None:
         self._outcome(running=True, message="", label=order.label)
         try:
-            result = await asyncio.to_thread(self._view.pick, order)
+            result = await self._in_thread("pick", lambda: self._view.pick(order))
         except OpenArmError as error:
             result = _failed(error)
+        except Exception:  # else the page would wait for ever
+            _LOG.exception("pick")
+            result = _failed(OpenArmError(Code.INTERNAL, "a defect of this server; its log has the traceback"))
         self._outcome(running=False, **result)
 
     def _outcome(self, **values: Any) -> None:
@@ -230,14 +251,35 @@ class ViewServer:
 
     async def _confirm(self, request: web.Request) -> web.Response:
         answer = await _body(request, Confirmation)
-        return await _answer(lambda: self._view.confirm(answer))
+        return await self._answer("confirm", lambda: self._view.confirm(answer))
 
-    async def _cancel(self, _: web.Request) -> web.Response:
-        return await _answer(self._view.cancel)
+    async def _urgent(self, kind: str, ask: Callable[[], tuple[bool, str]], _: web.Request) -> web.Response:
+        return await self._answer(kind, ask)
 
     async def _reset(self, request: web.Request) -> web.Response:
         order = await _body(request, Reset)
-        return await _answer(lambda: self._view.reset(order))
+        return await self._answer("reset", lambda: self._view.reset(order))
+
+    async def _answer(self, kind: str, ask: Callable[[], tuple[bool, str]]) -> web.Response:
+        try:
+            success, message = await self._in_thread(kind, ask)
+        except OpenArmError as error:
+            return web.json_response(_failed(error), status=409 if error.code is Code.BUSY else 200)
+        return web.json_response({"success": success, "code": Code.OK if success else "REFUSED", "message": message})
+
+    async def _in_thread(self, kind: str, ask: Callable[[], Any]) -> Any:
+        """Ask the graph in a thread of this kind of request: no other kind can be before it."""
+        if self._asked[kind] >= _MOST_AT_ONCE:
+            text = f"{_MOST_AT_ONCE} requests /{kind} wait for their answer; wait until one has it"
+            raise OpenArmError(Code.BUSY, text)
+        self._asked[kind] += 1
+        asked = asyncio.get_running_loop().run_in_executor(self._threads[kind], ask)
+        asked.add_done_callback(lambda _: self._asked.update({kind: self._asked[kind] - 1}))
+        return await asyncio.shield(asked)
+
+    async def _end_threads(self, _: web.Application) -> None:
+        for threads in self._threads.values():
+            threads.shutdown(wait=False, cancel_futures=True)
 
 
 async def _add_headers(_: web.Request, response: web.StreamResponse) -> None:
@@ -252,14 +294,6 @@ async def _body(request: web.Request, model: type[Any]) -> Any:
     except ValidationError as error:
         fault = OpenArmError(Code.INVALID_ARGUMENT, describe_faults(error, request.path, model))
         raise web.HTTPBadRequest(text=json.dumps(_failed(fault)), content_type="application/json") from error
-
-
-async def _answer(ask: Callable[[], tuple[bool, str]]) -> web.Response:
-    try:
-        success, message = await asyncio.to_thread(ask)
-    except OpenArmError as error:
-        return web.json_response(_failed(error))
-    return web.json_response({"success": success, "code": Code.OK if success else "REFUSED", "message": message})
 
 
 def _failed(error: OpenArmError) -> dict[str, Any]:

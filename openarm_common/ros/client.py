@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import rclpy
 from action_msgs.msg import GoalStatus
@@ -110,11 +110,14 @@ class BackgroundNode(ContextNode):
         super().__init__(name, domain=domain)
         self._timeout = timeout
         self._clients: dict[str, Any] = {}
+        self._making = threading.Lock()
+        self._closing = threading.Event()
         self._thread = threading.Thread(target=self._spin, name=name, daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Stop the thread and leave the graph."""
+        self._closing.set()
         self._executor.shutdown(timeout_sec=2.0)
         self._thread.join(timeout=5.0)
         super().close()
@@ -123,7 +126,8 @@ class BackgroundNode(ContextNode):
         """Call a service and return its response.
 
         Raises:
-            OpenArmError: NOT_READY, when there is no server; TIMEOUT.
+            OpenArmError: NOT_READY, when there is no server; INVALID_ARGUMENT, when no message can hold the request;
+                TIMEOUT.
         """
         client = self._client(name, lambda: self._node.create_client(kind, name))
         if not client.wait_for_service(timeout_sec=self._timeout):
@@ -153,7 +157,8 @@ class BackgroundNode(ContextNode):
             meanwhile: Called again and again in the thread of the caller while the goal is active.
 
         Raises:
-            OpenArmError: NOT_READY, when there is no server, or it ends; BUSY, when the goal is refused; TIMEOUT.
+            OpenArmError: NOT_READY, when there is no server, or it ends; BUSY, when the goal is refused;
+                INVALID_ARGUMENT, when no message can hold the goal; TIMEOUT.
         """
         client: ActionClient = self._client(name, lambda: ActionClient(self._node, kind, name))
         if not client.wait_for_server(timeout_sec=self._timeout):
@@ -178,9 +183,10 @@ class BackgroundNode(ContextNode):
         return answer.result
 
     def _client(self, name: str, make: Callable[[], Any]) -> Any:
-        if name not in self._clients:
-            self._clients[name] = make()
-        return self._clients[name]
+        with self._making:
+            if name not in self._clients:
+                self._clients[name] = make()
+            return self._clients[name]
 
     def _begin(self, ask: Callable[..., Future], *args: Any) -> Future:
         """Send a request from the background thread; the returned future is done when the answer is there.
@@ -189,7 +195,10 @@ class BackgroundNode(ContextNode):
         """
 
         async def exchange() -> Any:
-            return await ask(*args)
+            try:
+                return await ask(*args)
+            except Exception as error:  # raised here it would end the thread
+                return _Unsent(error.__cause__ or error)
 
         return self._executor.create_task(exchange)
 
@@ -222,13 +231,33 @@ class BackgroundNode(ContextNode):
                 stopped = True
                 deadline = min(deadline, time.monotonic() + self._timeout)
                 cancel()
-        return future.result()
+        answer = future.result()
+        if isinstance(answer, _Unsent):
+            reason = str(answer.error).partition("\n")[0] or type(answer.error).__name__
+            text = (
+                f"{name} can't be asked that: {reason}; expected values that its type can hold (`ros2 interface show`)"
+            )
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
+        return answer
 
     def _spin(self) -> None:
-        try:
-            self._executor.spin()
-        except ExternalShutdownException:
-            self._node.get_logger().debug("the context was shut down")
+        """Handle what arrives until the end; one message that can't be handled does not keep others from it."""
+        while not self._closing.is_set():
+            try:
+                self._executor.spin()
+                return
+            except ExternalShutdownException:
+                self._node.get_logger().debug("the context was shut down")
+                return
+            except Exception as error:
+                self._node.get_logger().error(f"what arrived could not be handled, the rest goes on: {error!r}")
+                self._closing.wait(_CHECK_S)  # of an error that stays, a few lines a second
+
+
+class _Unsent(NamedTuple):
+    """In place of an answer: why a request was not sent, or its answer not read."""
+
+    error: BaseException
 
 
 def _guarded(on_feedback: Callable[[Any], None], trouble: list[Exception]) -> Callable[[Any], None]:

@@ -190,3 +190,45 @@ def test_without_a_graph_every_question_has_an_answer(looking: Looking) -> None:
         with pytest.raises(OpenArmError, match="is the graph up") as refused:
             ask()
         assert refused.value.code is Code.NOT_READY
+
+
+def test_no_request_ends_the_client(ros, looking: Looking) -> None:
+    """A value that no message can hold is refused; the same client then still resets, stops and cancels."""
+    from action_msgs.srv import CancelGoal
+    from openarm_interfaces.srv import ResetWorld
+    from std_srvs.srv import Trigger
+
+    from openarm_bringup.view.server import Order, Reset
+
+    def answered(_: Any, response: Any) -> Any:
+        response.success, response.message = True, "heard"
+        return response
+
+    ros.node.create_service(ResetWorld, "/sim/reset_world", answered)
+    for name in ("/stop", "/mujoco_bridge/reset"):
+        ros.node.create_service(Trigger, name, answered)
+    ros.node.create_service(CancelGoal, "/grasp/pick/_action/cancel_goal", lambda _, response: response)
+    view = looking.view
+
+    def ask(question: Callable[[], Any]) -> Any:
+        ended: list[Any] = []
+
+        def run() -> None:
+            try:
+                ended.append(question())
+            except OpenArmError as error:
+                ended.append(error)
+
+        threading.Thread(target=run, daemon=True).start()
+        ros.spin_until(lambda: ended, 10.0, "an answer")
+        return ended[0]
+
+    refused = ask(lambda: view.reset(Reset.model_construct(scene="", seed=2**63)))
+    assert isinstance(refused, OpenArmError)
+    assert refused.code is Code.INVALID_ARGUMENT, refused
+    assert "/sim/reset_world" in refused.message
+    assert ask(lambda: view.reset(Reset(seed=3))) == (True, "heard")
+    assert ask(view.stop) == (True, "heard")
+    assert ask(view.release) == (True, "heard")
+    assert ask(view.cancel) == (False, "no grasp runs that was asked for by /grasp/pick")
+    assert ask(lambda: view.pick(Order())).code is Code.NOT_READY

@@ -47,6 +47,14 @@ class Graph:
         self.asked.append("cancel")
         return False, "no grasp runs"
 
+    def stop(self) -> tuple[bool, str]:
+        self.asked.append("stop")
+        return True, "the arms hold"
+
+    def release(self) -> tuple[bool, str]:
+        self.asked.append("release")
+        return True, "released"
+
     def reset(self, order: Reset) -> tuple[bool, str]:
         self.asked.append(order)
         raise OpenArmError(Code.NOT_READY, "no service /sim/reset_world")
@@ -351,5 +359,52 @@ def test_files_outside_of_the_page_are_not_there() -> None:
             assert (await bench.get(path))[0] == 404, path
         for path in ("/view.js", "/vendor/three.module.min.js"):
             assert (await bench.get(path))[0] == 200, path
+
+    with_bench(test)
+
+
+MALFORMED: dict[str, bytes] = {
+    "bad JSON": b"}{",
+    "bad UTF-8": b'{"label": "\xff\xfe", "scene": "\xff", "plan_id": "\xff"}',
+    "a lone surrogate": rb'{"label": "\ud800", "scene": "\ud800", "plan_id": "\ud800"}',
+    "deep": b"[" * 2000 + b"]" * 2000,
+    "a list": b"[]",
+    "null": b"null",
+    "wrong types": b'{"label": 3, "arm": {}, "scene": [], "seed": "x", "plan_id": 1, "accept": "perhaps"}',
+    "seed of 2^63": b'{"seed": 9223372036854775808}',
+    "seed of many digits": b'{"seed": ' + b"9" * 3000 + b"}",
+    "seed NaN": b'{"seed": NaN}',
+    "unknown key": b'{"speed": 9}',
+    "long text": b'{"label": "' + b"x" * 3000 + b'", "scene": "' + b"x" * 900 + b'"}',
+    "oversized": b'{"label": "' + b"x" * 100_000 + b'"}',
+}
+
+
+def test_no_malformed_request_keeps_others_from_their_answer() -> None:
+    async def test(bench: Bench) -> None:
+        known = json_body({"Authorization": f"Bearer {bench.token}", **bench.origin})
+        for path in ("/pick", "/confirm", "/reset"):
+            for name, body in MALFORMED.items():
+                async with bench.session.post(bench.url + path, data=body, headers=known) as response:
+                    text = await response.text()
+                    assert 400 <= response.status < 500, (path, name, response.status, text)
+                    assert "Traceback" not in text
+        assert bench.graph.asked == []
+        for path, status in (("/cancel", 200), ("/stop", 200), ("/release", 200), ("/reset", 200), ("/pick", 202)):
+            assert (await bench.post(path, {}))[0] == status, path
+
+    with_bench(test)
+
+
+def test_requests_that_wait_hold_up_neither_cancel_nor_stop() -> None:
+    async def test(bench: Bench) -> None:
+        bench.graph.reset = lambda order: (bench.graph.go_on.wait(10.0), "late")  # type: ignore[method-assign]
+        waiting = [asyncio.create_task(bench.post("/reset", {})) for _ in range(40)]
+        await until(lambda: sum(task.done() for task in waiting) == 38)
+        assert {task.result()[0] for task in waiting if task.done()} == {409}
+        assert (await bench.post("/cancel", {}))[1]["message"] == "no grasp runs"
+        assert (await bench.post("/stop", {}))[1]["message"] == "the arms hold"
+        bench.graph.go_on.set()
+        assert sorted([(await task)[0] for task in waiting])[:2] == [200, 200]
 
     with_bench(test)

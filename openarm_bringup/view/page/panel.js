@@ -7,6 +7,9 @@ const $ = (id) => document.getElementById(id);
 /** Colours of the labels that the detector knows; others stay grey. */
 const SWATCHES = { red: "#d64541", orange: "#e8863a", yellow: "#e3c02f", green: "#4a9d5b", blue: "#3f74c9", purple: "#8657b5" };
 
+/** What the node that commands the joints reports while its emergency stop is latched. */
+const LATCHED = "the emergency stop is latched";
+
 export function element(tag, { text, ...attributes } = {}, ...children) {
   const made = document.createElement(tag);
   if (text !== undefined) made.textContent = text;
@@ -141,6 +144,47 @@ export class AskPanel {
   #enable() {
     $("pick").disabled = this.running || this.label === null;
     $("pick").textContent = this.running ? "Picking…" : this.label === null ? "Pick" : `Pick ${this.label}`;
+  }
+}
+
+/** The emergency stop: the button and Shift+Esc latch it; it is shown until it is released, by whomever. */
+export class StopPanel {
+  /** @param ask sends a request and gives its answer */
+  constructor(ask) {
+    this.ask = ask;
+    $("stop").addEventListener("click", () => this.#stop());
+    $("release").addEventListener("click", () => this.#release());
+    document.addEventListener("keydown", (event) => {
+      if (event.key !== "Escape" || !event.shiftKey || event.repeat) return;
+      event.preventDefault();
+      this.#stop();
+    });
+  }
+
+  /** What the nodes report: a stop of another client is shown too. */
+  show({ nodes }) {
+    const latched = nodes.some((node) => node.message === LATCHED);
+    if (latched && $("stopped").hidden) $("stop-answer").textContent = LATCHED;
+    if (latched) this.latched = true;
+    else if (this.latched) this.#clear();
+    if (latched) $("stopped").hidden = false;
+  }
+
+  async #stop() {
+    $("stopped").hidden = false;
+    $("stop-answer").textContent = "stopping…";
+    tell("stop-answer", await this.ask("stop"));
+  }
+
+  async #release() {
+    const answer = await this.ask("release");
+    if (answer.success) this.#clear();
+    else tell("stop-answer", answer);
+  }
+
+  #clear() {
+    this.latched = false;
+    $("stopped").hidden = true;
   }
 }
 

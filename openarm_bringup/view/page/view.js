@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The page: data of the wanted layers come by a websocket, scene and panel show them, requests go to the server.
 
-import { AskPanel, GraspPanel, HealthPanel, element } from "./panel.js";
+import { AskPanel, GraspPanel, HealthPanel, StopPanel, element } from "./panel.js";
 import { Scene, boxEdges, cubes, group, lines, place, points, solid } from "./scene.js";
 
 const $ = (id) => document.getElementById(id);
@@ -13,6 +13,7 @@ const scene = new Scene($("scene"), placeLabels);
 const grasp = new GraspPanel(ask);
 const asking = new AskPanel(ask, markChosen);
 const health = new HealthPanel();
+const stopping = new StopPanel(ask);
 
 let socket = null;
 let links = new Map(); // of the robot, with what hangs on them
@@ -63,7 +64,10 @@ const handlers = {
     if (old) URL.revokeObjectURL(old);
   },
   grasp: (message) => grasp.show(message),
-  health: (message) => health.show(message),
+  health(message) {
+    health.show(message);
+    stopping.show(message);
+  },
   outcome: (message) => asking.showOutcome(message),
   fault: showFault,
 };

@@ -12,6 +12,7 @@ from typing import Any
 from action_msgs.srv import CancelGoal
 from openarm_interfaces.action import Pick
 from openarm_interfaces.srv import ConfirmPlan, ResetWorld
+from std_srvs.srv import Trigger
 
 from openarm_bringup.view.ros.layers import Layer, makers
 from openarm_bringup.view.server import Confirmation, Item, Order, Reset
@@ -25,6 +26,7 @@ CLOUD_CAMERA = "overhead"
 _TICK_S = 0.02
 _PICK_S = 900.0
 _ANSWER_S = 30.0
+_URGENT_S = 5.0
 
 
 class GraphView(ContextNode):
@@ -45,6 +47,7 @@ class GraphView(ContextNode):
         self._makers = makers(self.description, self.cameras, CLOUD_CAMERA)
         self._wanted: frozenset[str] = frozenset()
         self._ask = BackgroundNode("openarm_view", timeout=timeout)
+        self._urgent = BackgroundNode("openarm_view_stop", timeout=timeout)  # nothing else can hold it up
         super().__init__("openarm_view_layers", bare=True)
         self._ended = threading.Event()
         self._stop_picking = threading.Event()
@@ -63,6 +66,7 @@ class GraphView(ContextNode):
         self._picking.acquire(timeout=5.0)  # until the grasp that was asked for here knows that it is cancelled
         super().close()
         self._ask.close()
+        self._urgent.close()
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -102,10 +106,30 @@ class GraphView(ContextNode):
             OpenArmError: NOT_READY, when no grasp node answers.
         """
         # An empty goal id and stamp: all goals.
-        answer = self._ask.call(CancelGoal, "/grasp/pick/_action/cancel_goal", CancelGoal.Request(), _ANSWER_S)
+        answer = self._urgent.call(CancelGoal, "/grasp/pick/_action/cancel_goal", CancelGoal.Request(), _URGENT_S)
         if answer.goals_canceling:
             return True, "cancelled; the arm holds where it is"
         return False, "no grasp runs that was asked for by /grasp/pick"
+
+    def stop(self) -> tuple[bool, str]:
+        """Latch the emergency stop of the joints.
+
+        Raises:
+            OpenArmError: NOT_READY, when no node offers it; TIMEOUT.
+        """
+        return self._trigger("/stop")
+
+    def release(self) -> tuple[bool, str]:
+        """Release the emergency stop.
+
+        Raises:
+            OpenArmError: NOT_READY, when no node offers it; TIMEOUT.
+        """
+        return self._trigger("/mujoco_bridge/reset")
+
+    def _trigger(self, service: str) -> tuple[bool, str]:
+        answer = self._urgent.call(Trigger, service, Trigger.Request(), _URGENT_S)
+        return answer.success, answer.message
 
     def reset(self, order: Reset) -> tuple[bool, str]:
         """Put the simulation back to its start.
