@@ -19,7 +19,9 @@ from visualization_msgs.msg import MarkerArray
 from benchmarks.fuzz.files import KINDS, read_altered
 from benchmarks.fuzz.hostile import hostile, plausible
 from benchmarks.fuzz.judge import Tally
+from openarm_bringup.view.ros.layers import _show_robot, _text
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 from openarm_common.ros import convert
 from openarm_common.ros.detections import detections_from_msg
 from openarm_motion.ros import convert as motion
@@ -74,6 +76,16 @@ def test_hostile_messages_become_data_or_are_refused() -> None:
             except OpenArmError:
                 refused += 1
     assert refused > 200
+
+
+def test_the_page_takes_joint_states_of_another_length_and_refuses_what_is_no_json() -> None:
+    show = _show_robot(RobotDescription.load())
+    for names in (["a"], ["a", "b"], ["b"]):
+        assert [key for key, _ in show([JointState(name=names, position=[0.1] * len(names))], [])] == ["robot"]
+    with pytest.raises(OpenArmError, match="0 positions of 1 joints"):
+        list(show([JointState(name=["a"])], []))
+    with pytest.raises(OpenArmError, match="states: a value is not finite"):
+        _text("states", speed=float("nan"))
 
 
 def test_what_is_no_sentence_is_counted_as_a_raw_error() -> None:

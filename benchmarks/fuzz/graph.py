@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import re
@@ -10,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,12 @@ from benchmarks.fuzz.files import BAG
 from benchmarks.fuzz.hostile import hostile, plausible
 from benchmarks.fuzz.judge import Tally, peak_mib, reset_peak, where
 from openarm_bringup.messages import interface
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.config import validate
 from openarm_common.domain import release_domain, reserve_domain
 from openarm_common.errors import OpenArmError
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.lifecycle_node import RCLError
 
 #: What is sent before the nodes are asked whether they still answer.
 BATCH = 10
@@ -49,6 +53,7 @@ class Nodes:
         from rclpy.parameter import Parameter
 
         from openarm_bringup.bags.ros.flight_recorder import FlightRecorder
+        from openarm_bringup.view.ros.layers import makers
         from openarm_calibration.ros.node import CalibrationNode
         from openarm_calibration.ros.publisher import PublisherNode
         from openarm_grasp.ros.node import GraspNode
@@ -85,6 +90,10 @@ class Nodes:
             self.nodes.append(node)
             self._spin(node)
         self._listen()
+        #: What the page shows; polled, not spun.
+        self.page: Any = Node("page")
+        cameras = list(load_cameras().values())
+        self.layers = [make(self.page) for make in makers(RobotDescription.load(), cameras, "overhead").values()]
 
     def _spin(self, node: Any) -> None:
         executor = self._executor()
@@ -119,6 +128,20 @@ class Nodes:
     def _take_state(self, message: Any) -> None:
         self.newest_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
+    def look(self) -> None:
+        """Let the page show what has come."""
+        for layer in self.layers:
+            try:
+                for key, payload in layer.update():
+                    if isinstance(payload, str):
+                        json.loads(payload, parse_constant=lambda word: _no_json(word))
+                    assert key
+            except OpenArmError:
+                continue  # what can't be shown is said on the page
+            # Anything else would end its thread.
+            except Exception as error:
+                self.errors.append(f"page: {where(error)}")
+
     def silent(self) -> list[str]:
         """Return the nodes that do not answer a request for a parameter in time, and note the longest time."""
         from rcl_interfaces.srv import GetParameters
@@ -142,6 +165,9 @@ class Nodes:
         self._ending = True
         for thread in self._threads:
             thread.join(timeout=5.0)
+        for layer in self.layers:
+            layer.close()
+        self.page.destroy_node()
         for node in self.nodes:
             node.close()
             node.destroy_node()
@@ -184,7 +210,7 @@ class Sender:
         """One message on one subscription."""
         heard = {
             (s.topic_name, s.msg_type)
-            for node in self._nodes.nodes
+            for node in (*self._nodes.nodes, self._nodes.page)
             for s in list(node.subscriptions)
             if s.topic_name not in ("/clock", "/parameter_events")
         }
@@ -206,14 +232,15 @@ class Sender:
         message = hostile(sound, self._rng)
         if self._rng.random() < 0.2:
             data = serialize_message(sound)
-            publisher.publish(data[:4] + altered_bytes(data[4:400], self._rng) + data[400:])
+            with suppress(RCLError):  # the sender's own middleware refuses it
+                publisher.publish(data[:4] + altered_bytes(data[4:400], self._rng) + data[400:])
         else:
             publisher.publish(message)
 
     def _publisher(self, topic: str, kind: Any) -> Any:
         if topic not in self._made:
             self._made[topic] = self._probe.create_publisher(kind, topic, self._profile)
-            deadline = time.monotonic() + 2.0
+            deadline = time.monotonic() + 0.5
             while not self._made[topic].get_subscription_count() and time.monotonic() < deadline:
                 time.sleep(0.01)
         return self._made[topic]
@@ -305,6 +332,10 @@ class Sender:
             raise OpenArmError("REFUSED", answer.reason)
         back = SetParameters.Request(parameters=[Parameter(name=name, value=before)])
         _wait(client.call_async(back), ANSWER_S, f"no answer of {service}")
+
+
+def _no_json(word: str) -> None:
+    raise AssertionError(f"{word} is no JSON")
 
 
 class _SilentError(Exception):
@@ -399,6 +430,7 @@ def send_hostile(counts: dict[str, int], seed: int) -> list[Tally]:
                     tally.raw[f"{name} did not answer for {ALIVE_S:g} s"] += 1
                 tally.worst_s = max(tally.worst_s, time.monotonic() - began)
                 tally.worst_mib = max(tally.worst_mib, peak_mib() - before)
+                nodes.look()
                 while nodes.errors:
                     tally.raw[nodes.errors.pop()] += 1
             tally.notes += [f"{node.get_name()}: {node._BaseNode__status.message[:150]}" for node in nodes.nodes]

@@ -172,6 +172,8 @@ def decode(data: Bytes | bytes, resolution: float, *, binary: bool) -> Leaves:
         OpenArmError: INVALID_ARGUMENT, when the payload ends too early, goes on after its end, is deeper than 16
             levels, or holds log-odds that are not finite.
     """
+    if not 1e-4 <= resolution <= 100.0:
+        raise _invalid(f"res is {resolution} m, expected 0.0001 .. 100")
     raw = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data.view(np.uint8)
     if raw.size == 0:
         return Leaves(resolution, np.empty((0, 5), np.int64), np.empty(0, np.float32), 0)
@@ -246,8 +248,6 @@ def _parse(content: bytes) -> Leaves:
         resolution, nodes = float(fields["res"]), int(fields["size"])
     except (KeyError, ValueError) as error:
         raise _invalid(f"header needs numbers 'size' and 'res': {error}") from error
-    if not 1e-4 <= resolution <= 100.0:
-        raise _invalid(f"res is {resolution} m, expected 0.0001 .. 100")
     leaves = decode(data, resolution, binary=forms[0] == ".bt")
     if leaves.nodes != nodes:
         raise _damaged(f"has {leaves.nodes} nodes, its header says {nodes}")

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.config import brief
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
@@ -34,6 +35,8 @@ TOLERANCE_NS = 5_000_000
 MAX_BRACKET_NS = 100_000_000
 #: Largest predicted error of the position of a frame, m.
 MAX_ERROR = 1e-3
+#: Longest name of a joint or frame, characters, and most frames beside the robot's.
+LONGEST_NAME, _FRAMES = 256, 1000
 #: Share of ``a h²`` that counts as error: with measured velocities, and with those from positions.
 _MEASURED, _DERIVED = 1.0 / 8.0, 1.0 / 2.0
 
@@ -94,7 +97,16 @@ class RobotStateBuffer:
             parent: Frame.
             child: Frame.
             T_parent_child: (4, 4), m.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, for a name that is none, or when there are too many.
         """
+        if max(len(parent), len(child)) > LONGEST_NAME or (child not in self._static and len(self._static) >= _FRAMES):
+            raise OpenArmError(
+                Code.INVALID_ARGUMENT,
+                f"frame {brief(child)} has a name of more than {LONGEST_NAME} characters, or is one of more than"
+                f" {_FRAMES}",
+            )
         if child not in self._description.links:
             self._static[child] = (parent, T_parent_child)
             self._levers_of.clear()
@@ -198,6 +210,8 @@ class RobotStateBuffer:
         """Return the largest distances (frames, n) at which joints move a frame, m/rad or m/m; empty: all links."""
         key = (frame, names)
         if key not in self._levers_of:
+            if len(self._levers_of) >= _FRAMES:  # names that change with each message
+                self._levers_of.clear()
             rows: list[list[float]] = []
             for one in [frame] if frame else self._description.links:
                 link, T_link_frame = self._carrier(one)

@@ -28,6 +28,7 @@ from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import brief, brief_text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.held import HeldBox
+from openarm_common.robot.robot_state import LONGEST_NAME
 from openarm_common.types import Array, Bytes, Floats
 
 #: encoding: (dtype, channels)
@@ -41,6 +42,8 @@ ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
 
 #: Nothing that a message speaks of is further away, m.
 _FAR = 1e4
+#: No robot has more joints.
+_MOST_JOINTS = 512
 #: No joint is further from its zero, rad or m.
 _FARTHEST = 1e4
 
@@ -318,6 +321,9 @@ def joints_from_msg(message: JointState) -> JointState:
     """
     names, positions = message.name, message.position
     count = len(names)
+    if count > _MOST_JOINTS or max(map(len, names), default=0) > LONGEST_NAME:
+        text = f"joint states of {count} joints, or with a name of more than {LONGEST_NAME} characters"
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}; expected at most {_MOST_JOINTS} joints")
     if len(positions) != count or len(set(names)) != count:
         text = f"{len(positions)} positions of {count} joints, {len(set(names))} of them different"
         raise OpenArmError(Code.INVALID_ARGUMENT, f"joint states have {text}; expected one position of each joint")

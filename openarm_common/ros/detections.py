@@ -26,8 +26,9 @@ from vision_msgs.msg import (
     ObjectHypothesisWithPose,
 )
 
+from openarm_common.config import brief
 from openarm_common.detection import KINDS, Described, Detection
-from openarm_common.errors import Code
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.convert import header, matrix_to_pose, pose_to_matrix, vector, xyz
 from openarm_common.types import Array
 
@@ -36,6 +37,8 @@ UNKNOWN = -1.0
 _MARKS = {Code.INTRINSICS_MISMATCH: -2.0, Code.TABLE_MISMATCH: -3.0}
 _REASONS = {mark: code for code, mark in _MARKS.items()}
 #: Shapes that are round seen from above when they stand; one that lies is seldom as long as wide.
+#: Longest edge of an object, m.
+_LARGEST = 10.0
 _ROUND, _AS_LONG_AS_WIDE = frozenset({"cylinder", "can", "sphere"}), 0.001
 
 
@@ -66,7 +69,7 @@ def detections_from_msg(message: Detection3DArray) -> tuple[Detection, ...]:
     """Return the objects of a message, in the frame that its header names; those without a hypothesis are left out.
 
     Raises:
-        OpenArmError: INVALID_ARGUMENT, for a pose that is not one.
+        OpenArmError: INVALID_ARGUMENT, for a pose or a size that is not one, or a score that is no number.
     """
     out: list[Detection] = []
     for item in message.detections:
@@ -77,6 +80,9 @@ def detections_from_msg(message: Detection3DArray) -> tuple[Detection, ...]:
         others = [r.hypothesis.class_id for r in item.results if r.hypothesis.class_id != best.class_id]
         name, color, kind = _attributes(item.id, [best.class_id, *others])
         T, size = pose_to_matrix(item.bbox.center), np.asarray(xyz(item.bbox.size))
+        if not ((size >= 0.0) & (size <= _LARGEST)).all() or not np.isfinite([best.score, variance]).all():
+            text = f"{size.tolist()} m, score {best.score:g}, covariance {variance:g}"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"detection {brief(name)} has the size {text}")
         is_round = kind in _ROUND and abs(float(size[0] - size[1])) < _AS_LONG_AS_WIDE
         code = _REASONS.get(variance, Code.NOTHING_DETECTED)
         out.append(Detection(name, best.score, T, size, is_round, kind, variance >= 0.0, code, color))

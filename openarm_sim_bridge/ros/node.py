@@ -23,6 +23,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from openarm_common.camera.cameras import CameraConfig, load_cameras
+from openarm_common.config import brief
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.ros.holds import HoldListener
@@ -55,6 +56,8 @@ LARGE_PROFILE = "OPENARM_LARGE_MESSAGES_PROFILE"
 REPORT_PERIOD_S = 1.0
 #: Slower than this share of the requested speed is reported as a fault.
 _SLOW = 0.9
+#: So many unknown joints of commands are named in the log.
+_NAMED = 20
 #: Joint states that are further apart than this (p99, ms) are reported as a fault.
 _LATE_MS = 15.0
 
@@ -156,10 +159,10 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         except OpenArmError as error:
             logger.error(f"/joint_commands refused: {error}", throttle_duration_sec=1.0)
             return
-        for name in set(command.unknown) - self._warned:
+        for name in sorted(set(command.unknown) - self._warned)[: _NAMED - len(self._warned)]:
             self._warned.add(name)
             known = ", ".join(self._simulation.world.joint_names)
-            logger.warning(f"/joint_commands: unknown joint {name!r} is ignored; joints: {known}")
+            logger.warning(f"/joint_commands: unknown joint {brief(name)} is ignored; joints: {known}")
         busy = self._controller.busy(command)
         if busy:
             names = ", ".join(busy)

@@ -15,6 +15,15 @@ from openarm_bringup.messages import interface
 from openarm_common.errors import Code, OpenArmError
 
 
+def no_message(bag: Bag, record: Record) -> OpenArmError:
+    """Return the error of a record whose bytes are not of its type."""
+    return OpenArmError(
+        Code.INVALID_ARGUMENT,
+        f"{bag.path} has a message of {record.topic} at {record.t_ns} ns that is no {record.type}"
+        f" ({len(record.data)} bytes); the bag is damaged",
+    )
+
+
 def message_of(bag: Bag, record: Record) -> Any:
     """Return the message of a record.
 
@@ -31,11 +40,7 @@ def message_of(bag: Bag, record: Record) -> Any:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"{bag.path}: {why}; read it with the version that made it"
             ) from error
-        raise OpenArmError(
-            Code.INVALID_ARGUMENT,
-            f"{bag.path} has a message of {record.topic} at {record.t_ns} ns that is no {record.type}"
-            f" ({len(record.data)} bytes); the bag is damaged",
-        ) from error
+        raise no_message(bag, record) from error
 
 
 def messages_of(bag: Bag, topics: Iterable[str]) -> dict[str, list[Any]]:

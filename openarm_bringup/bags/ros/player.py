@@ -18,12 +18,14 @@ from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 
 from openarm_bringup.bags.bag import Bag, Record
+from openarm_bringup.bags.ros.messages import no_message
 from openarm_bringup.messages import interface
 from openarm_bringup.supervision.environment import profiled, write_profile
 from openarm_bringup.supervision.graph import NodeSpec
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.client import ContextNode
 from openarm_common.ros.convert import ns_to_stamp
+from openarm_common.ros.lifecycle_node import RCLError
 
 _CLOCK = "/clock"
 #: What comes from a robot and its cameras: two of them in one graph would be taken for one that jumps.
@@ -174,7 +176,10 @@ class Player(ContextNode):
     def _publish(self, record: Record) -> None:
         if self._clock is not None:
             self._clock.publish(Clock(clock=ns_to_stamp(record.t_ns)))
-        self._publishers[record.topic].publish(record.data)
+        try:
+            self._publishers[record.topic].publish(record.data)
+        except RCLError as error:
+            raise no_message(self._bag, record) from error
         self.published += 1
 
     def wait_idle(self, quiet_s: float, limit_s: float) -> None:

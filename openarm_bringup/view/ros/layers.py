@@ -29,6 +29,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_bringup.view import wire
 from openarm_common.camera.cameras import CameraConfig
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.codec import decode
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
@@ -36,6 +37,7 @@ from openarm_common.ros.convert import (
     depth_image,
     held_from_msg,
     intrinsics_from_info,
+    joints_from_msg,
     pose_to_matrix,
     rgb_image,
     stamp_to_ns,
@@ -176,8 +178,9 @@ def _show_robot(description: RobotDescription) -> Show:
 
     def show(states: list[JointState], attached: list[MarkerArray]) -> Items:
         nonlocal shown
-        joints = states[-1] if states else None
-        if joints is not None and not (shown and np.allclose(joints.position, shown, atol=2e-5)):
+        joints = joints_from_msg(states[-1]) if states else None
+        known = joints is not None and len(shown) == len(joints.position)
+        if joints is not None and not (known and np.allclose(joints.position, shown, atol=2e-5)):
             shown = list(joints.position)
             q = dict(zip(joints.name, joints.position, strict=True))
             yield "robot", wire.frame({"kind": "robot"}, wire.link_poses(description, q))
@@ -305,7 +308,10 @@ def makers(
 
 
 def _text(kind: str, **values: Any) -> str:
-    return json.dumps({"kind": kind, **values})
+    try:
+        return json.dumps({"kind": kind, **values}, allow_nan=False)
+    except ValueError as error:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"{kind}: a value is not finite") from error
 
 
 def _step(message: GraspStatus) -> dict[str, Any]:
