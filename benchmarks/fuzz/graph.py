@@ -418,7 +418,7 @@ def send_hostile(counts: dict[str, int], seed: int) -> list[Tally]:
             rng = random.Random(f"{kind}{seed}")
             sender, tally = Sender(nodes, rng), Tally(kind)
             tallies.append(tally)
-            done = 0
+            done, first_mib = 0, reset_peak()
             while done < count:
                 before = reset_peak()
                 sender.restore()
@@ -433,6 +433,7 @@ def send_hostile(counts: dict[str, int], seed: int) -> list[Tally]:
                 nodes.look()
                 while nodes.errors:
                     tally.raw[nodes.errors.pop()] += 1
+            tally.notes.append(f"{reset_peak() - first_mib:+.0f} MiB from the first input to the last")
             tally.notes += [f"{node.get_name()}: {node._BaseNode__status.message[:150]}" for node in nodes.nodes]
             at = Path(log.name)
             for found in _DEFECT.finditer(at.read_text("utf-8", "replace")):
