@@ -23,15 +23,15 @@ from openarm_common.lazy import attach
 if TYPE_CHECKING:
     from openarm_grasp.config import GraspConfig as GraspConfig
     from openarm_grasp.context import GraspContext as GraspContext
+    from openarm_grasp.requests.request import GraspOutcome as GraspOutcome
+    from openarm_grasp.requests.request import GraspRequest as GraspRequest
+    from openarm_grasp.requests.states import SUCCESSORS as SUCCESSORS
+    from openarm_grasp.requests.task import GraspSession as GraspSession
+    from openarm_grasp.requests.task import Task as Task
     from openarm_grasp.robot.interface import RobotInterface as RobotInterface
     from openarm_grasp.robot.skills import Skills as Skills
     from openarm_grasp.ros.client import GraspClient as GraspClient
     from openarm_grasp.strategies.registry import STRATEGIES as STRATEGIES
     from openarm_grasp.strategies.registry import carry_out as carry_out
-    from openarm_grasp.strategies.request import GraspOutcome as GraspOutcome
-    from openarm_grasp.strategies.request import GraspRequest as GraspRequest
-    from openarm_grasp.strategies.states import SUCCESSORS as SUCCESSORS
-    from openarm_grasp.strategies.task import GraspSession as GraspSession
-    from openarm_grasp.strategies.task import Task as Task
 
 __getattr__, __dir__ = attach(__name__, __file__)

@@ -20,7 +20,7 @@ def graph(*, form: Literal["text", "mermaid"] = "text") -> Outcome:
     Args:
         form: text or mermaid.
     """
-    from openarm_grasp.strategies.states import SUCCESSORS, as_text, mermaid
+    from openarm_grasp.requests.states import SUCCESSORS, as_text, mermaid
 
     drawing = mermaid() if form == "mermaid" else as_text()
     data = {state.value: {other.value: when for other, when in row.items()} for state, row in SUCCESSORS.items()}

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from openarm_grasp.planning.options import Option
     from openarm_grasp.ros.client import GraspResult, PairResult
-    from openarm_grasp.strategies.state_times import StateTime
+    from openarm_grasp.requests.state_times import StateTime
 
 
 Arm = Literal["auto", "left", "right"]
@@ -69,7 +69,7 @@ def pick(
         raise OpenArmError(Code.INVALID_ARGUMENT, "--confirm is of one object; use --dry-run to see the plan of two")
     join_graph(domain)
     from openarm_grasp.ros.client import GraspClient
-    from openarm_grasp.strategies.request import GraspRequest
+    from openarm_grasp.requests.request import GraspRequest
 
     wanted: list[dict[str, Any]] = [
         {
@@ -216,7 +216,7 @@ def order(
         each: Most objects of each.
         timeout: Longest wait for one object, s.
     """
-    from openarm_grasp.strategies.orders import Order, load_bins
+    from openarm_grasp.requests.orders import Order, load_bins
 
     work = Order(labels, load_bins(bins) if bins is not None else None, each)
     join_graph(domain)

@@ -91,7 +91,7 @@ def make_server(host: str, on_end: Callable[[BaseException], None]) -> Iterator[
     from openarm_bringup.view.ros.page import GraphView
     from openarm_bringup.view.server import ViewServer
     from openarm_bringup.view.wire import robot_shapes
-    from openarm_grasp.strategies.states import State
+    from openarm_grasp.requests.states import State
 
     loop = asyncio.get_running_loop()
     graph = GraphView(

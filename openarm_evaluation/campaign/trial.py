@@ -34,12 +34,12 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
-from openarm_grasp.strategies.orders import Order
+from openarm_grasp.requests.orders import Order
 from openarm_grasp.strategies.pair import Pair
 from openarm_grasp.strategies.registry import carry_out, carry_out_pair
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
-from openarm_grasp.strategies.task import GraspSession, Status
-from openarm_grasp.strategies.task import Task as GraspTask
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest
+from openarm_grasp.requests.task import GraspSession, Status
+from openarm_grasp.requests.task import Task as GraspTask
 from openarm_sim_bridge.faults.faults import checked_fault
 
 _SETTLE_S = 0.5

@@ -20,7 +20,7 @@ from openarm_evaluation.demo.options import DemoOptions
 from openarm_evaluation.judging import provenance
 from openarm_evaluation.judging.statistics import summarise
 from openarm_evaluation.judging.trial import Step, Trial, choose_targets, run_trial
-from openarm_grasp.strategies.request import GraspRequest
+from openarm_grasp.requests.request import GraspRequest
 
 if TYPE_CHECKING:
     from openarm_bringup.supervision.supervisor import Event

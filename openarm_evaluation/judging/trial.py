@@ -17,7 +17,7 @@ from openarm_common.scene.scene import Scene, SceneObject
 from openarm_common.wanted import describe, select
 from openarm_evaluation.judging.judge import RULES, Sample, Verdict, at_rest, end_of, judge
 from openarm_evaluation.judging.provenance import scene_hash
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 
 if TYPE_CHECKING:
     from openarm_evaluation.judging.ros.observer import Observer

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +22,9 @@ from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget, propose
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import other_grasps, place_targets
-from openarm_grasp.robot.skills import Skills
+
+if TYPE_CHECKING:
+    from openarm_grasp.robot.skills import Skills
 
 
 class FeasibilityCheck:

@@ -17,9 +17,9 @@ from openarm_common.errors import Answer, Code, OpenArmError
 from openarm_common.ros.client import BackgroundNode
 from openarm_common.ros.convert import point, xyz
 from openarm_grasp.planning.options import Option
+from openarm_grasp.requests.request import GraspRequest
+from openarm_grasp.requests.state_times import StateTime
 from openarm_grasp.ros.messages import code_from_text, option_from_msg
-from openarm_grasp.strategies.request import GraspRequest
-from openarm_grasp.strategies.state_times import StateTime
 
 OnFeedback = Callable[[GraspStatus], None]
 OnPlan = Callable[[GraspStatus], bool]

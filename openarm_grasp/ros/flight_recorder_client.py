@@ -11,7 +11,7 @@ from rclpy.task import Future
 
 from openarm_common.errors import Code
 from openarm_common.ros.node import BaseNode
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome, command
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome, command
 
 #: Longest wait for the path, s of wall clock: the answer to the request waits as long.
 _WAIT_S = 0.8

@@ -27,10 +27,10 @@ from openarm_common.types import Array
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NoWayError, Option
+from openarm_grasp.requests.confirm import ShownPlan
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome
+from openarm_grasp.requests.task import Status
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
-from openarm_grasp.strategies.confirm import ShownPlan
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome
-from openarm_grasp.strategies.task import Status
 
 _CHOSEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 _REFUSED = ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.35)

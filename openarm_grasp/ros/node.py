@@ -27,6 +27,9 @@ from openarm_common.scene.scene import load_scene
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.planning.arms import ARMS
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome
+from openarm_grasp.requests.states import State
+from openarm_grasp.requests.task import GraspSession, Status, Task
 from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.ros import messages
@@ -34,9 +37,6 @@ from openarm_grasp.ros.flight_recorder_client import FlightRecorderClient
 from openarm_grasp.ros.graph_robot import GraphRobot
 from openarm_grasp.strategies.pair import Pair
 from openarm_grasp.strategies.registry import carry_out, carry_out_pair
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome
-from openarm_grasp.strategies.states import State
-from openarm_grasp.strategies.task import GraspSession, Status, Task
 
 AnswerT = TypeVar("AnswerT", GraspOutcome, PairOutcome, str)
 OutcomeT = TypeVar("OutcomeT", GraspOutcome, PairOutcome)

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.feasibility import FeasibilityCheck
+from openarm_grasp.requests.request import GraspOutcome
+from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from openarm_grasp.strategies.request import GraspOutcome
-from openarm_grasp.strategies.task import Task
 
 
 async def direct(task: Task) -> GraspOutcome:

@@ -25,9 +25,9 @@ from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import clear_spots, grid
+from openarm_grasp.requests.request import Feasible, GraspOutcome
+from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from openarm_grasp.strategies.request import Feasible, GraspOutcome
-from openarm_grasp.strategies.task import Task
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ from openarm_grasp.evidence.verdicts import Evidence
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate, object_in
+from openarm_grasp.requests.request import GraspRequest
+from openarm_grasp.requests.task import Grasp, GraspSession, release_command
 from openarm_grasp.robot.skills import Skills
-from openarm_grasp.strategies.request import GraspRequest
-from openarm_grasp.strategies.task import Grasp, GraspSession, release_command
 
 
 async def take_up(session: GraspSession, robot: Skills, *requests: GraspRequest) -> None:

@@ -18,13 +18,13 @@ from openarm_grasp.config import DetectConfig
 from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart, on_table
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.feasibility import FeasibilityCheck
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome
+from openarm_grasp.requests.states import State
+from openarm_grasp.requests.task import GraspSession, Report, Status, Task
 from openarm_grasp.robot.coordination import ArmCoordination, coordinated
 from openarm_grasp.robot.interface import RobotInterface
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome
-from openarm_grasp.strategies.states import State
-from openarm_grasp.strategies.task import GraspSession, Report, Status, Task
 
 Requests = tuple[GraspRequest, GraspRequest]
 

@@ -28,12 +28,12 @@ from openarm_grasp.planning.arms import ARMS, arm_order
 from openarm_grasp.planning.candidates import UP, GraspCandidate
 from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.requests.confirm import PUSH, agree
+from openarm_grasp.requests.request import Feasible, GraspOutcome
+from openarm_grasp.requests.task import Task
 from openarm_grasp.robot.interface import Planned
 from openarm_grasp.robot.skills import STOPS, reraise_stop
-from openarm_grasp.strategies.confirm import PUSH, agree
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from openarm_grasp.strategies.request import Feasible, GraspOutcome
-from openarm_grasp.strategies.task import Task
 
 #: Between two points of a hand's shape, m.
 _GRAIN = 0.005

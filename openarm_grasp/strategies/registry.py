@@ -14,13 +14,13 @@ from dataclasses import replace
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.planning.options import NO_WAY
+from openarm_grasp.requests.request import GraspOutcome, PairOutcome
+from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies.direct import direct
 from openarm_grasp.strategies.hand_over import hand_over
 from openarm_grasp.strategies.in_hand import take_up
 from openarm_grasp.strategies.pair import ENDS, Pair, in_turn, simultaneous
 from openarm_grasp.strategies.push import push
-from openarm_grasp.strategies.request import GraspOutcome, PairOutcome
-from openarm_grasp.strategies.task import Task
 
 Strategy = Callable[[Task], Awaitable[GraspOutcome | None]]
 

@@ -6,51 +6,20 @@ Nobody is asked to confirm it, and an attempt that has failed ends with it. Base
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.evidence.verdicts import GripperVerdict, Verdict
 from openarm_grasp.planning import candidates
-from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.planning.place import place_targets
+from openarm_grasp.requests.states import Hand, State
+from openarm_grasp.requests.task import Grasp, Placed
 from openarm_grasp.robot.skills import reraise_stop
-from openarm_grasp.strategies.states import State
 
 if TYPE_CHECKING:
-    from openarm_grasp.strategies.pick_and_place import Run
-    from openarm_grasp.strategies.task import Grasp
-
-
-class Hand(Enum):
-    """Where the hand is, as far as known; it decides the way home."""
-
-    FREE = "away from objects, empty"
-    AT_OBJECT = "around the object or straight above its grasp, empty"
-    HOLDING = "around the object or straight above its grasp, holding it"
-    CARRYING = "elsewhere, holding the object"
-    RELEASED = "around the object that it has put down"
-    CLEAR = "away from the object that it has put down"
-
-
-@dataclass(frozen=True)
-class Placed:
-    """An object that was put down.
-
-    Attributes:
-        target: Where.
-        gripper: That the hand held it above that place.
-        reason: How it was put down.
-        failure: Why it was put back where it came from; None when it was put where it belongs.
-    """
-
-    target: PlaceTarget
-    gripper: GripperVerdict
-    reason: str
-    failure: Verdict | None = None
+    from openarm_grasp.strategies.run import Run
 
 
 def still_held(run: Run, error: OpenArmError) -> str:

@@ -17,8 +17,8 @@ from openarm_grasp.robot.interface import Frames
 from openarm_grasp.robot.skills import reraise_stop
 
 if TYPE_CHECKING:
-    from openarm_grasp.strategies.pick_and_place import Run
-    from openarm_grasp.strategies.task import Grasp
+    from openarm_grasp.requests.task import Grasp
+    from openarm_grasp.strategies.run import Run
 
 
 async def second_look(run: Run, grasp: Grasp, least: float) -> tuple[Grasp | None, str]:

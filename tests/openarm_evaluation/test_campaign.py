@@ -26,8 +26,8 @@ from openarm_evaluation.campaign.tasks.faults import KINDS
 from openarm_evaluation.campaign.tasks.suites import SUITES, make_task
 from openarm_evaluation.campaign.tasks.task import FaultPlan
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.strategies.registry import carry_out
-from openarm_grasp.strategies.request import GraspRequest
 from openarm_octomap.config import GridConfig
 from openarm_octomap.grid import OccupancyGrid
 from tests.tag_paint import paint

@@ -22,13 +22,13 @@ from openarm_grasp.perception.detections import Frame
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.planning.feasibility import standing_at
 from openarm_grasp.planning.options import NoWayError
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest
+from openarm_grasp.requests.states import State
+from openarm_grasp.requests.task import GraspSession, Status, Task
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace
 from openarm_grasp.robot.skills import Skills
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.registry import carry_out
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
-from openarm_grasp.strategies.states import State
-from openarm_grasp.strategies.task import GraspSession, Status, Task
 
 #: How far either arm reaches over the middle, m.
 OVER = 0.10

@@ -8,7 +8,7 @@ import shlex
 import pytest
 
 from openarm_bringup.cli import build_app
-from openarm_grasp.strategies.request import GraspRequest, command
+from openarm_grasp.requests.request import GraspRequest, command
 
 FULL = GraspRequest(
     "red", arm="left", place=(0.25, -0.1), place_yaw=-0.5, phase="pick", timeout=30.0, object_at=(0.3, -0.2)

@@ -14,12 +14,12 @@ from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.requests.confirm import ShownPlan
+from openarm_grasp.requests.request import GraspRequest
+from openarm_grasp.requests.states import State
+from openarm_grasp.requests.task import Status
 from openarm_grasp.robot.interface import PlanGrasp
-from openarm_grasp.strategies.confirm import ShownPlan
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from openarm_grasp.strategies.request import GraspRequest
-from openarm_grasp.strategies.states import State
-from openarm_grasp.strategies.task import Status
 from openarm_motion.timing.trajectory import Motion
 from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, World, standing
 

@@ -19,9 +19,9 @@ from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.options import NoWayError, Option
+from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.robot.interface import Planned
 from openarm_grasp.strategies.registry import carry_out
-from openarm_grasp.strategies.request import GraspRequest
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.strategies.orders import Bin, Bins, Order, load_bins
-from openarm_grasp.strategies.request import GraspRequest
+from openarm_grasp.requests.orders import Bin, Bins, Order, load_bins
+from openarm_grasp.requests.request import GraspRequest
 
 BINS = Bins(
     bins={"left": Bin(x=(0.16, 0.28), y=(0.20, 0.44)), "right": Bin(x=(0.16, 0.28), y=(-0.32, -0.20))},

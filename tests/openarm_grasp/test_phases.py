@@ -14,10 +14,10 @@ from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig, HandConfig, HeldConfig
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest
+from openarm_grasp.requests.task import GraspSession
 from openarm_grasp.strategies.pick_and_place import pick_and_place
 from openarm_grasp.strategies.registry import carry_out
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
-from openarm_grasp.strategies.task import GraspSession
 
 BOX = SceneObject(name="blue_box", shape="box", size=(0.045, 0.068, 0.06), color="blue", position=(0.26, -0.2), yaw=0.4)
 CUBE = SceneObject(name="red_cube", shape="box", size=(0.05, 0.05, 0.05), color="red", position=(0.26, 0.2))

@@ -19,8 +19,8 @@ from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, judge_place
 from openarm_grasp.perception.detections import Frame
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
 from openarm_sim_bridge.faults.faults import checked_fault
 
 BOX = SceneObject(name="blue_box", shape="box", size=(0.045, 0.06, 0.07), color="blue", position=(0.26, 0.22), yaw=0.4)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import PlanGrasp, PlanPlace
-from openarm_grasp.strategies.states import State
 from tests.openarm_grasp.scripted import Follow, GoHome, Grip, MoveLinear, Observe, ToBase, Wait
 
 

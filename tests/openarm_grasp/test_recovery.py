@@ -9,10 +9,10 @@ import pytest
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.perception.detections import Frame
+from openarm_grasp.requests.request import GraspRequest
+from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import Frames, PlanGrasp, PlanPlace
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from openarm_grasp.strategies.request import GraspRequest
-from openarm_grasp.strategies.states import State
 from tests.openarm_grasp.scripted import GoHome, Grip, MoveLinear, Wait
 
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest
+from openarm_grasp.requests.task import Task
 from openarm_grasp.strategies import registry
 from openarm_grasp.strategies.pick_and_place import pick_and_place
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
-from openarm_grasp.strategies.task import Task
 from tests.openarm_grasp.scripted import Follow, standing
 
 

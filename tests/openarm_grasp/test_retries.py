@@ -17,8 +17,8 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.planning.candidates import propose
 from openarm_grasp.planning.retries import FailedGrasp, ways
+from openarm_grasp.requests.states import State
 from openarm_grasp.robot.interface import PlanGrasp, Planned, PlanPlace
-from openarm_grasp.strategies.states import State
 from tests.openarm_grasp.scripted import World, standing
 
 CONFIG = GraspConfig()

@@ -16,8 +16,8 @@ from openarm_evaluation.campaign.robot import SimulatedSenses
 from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import Trials
 from openarm_grasp.config import GraspConfig
+from openarm_grasp.requests.task import Status
 from openarm_grasp.robot.interface import Frames, PlanGrasp
-from openarm_grasp.strategies.task import Status
 from tests.openarm_grasp.scripted import Follow
 
 CUBE = SceneObject(name="red_cube", shape="box", size=(0.06, 0.06, 0.05), color="red", position=(0.27, -0.22), yaw=0.3)

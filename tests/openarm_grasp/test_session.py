@@ -14,9 +14,9 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.candidates import Box, propose
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome, Proof
+from openarm_grasp.requests.task import Grasp, GraspSession
 from openarm_grasp.strategies.pair import check_pair
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest, PairOutcome, Proof
-from openarm_grasp.strategies.task import Grasp, GraspSession
 from tests.openarm_grasp.scripted import GoHome, Grip, World, standing
 
 

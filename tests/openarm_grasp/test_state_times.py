@@ -6,8 +6,8 @@ from __future__ import annotations
 import pytest
 
 from openarm_grasp.config import BudgetConfig
-from openarm_grasp.strategies.state_times import StateClock
-from openarm_grasp.strategies.states import State
+from openarm_grasp.requests.state_times import StateClock
+from openarm_grasp.requests.states import State
 from tests.openarm_grasp.scripted import Follow
 
 S = State

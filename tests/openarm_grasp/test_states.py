@@ -8,8 +8,8 @@ import itertools
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_grasp.requests.states import SUCCESSORS, State, as_text, check_transition, mermaid
 from openarm_grasp.strategies import pick_and_place as steps
-from openarm_grasp.strategies.states import SUCCESSORS, State, as_text, check_transition, mermaid
 from tests.openarm_grasp.scripted import Follow, Observe
 
 S = State

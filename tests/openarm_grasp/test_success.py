@@ -13,7 +13,7 @@ import pytest
 import openarm_grasp
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
-from openarm_grasp.strategies.request import Feasible, GraspOutcome, Proof
+from openarm_grasp.requests.request import Feasible, GraspOutcome, Proof
 
 HELD = GripperVerdict(Code.OK, "held")
 AT_PLACE = CameraVerdict(Code.OK, "2 mm from its target")

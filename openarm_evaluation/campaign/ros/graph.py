@@ -24,7 +24,7 @@ from openarm_evaluation.campaign.tasks.task import Task
 from openarm_evaluation.campaign.trial import add_clearance, crashed_row, row_of
 from openarm_evaluation.judging.arm_clearance import least_clearance
 from openarm_evaluation.judging.trial import run_pair, run_trial
-from openarm_grasp.strategies.request import GraspRequest
+from openarm_grasp.requests.request import GraspRequest
 
 if TYPE_CHECKING:
     from openarm_evaluation.judging.ros.observer import Observer

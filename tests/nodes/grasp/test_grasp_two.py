@@ -17,8 +17,8 @@ from rclpy.task import Future
 
 from openarm_bringup import cli
 from openarm_common.errors import Code
+from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.ros.client import GraspClient, PairResult
-from openarm_grasp.strategies.request import GraspRequest
 
 STATES = "DETECT TRANSFORM PLAN MOVE_TO_PREGRASP MOVE_TO_GRASP CLOSE_GRIPPER LIFT PLACE RESET IDLE"
 

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.perception.detections import Frame, apart
-from openarm_grasp.robot.interface import Planned, Trajectory
 
 if TYPE_CHECKING:
+    from openarm_grasp.requests.task import Task
+    from openarm_grasp.robot.interface import Planned, Trajectory
     from openarm_grasp.robot.skills import Skills
-    from openarm_grasp.strategies.task import Task
 
 #: Names of the parts of a plan, as they are shown.
 GRASP = ("transfer", "approach", "lift")

@@ -5,21 +5,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.wanted import fits
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.drift import DriftWatch
-from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.evidence.verdicts import GripperVerdict, Verdict
 from openarm_grasp.perception.detections import Sighting
 from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
-from openarm_grasp.robot.skills import Skills
-from openarm_grasp.strategies.confirm import PlanGate, ShownPlan
-from openarm_grasp.strategies.request import GraspOutcome, GraspRequest
-from openarm_grasp.strategies.state_times import StateClock
-from openarm_grasp.strategies.states import State
+from openarm_grasp.requests.confirm import PlanGate, ShownPlan
+from openarm_grasp.requests.request import GraspOutcome, GraspRequest
+from openarm_grasp.requests.state_times import StateClock
+from openarm_grasp.requests.states import State
+
+if TYPE_CHECKING:
+    from openarm_grasp.robot.skills import Skills
 
 
 # --- what outlives a request
@@ -38,6 +41,23 @@ class Grasp:
     sighting: Sighting
     candidate: GraspCandidate
     places: tuple[PlaceTarget, ...]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An object that was put down.
+
+    Attributes:
+        target: Where.
+        gripper: That the hand held it above that place.
+        reason: How it was put down.
+        failure: Why it was put back where it came from; None when it was put where it belongs.
+    """
+
+    target: PlaceTarget
+    gripper: GripperVerdict
+    reason: str
+    failure: Verdict | None = None
 
 
 class GraspSession:

@@ -7,7 +7,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 from openarm_grasp.config import BudgetConfig
-from openarm_grasp.strategies.states import State
+from openarm_grasp.requests.states import State
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,17 @@ class State(Enum):
     RESET = "RESET"
 
 
+class Hand(Enum):
+    """Where the hand is, as far as known; it decides the way home."""
+
+    FREE = "away from objects, empty"
+    AT_OBJECT = "around the object or straight above its grasp, empty"
+    HOLDING = "around the object or straight above its grasp, holding it"
+    CARRYING = "elsewhere, holding the object"
+    RELEASED = "around the object that it has put down"
+    CLEAR = "away from the object that it has put down"
+
+
 _STOP = "cancelled, timed out, or the robot is lost: the arm holds"
 
 #: The states that may follow each state, and when. A state that follows itself is another step of the same work.

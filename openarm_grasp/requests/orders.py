@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 from openarm_common.config import Config, load_config
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import Interval
-from openarm_grasp.strategies.request import GraspRequest
+from openarm_grasp.requests.request import GraspRequest
 
 #: (x, y), base frame, m.
 Spot = tuple[float, float]

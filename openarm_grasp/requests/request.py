@@ -7,14 +7,17 @@ import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_grasp.config import DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
 from openarm_grasp.perception.detections import Frame, Sighting, find
 from openarm_grasp.planning.arms import arm_order
-from openarm_grasp.planning.options import Option
-from openarm_grasp.strategies.state_times import StateTime
+from openarm_grasp.requests.state_times import StateTime
+
+if TYPE_CHECKING:
+    from openarm_grasp.planning.options import Option
 
 #: What a request may ask for.
 PHASES = ("all", "pick", "place")

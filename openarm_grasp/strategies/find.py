@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find an object and plan how to grasp and place it: frames until it can be trusted, then both arms. Base frame, m."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import TYPE_CHECKING
+
+from openarm_common.detection import Detection
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.wanted import describe
+from openarm_grasp.evidence.verdicts import Verdict
+from openarm_grasp.perception.detections import Frame, Sighting, in_view, on_table
+from openarm_grasp.planning import retries
+from openarm_grasp.planning.arms import ARMS, arm_order, out_of_reach
+from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
+from openarm_grasp.planning.options import NoWayError, not_placeable, options_of, planned
+from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets
+from openarm_grasp.requests.confirm import GRASP, PLACE, agree, outdated
+from openarm_grasp.requests.states import State
+from openarm_grasp.requests.task import Grasp
+from openarm_grasp.robot.interface import Frames, Planned
+from openarm_grasp.robot.skills import reraise_stop
+
+if TYPE_CHECKING:
+    from openarm_grasp.strategies.run import Run
+
+#: An object that is observed so may be trusted in the next frames.
+_NOT_TRUSTED = (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT, Code.STALE_DATA)
+
+
+class NoGraspError(OpenArmError):
+    """No grasp, or no place for what is grasped, could be planned."""
+
+
+async def find_grasp(run: Run, why: str) -> tuple[Grasp, Planned | None, str]:
+    """Find an object and plan how to grasp it; without a plan, for what the hand holds already.
+
+    Returns:
+        The grasp, its trajectories, and why it was chosen.
+
+    Raises:
+        OpenArmError: When the object is refused.
+    """
+    while True:
+        sighting = await detect(run, why)
+        if run.kept is not None:
+            grasp = run.grasp = _grasp(run, run.kept.arm, sighting, run.kept.candidate)
+            why = f"the {grasp.arm} hand holds {run.label!r}; {len(grasp.places)} ways to place it"
+            if run.request.dry_run:
+                _, target = await plan_place(run, grasp, grasp.places, why)
+                why = f"place {target}"
+            return grasp, None, why
+        try:
+            return await plan(run, sighting)
+        except NoGraspError as error:
+            run.fail(error.code, error.message)
+            run.plans_failed += 1
+            if run.plans_failed >= run.config.limits.plan_attempts:
+                raise
+            run.forget()
+            why = error.message
+
+
+async def detect(run: Run, why: str) -> Sighting:
+    """Clear the camera's view and observe until an object can be trusted.
+
+    Raises:
+        OpenArmError: When there is none after the rounds that are allowed, or no frame at all.
+    """
+    while True:
+        run.enter(State.DETECT, why)
+        await _clear_view(run)
+        seen = await run.robot.observe(run.config.detect.frames)
+        text = f"in view: {describe([d for frame in seen.frames for d in frame.detections])}"
+        if run.kept is not None:
+            text = f"holding {run.label!r}; {text}"
+        elif missing := _missing(run, seen):
+            run.enter(State.IDLE, run.missed_round(missing.code, missing.message))
+            why = "the next frame has come"
+            try:
+                await run.robot.observe(1)
+            except OpenArmError as error:
+                reraise_stop(error)
+                why = error.message  # the next round observes all the same
+            continue
+        run.enter(State.TRANSFORM, text)
+        run.robot.stop_observing()
+        try:
+            return _locate(run, run.robot.in_base(seen).frames)
+        except OpenArmError as error:
+            if error.code not in _NOT_TRUSTED:
+                raise
+            why = run.missed_round(error.code, error.message)
+            run.forget()
+
+
+def _missing(run: Run, seen: Frames) -> OpenArmError | None:
+    """Why nothing in view is what is asked for; None when something is."""
+    try:
+        in_view(run.robot.in_base(seen).frames, run.request.label)
+    except OpenArmError as error:
+        return error if error.code in (Code.NOTHING_DETECTED, Code.UNKNOWN_OBJECT) else None
+    return None
+
+
+async def _clear_view(run: Run) -> None:
+    """Send the arms home that may hide something. A dry run moves nothing, nor does what nobody has confirmed yet."""
+    if run.request.dry_run or run.request.confirm or run.missed > 0 or run.plans_failed > 0:
+        return
+    if run.kept is not None:
+        # A hand that holds something stays where it is; it may be among the objects.
+        await run.robot.go_home([arm for arm in ARMS if arm not in run.task.session.kept])
+    else:
+        await run.robot.go_home(ARMS, back_off_below=run.context.clear_of_objects)
+
+
+def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
+    """The object and its neighbours in frames of the base frame.
+
+    Raises:
+        OpenArmError: One of `_NOT_TRUSTED`, when it cannot be trusted.
+    """
+    request, limits, top_z, kept = run.request, run.config.detect, run.context.table.top_z, run.kept
+    if kept is not None:
+        newest = frames[-1]
+        others = (d for d in newest.detections if d.label != kept.sighting.target.label)
+        sighting = Sighting(kept.sighting.target, _standing(others, top_z), newest.t_ns)
+    else:
+        found = request.find(frames, limits)
+        target = on_table(found.target, top_z)
+        sighting = replace(found, target=target, others=_standing(found.others, top_z))
+    age = (run.robot.now_ns - sighting.t_ns) * 1e-9
+    if age > limits.max_age:
+        text = f"the newest detection is {age:.2f} s old, expected at most {limits.max_age:g} s"
+        raise OpenArmError(Code.STALE_DATA, text)
+    run.findings.sighting = sighting
+    if kept or run.size is None or any(d.label == sighting.target.label for d in sighting.others):
+        run.size = sighting.target.size
+    return sighting
+
+
+def _standing(found: Iterable[Detection], table_z: float) -> tuple[Detection, ...]:
+    """What stands on the table; what is flat on it is no obstacle."""
+    return tuple(on_table(d, table_z) for d in found if d.top > table_z + 0.005)
+
+
+async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
+    """Plan the grasp, and the place where one is asked for or nothing may move; with each arm that may reach.
+
+    Raises:
+        NoGraspError: With what each arm lacks.
+        OpenArmError: When the place is not one, or the object does not fit into a hand.
+    """
+    request, target, table = run.request, sighting.target, run.context.table
+    if request.place is not None:
+        check_position(request.place, target, sighting.others, table)
+    run.options, why = {}, ""
+    arms = arm_order(request.arm, float(target.p_base[1]), run.config.approach.overlap_half_width)
+    arms = retries.arms_to_try(arms, run.failed)
+    ways = {arm: run.ways(arm, sighting) for arm in arms}
+    where = "({:.3f}, {:.3f}, {:.3f}) m".format(*target.p_base)
+    for repeats, run.arm in product((False, True), arms):
+        offered = ways[run.arm].repeats if repeats else ways[run.arm].fresh
+        if not offered:
+            continue
+        run.options |= options_of(run.arm, offered, target, run.config.approach)
+        text = f"{why}; trying the {run.arm} arm" if why else f"{target.label!r} stands at {where}"
+        text += f"; {len(offered)} ways to grasp it" + ("; all that is left has failed before" if repeats else "")
+        try:
+            return await _plan_with(run, sighting, offered, text)
+        except NoGraspError as error:
+            run.findings.refusals[run.arm] = Verdict(error.code, error.message)
+            why = error.message
+    run.arm = ""
+    refusals = run.findings.refusals
+    codes = {refusal.code for refusal in refusals.values()}
+    why = "; ".join(f"{arm} arm: {v.reason.removeprefix(f'{arm} arm: ')}" for arm, v in refusals.items())
+    if codes == {Code.UNREACHABLE} and not run.findings.place_refused:
+        run.enter(State.PLAN, "out of reach; asking how near the arms come")
+        try:
+            distances = await run.robot.reach(arms, run.offered[0].T_base_tcp)
+        except OpenArmError as error:
+            reraise_stop(error)
+            distances = {}
+        why = f"{out_of_reach(f'{target.label!r} at {where}', distances)} ({why})"
+    raise NoGraspError(codes.pop() if len(codes) == 1 else Code.NO_PLAN, why)
+
+
+async def _plan_with(
+    run: Run, sighting: Sighting, offered: tuple[GraspCandidate, ...], why: str
+) -> tuple[Grasp, Planned, str]:
+    """Plan with one arm; a grasp after which the object cannot be placed is replaced by another."""
+    arm, request = run.arm, run.request
+    while True:
+        run.offered = offered
+        run.enter(State.PLAN, why)
+        try:
+            found = await run.robot.plan_grasp(arm, offered, sighting)
+        except OpenArmError as error:
+            reraise_stop(error)
+            refusals = error.refusals if isinstance(error, NoWayError) else {}
+            run.options = planned(run.options, arm, offered, -1, refusals, ())
+            raise NoGraspError(error.code, error.message) from error
+        run.options = planned(run.options, arm, offered, found.chosen, found.refusals, found.limit_margins)
+        candidate = offered[found.chosen]
+        # Also without a place that is asked for: no free spot is a reason not to lift.
+        grasp = run.grasp = _grasp(run, arm, sighting, candidate)
+        chosen = f"grasp {candidate.id} with the {arm} arm"
+        if request.place is None and not (request.dry_run or (request.confirm and request.phase == "all")):
+            return grasp, found, chosen
+        run.enter(State.PLAN, f"{chosen}; planning the place")
+        try:
+            # From the end of the lift; PLACE plans from where the arm then is.
+            end = await run.robot.plan_place(arm, grasp.places, sighting, candidate, found.retreat)
+        except OpenArmError as error:
+            reraise_stop(error)
+            run.findings.place_refused = True
+            why = f"it could grasp, but not place: {error.message.removeprefix(f'{arm} arm: ')}"
+            # Held by other faces or leaning otherwise, it may come to stand where it is wanted.
+            left = other_grasps(offered, candidate, error.code, sighting.target, request.place_yaw)
+            dropped = [c for c in offered if c not in left]
+            run.options = not_placeable(run.options, arm, dropped, candidate, Verdict(error.code, why))
+            run.grasp = None
+            if not left:
+                raise NoGraspError(error.code, why) from error
+            offered, why = left, f"{why}; trying another grasp"
+            continue
+        run.place_target = grasp.places[end.chosen]
+        run.place_plan = end if request.confirm and request.phase == "all" else None
+        return grasp, found, f"{chosen}, place {run.place_target}"
+
+
+def _grasp(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) -> Grasp:
+    """A grasp with the ways to put the object down: where it was asked for, or on free spots."""
+    request, target, others, table = run.request, sighting.target, sighting.others, run.context.table
+    if request.place is not None:
+        spots = (check_position(request.place, target, others, table),)
+    else:
+        spots = free_spots(arm, target, others, run.config)
+    yaw = request.place_yaw
+    return Grasp(
+        arm, sighting, candidate, place_targets(target, candidate, spots, run.config, run.used_places, yaw=yaw)
+    )
+
+
+async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why: str) -> tuple[Planned, PlaceTarget]:
+    """Plan from where the arm is how to put the object down in one of these ways, unless that is confirmed already."""
+    run.enter(State.PLACE, why)
+    run.robot.stop_observing()
+    ready, run.place_plan = run.place_plan, None
+    if ready is not None:
+        why = await outdated(run.robot, (ready,), ready.start, run.config.confirm.joints)
+        if not why:
+            return ready, ways[ready.chosen]
+        run.enter(State.PLACE, f"the confirmed place has to be planned anew: {why}")
+    while True:
+        plan = await run.robot.plan_place(grasp.arm, ways, grasp.sighting, grasp.candidate)
+        target = ways[plan.chosen]
+        why = await agreed(run, State.PLACE, grasp, f"place {target} with the {grasp.arm} arm", place=plan)
+        if not why:
+            return plan, target
+        run.enter(State.PLACE, why)
+
+
+async def agreed(
+    run: Run, state: State, grasp: Grasp, why: str, plan: Planned | None = None, place: Planned | None = None
+) -> str:
+    """Let a person confirm what is planned; returns why it has to be planned anew, "" when it has not."""
+    plans = [(names, part) for names, part in ((GRASP, plan), (PLACE, place)) if part is not None]
+    standing = (grasp.sighting.target, *grasp.sighting.others) if state is State.PLAN else ()
+    return await agree(
+        run.task, grasp.arm, why, plans, lambda text, shown: run.enter(state, text, shown), standing=standing
+    )
