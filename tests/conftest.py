@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+import hypothesis
 import pytest
 
 from openarm_common.domain import release_domain, reserve_domain
@@ -23,6 +24,11 @@ from openarm_common.domain import release_domain, reserve_domain
 os.environ["ROS_DOMAIN_ID"] = str(reserve_domain())
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ.setdefault("MUJOCO_GL", "egl")
+
+# A run of the suite draws the same examples every time and times none; `--hypothesis-profile=explore` draws new ones.
+hypothesis.settings.register_profile("suite", deadline=None, derandomize=True)
+hypothesis.settings.register_profile("explore", deadline=None)
+hypothesis.settings.load_profile("suite")
 
 
 class MachineLock:

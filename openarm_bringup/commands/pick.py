@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from openarm_interfaces.msg import GraspStatus
 
     from openarm_grasp.planning.options import Option
-    from openarm_grasp.ros.client import GraspResult, PairResult
     from openarm_grasp.requests.state_times import StateTime
+    from openarm_grasp.ros.client import GraspResult, PairResult
 
 
 Arm = Literal["auto", "left", "right"]
@@ -68,8 +68,8 @@ def pick(
     if second and confirm:
         raise OpenArmError(Code.INVALID_ARGUMENT, "--confirm is of one object; use --dry-run to see the plan of two")
     join_graph(domain)
-    from openarm_grasp.ros.client import GraspClient
     from openarm_grasp.requests.request import GraspRequest
+    from openarm_grasp.ros.client import GraspClient
 
     wanted: list[dict[str, Any]] = [
         {

@@ -32,14 +32,14 @@ from openarm_evaluation.judging.trial import Step, Trial, choose_targets
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.planning.arms import ARMS
-from openarm_grasp.robot.interface import RobotInterface
-from openarm_grasp.robot.skills import Skills
 from openarm_grasp.requests.orders import Order
-from openarm_grasp.strategies.pair import Pair
-from openarm_grasp.strategies.registry import carry_out, carry_out_pair
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 from openarm_grasp.requests.task import GraspSession, Status
 from openarm_grasp.requests.task import Task as GraspTask
+from openarm_grasp.robot.interface import RobotInterface
+from openarm_grasp.robot.skills import Skills
+from openarm_grasp.strategies.pair import Pair
+from openarm_grasp.strategies.registry import carry_out, carry_out_pair
 from openarm_sim_bridge.faults.faults import checked_fault
 
 _SETTLE_S = 0.5

@@ -37,7 +37,7 @@ def d435(z: np.ndarray, seed: int = 0) -> np.ndarray:
     return np.nan_to_num(np.round(noisy * 1e3)).astype(np.uint16)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.booleans(), st.integers(1, 8), st.integers(1, 12), st.integers(1, 9))
 def test_it_does_what_it_says(seed: int, metres: bool, neighbours: int, width: int, height: int) -> None:
     """Any image of any size, holes, values that are not numbers and borders included: as computed pixel by pixel."""

@@ -50,7 +50,7 @@ def test_an_empty_map_has_no_bytes() -> None:
     assert np.isnan(values).all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1))
 @pytest.mark.requirement("A-57")
 def test_binary_round_trip(seed: int) -> None:
@@ -61,7 +61,7 @@ def test_binary_round_trip(seed: int) -> None:
     np.testing.assert_array_equal(np.where(np.isnan(values), 0, np.where(values > 0, 2, 1)), states)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1))
 @pytest.mark.requirement("A-57")
 def test_full_round_trip(seed: int) -> None:
@@ -85,7 +85,7 @@ def test_what_lies_outside_of_a_box_is_counted() -> None:
         leaves.on(half.coarser(1))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=400), st.booleans())
 def test_random_bytes_are_read_or_refused_never_worse(data: bytes, binary: bool) -> None:
     try:
@@ -96,7 +96,7 @@ def test_random_bytes_are_read_or_refused_never_worse(data: bytes, binary: bool)
         assert np.isfinite(leaves.log_odds).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data())
 def test_a_damaged_file_is_refused_or_reads_as_some_tree(tmp_path_factory, data) -> None:
     """Cut, lengthened or with bytes changed; a change that leaves a well-formed tree can't be seen."""

@@ -45,7 +45,7 @@ def truth(kind: str, points: np.ndarray, padding: float) -> np.ndarray:
     return x * x + y * y + z * z <= (0.15 + padding) ** 2
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.sampled_from(list(GEOMETRY)), st.integers(0, 2**32 - 1))
 @pytest.mark.requirement("P-05")
 def test_pixels_in_the_padded_shape_and_no_others_are_labelled(kind: str, seed: int) -> None:

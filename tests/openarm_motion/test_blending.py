@@ -32,7 +32,7 @@ def excess(trajectory: Trajectory, limits: JointLimits) -> list[float]:
     return [float(np.max(np.abs(value) / limit)) for value, limit in used]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.lists(st.floats(-2.5, 2.5), min_size=3, max_size=3), min_size=2, max_size=6))
 def test_blends_hold_limits_and_stay_in_the_corners_triangles(points: list[list[float]]) -> None:
     waypoints = np.array(points)

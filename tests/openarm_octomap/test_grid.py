@@ -108,7 +108,7 @@ def test_a_cloud_gives_the_same_map_as_its_image(accumulated, reference) -> None
     np.testing.assert_array_equal(grid.log_odds, accumulated.log_odds)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_every_ray_is_free_up_to_its_end(seed: int, limited: bool) -> None:
     """Any pose, any image: cells on the way to a surface (sampled) are free unless a surface is in them."""
@@ -307,7 +307,7 @@ def test_scans_that_do_not_fit_are_refused_by_name(depth, intrinsics, T, code) -
     assert error.value.code == code
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data())
 @pytest.mark.requirement("B-28")
 def test_no_image_harms_the_map(data) -> None:

@@ -29,7 +29,7 @@ def reference(depth, scale: float, intrinsics: Intrinsics, limits: DepthLimits):
     return np.stack([x, y, z], axis=-1)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(hnp.arrays(np.uint16, (12, 16), elements=st.integers(0, 2500).filter(lambda d: d not in (200, 2000))))
 @pytest.mark.requirement("A-47", "B-29")
 def test_millimetres_equal_the_pinhole_written_out(depth) -> None:
@@ -43,7 +43,7 @@ def test_millimetres_equal_the_pinhole_written_out(depth) -> None:
     np.testing.assert_allclose(kept, expected[np.isfinite(expected[..., 2])], atol=1e-6)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(hnp.arrays(np.float32, (12, 16), elements=st.floats(0.0, 2.5, width=32) | st.just(float("nan"))))
 @pytest.mark.requirement("A-47")
 def test_metres_equal_the_pinhole_written_out(depth) -> None:

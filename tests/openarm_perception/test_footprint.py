@@ -35,7 +35,7 @@ def circle(diameter: float, centre=(0.0, 0.0), noise: float = 0.0005):
     return points + np.random.default_rng(2).normal(0.0, noise, points.shape) + centre
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.tuples(st.floats(0.04, 0.115), st.floats(0.04, 0.115)),
     st.floats(-math.pi, math.pi),
@@ -58,7 +58,7 @@ def test_rectangles_are_found_at_any_yaw(edges: tuple[float, float], yaw: float,
     assert abs(math.degrees(error)) < 1.0
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(0.04, 0.08), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 @pytest.mark.requirement("B-43")
 def test_circles_are_found_and_have_any_yaw(diameter: float, x: float, y: float) -> None:

@@ -22,7 +22,7 @@ K = Intrinsics.from_fovy(640, 480, 60.0)
 FLAT = (0.0, 0.0, 1.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1))
 @pytest.mark.requirement("B-31")
 def test_a_point_of_any_plane_comes_back_for_any_attitude_of_the_camera(seed: int) -> None:
