@@ -43,6 +43,8 @@ def pick(
 ) -> Outcome:
     """Pick an object and place it, or two simultaneously; the states are shown while it runs, Ctrl-C cancels it.
 
+    A second Ctrl-C, while the first waits for the answer to the cancel, is the emergency stop.
+
     `openarm pick red blue` picks two objects with both arms in parallel, or one after the other where the arms would
     come too near to each other. Options of two objects are given once for each: `--arm left --arm right`.
 
@@ -90,8 +92,12 @@ def pick(
                 return _of_two(client.pick_two(first, other, **run), dry_run=dry_run)
             ask = confirm and (_runs if sys.stdin.isatty() else True)
             result = client.pick(**wanted[0], phase=phase, confirm=ask, **run)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as interrupt:
             asked = {"labels": labels} if second else {"label": label}
+            if isinstance(interrupt.__context__, KeyboardInterrupt):  # the second, while the first waits for the cancel
+                from openarm_bringup.ros.stop_client import emergency_stop
+
+                return Outcome(False, f"emergency stop: {emergency_stop()[1]}", Code.STOPPED, asked)
             return Outcome(False, "cancelled by Ctrl-C; the robot holds where it is", Code.CANCELLED, asked)
     times = _times_line(result.state_times)
     data, options = {**_result_row(result), "dry_run": dry_run}, result.options if dry_run else ()

@@ -297,14 +297,16 @@ def send(name: str, *goal: str, feedback: bool = False, timeout: float = 300.0, 
         found, kind = peer.find("action", name)
         filled = fill(interface(kind).Goal(), fields_of(goal, found, kind))
         client = peer.action_client(interface(kind), found)
-        handle = peer.result(client.send_goal_async(filled, feedback_callback=on_feedback), 10.0, found)
+        died = client.watch()
+        handle = peer.result(client.send_goal_async(filled, feedback_callback=on_feedback), 10.0, found, died)
         if not handle.accepted:
             return Outcome(False, f"{found} refused the goal", Code.INVALID_ARGUMENT, {"action": found})
         future = handle.get_result_async()
         try:
-            result = peer.result(future, timeout, found)
+            result = peer.result(future, timeout, found, died)
         except (KeyboardInterrupt, OpenArmError):
-            peer.result(handle.cancel_goal_async(), 5.0, f"cancelling {found}")
+            if not died():
+                peer.result(handle.cancel_goal_async(), 5.0, f"cancelling {found}")
             raise
     return _answered(to_data(result.result, _LONGEST), {"action": found, "type": kind, "status": result.status})
 

@@ -30,7 +30,7 @@ def up(
     viz: bool = False,
     viz_port: int = 8765,
 ) -> Outcome:
-    """Start the nodes of a graph, and stop them at Ctrl-C (a second Ctrl-C hurries).
+    """Start the nodes of a graph, and stop them at Ctrl-C (a second Ctrl-C: emergency stop, and hurry).
 
     Args:
         graph: Name of a graph (sim, sim_only, perception, motion) or a file.

@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -23,6 +22,7 @@ from openarm_bringup.messages import to_data
 from openarm_bringup.suggest import unknown
 from openarm_bringup.supervision import runs
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.actions import ActionClient
 from openarm_common.ros.client import ContextNode
 from openarm_common.ros.convert import transform_to_matrix
 from openarm_common.ros.node import QOS_STATIC_TF, QOS_TF, offered_qos
@@ -149,13 +149,13 @@ class Peer(ContextNode):
         ]
         return sorted(rows, key=lambda row: row["node"])
 
-    def action_client(self, kind: Any, name: str) -> Any:
+    def action_client(self, kind: Any, name: str) -> ActionClient:
         """A client of an action whose server answers.
 
         Raises:
             OpenArmError: NOT_READY, when it does not.
         """
-        client: Any = ActionClient(self.node, kind, name)
+        client = ActionClient(self.node, kind, name)
         self.wait_for(client.server_is_ready, name)
         return client
 

@@ -34,6 +34,10 @@ class Probe(Protocol):
         """Return the names of a node's parameters."""
         ...
 
+    def emergency_stop(self, seconds: float) -> str:
+        """Let the joints hold; return the answer of who commands them, or why there is none within so long."""
+        ...
+
     def close(self) -> None:
         """Leave the graph."""
         ...

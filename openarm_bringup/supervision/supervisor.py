@@ -31,6 +31,9 @@ from openarm_common.errors import Code, OpenArmError
 
 T = TypeVar("T")
 
+#: Longest wait for the answer of the emergency stop before the end is hurried, s.
+_STOP_S = 0.5
+
 
 @dataclass(frozen=True)
 class Event:
@@ -77,6 +80,7 @@ class Supervisor:
         self._guard: asyncio.subprocess.Process | None = None
         self.spawning = asyncio.Lock()
         self.stop_asked = asyncio.Event()
+        self._hurrying: asyncio.Task[None] | None = None
         self.ladder, self.poll = ladder or Ladder(), poll
         self._logs: list[LogFile] = []
         self._log = self.log_file("supervisor")
@@ -141,10 +145,20 @@ class Supervisor:
             self._trouble.result()
 
     def ask_stop(self) -> None:
-        """Ask for the end; a second time: hurry (the next signal at once)."""
-        if self.stop_asked.is_set():
+        """Ask for the end; a second time: emergency stop, and hurry (the next signal at once); then hurry on."""
+        if self._hurrying is not None and self._hurrying.done():
             self.ladder.hurry()
+        elif self._hurrying is None and self.stop_asked.is_set():
+            self._hurrying = asyncio.create_task(self._hold_and_hurry())
         self.stop_asked.set()
+
+    async def _hold_and_hurry(self) -> None:
+        try:
+            async with asyncio.timeout(2.0 * _STOP_S):
+                self.say(f"emergency stop: {await self.ask(lambda probe: probe.emergency_stop(_STOP_S))}")
+        except (TimeoutError, OpenArmError, RuntimeError) as error:  # the last: everything has ended meanwhile
+            self.say(f"no emergency stop: {error!r}")
+        self.ladder.hurry()
 
     async def stop(self) -> None:
         """Stop every node, dependents before their needs, and leave nothing behind."""

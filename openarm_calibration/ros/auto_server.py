@@ -12,7 +12,7 @@ import numpy as np
 from openarm_interfaces.action import AutoCalibrate, MoveArm
 from openarm_interfaces.msg import CollisionBox
 from openarm_interfaces.srv import ComputeCalibration
-from rclpy.action import ActionClient, ActionServer, CancelResponse
+from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 
 from openarm_calibration.handeye.offline import Result
@@ -23,6 +23,7 @@ from openarm_calibration.sampling.samples import SESSION_SUFFIXES, Sample
 from openarm_common import se3
 from openarm_common.asked_files import file_to_write
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.actions import ActionClient, ActionServer, check_alive
 from openarm_common.ros.convert import matrix_to_pose, vector
 from openarm_common.types import Array
 
@@ -215,14 +216,20 @@ class _Run:
         goal = MoveArm.Goal(arm=self._config.arm, kind=MoveArm.Goal.JOINTS, joint_positions=q.tolist())
         goal.velocity_scale = scale
         self._surround(goal)
+        died = self._mover.watch()
         sent = self._mover.send_goal_async(goal)
-        if not await wait_until(self._node, sent.done, _ANSWER):
+        answered = await wait_until(self._node, lambda: sent.done() or bool(died()), _ANSWER)
+        check_alive(died, "/motion/move")
+        if not answered:
             raise OpenArmError(Code.TIMEOUT, f"/motion/move did not answer within {_ANSWER:g} s")
         accepted = sent.result()
         if accepted is None or not accepted.accepted:
             raise OpenArmError(Code.BUSY, "/motion/move refused the goal")
         ended = accepted.get_result_async()
-        in_time = await wait_until(self._node, lambda: ended.done() or stopped(), self._config.move_timeout)
+        in_time = await wait_until(
+            self._node, lambda: ended.done() or stopped() or bool(died()), self._config.move_timeout
+        )
+        check_alive(died, "/motion/move")
         if not ended.done():
             accepted.cancel_goal_async()  # the motion node stops the arm
             await wait_until(self._node, ended.done, _ANSWER)

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple, Self
 
 import rclpy
 from action_msgs.msg import GoalStatus
-from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -20,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.actions import ActionClient, check_alive
 
 #: Period of checks that the server is still there, s.
 _CHECK_S = 0.25
@@ -86,13 +86,22 @@ class ContextNode:
             self._executor.spin_once(timeout_sec=min(left, 0.1))
         return True
 
-    def result(self, future: Any, seconds: float, what: str) -> Any:
+    def result(self, future: Any, seconds: float, what: str, died: Callable[[], str] = str) -> Any:
         """Spin until a future is done and return its result.
 
+        Args:
+            future: Awaited.
+            seconds: Longest wait.
+            what: Does answer, for the error.
+            died: Of `ActionClient.watch`, where that is an action.
+
         Raises:
-            OpenArmError: TIMEOUT, naming `what` did not answer.
+            OpenArmError: TIMEOUT, naming `what` did not answer; NOT_READY, when its server has died.
         """
-        if not self.spin_until(future.done, seconds):
+        in_time = self.spin_until(lambda: future.done() or died(), seconds)
+        if not future.done():
+            check_alive(died, what)
+        if not in_time:
             raise OpenArmError(Code.TIMEOUT, f"{what}: no answer within {seconds:g} s")
         return future.result()
 
@@ -157,7 +166,7 @@ class BackgroundNode(ContextNode):
             meanwhile: Called again and again in the thread of the caller while the goal is active.
 
         Raises:
-            OpenArmError: NOT_READY, when there is no server, or it ends; BUSY, when the goal is refused;
+            OpenArmError: NOT_READY, when there is no server, or it dies; BUSY, when the goal is refused;
                 INVALID_ARGUMENT, when no message can hold the goal; TIMEOUT.
         """
         client: ActionClient = self._client(name, lambda: ActionClient(self._node, kind, name))
@@ -165,18 +174,18 @@ class BackgroundNode(ContextNode):
             raise OpenArmError(Code.NOT_READY, f"no action {name} within {self._timeout:g} s: {_UP}")
         trouble: list[Exception] = []
         deliver = None if on_feedback is None else _guarded(on_feedback, trouble)
-        there = client.server_is_ready
+        there, died = client.server_is_ready, client.watch()
         sent = self._begin(client.send_goal_async, goal, deliver)
-        handle = self._wait(sent, self._timeout, name, there)
+        handle = self._wait(sent, self._timeout, name, there, died=died)
         if not handle.accepted:
             raise OpenArmError(Code.BUSY, f"{name} refused the goal")
         try:
             ended = self._begin(handle.get_result_async)
             cancel = partial(self._begin, handle.cancel_goal_async)
-            answer = self._wait(ended, timeout, name, there, stop, cancel, trouble, meanwhile)
+            answer = self._wait(ended, timeout, name, there, stop, cancel, trouble, meanwhile, died)
         except BaseException:
             # Whatever keeps the caller from waiting (a deadline, Ctrl-C): the robot would continue unattended.
-            _event(self._begin(handle.cancel_goal_async)).wait(2.0)
+            _event(self._begin(handle.cancel_goal_async)).wait(0.1 if died() else 2.0)
             raise
         if answer.status == GoalStatus.STATUS_UNKNOWN:
             raise OpenArmError(Code.NOT_READY, f"{name} no longer knows the goal: its node was restarted")
@@ -212,12 +221,14 @@ class BackgroundNode(ContextNode):
         cancel: Callable[[], object] = lambda: None,
         trouble: Sequence[Exception] = (),
         meanwhile: Callable[[], None] = lambda: None,
+        died: Callable[[], str] = str,
     ) -> Any:
         done = _event(future)
         deadline = time.monotonic() + timeout
         missed, stopped = 0, False
         while not done.wait(_CHECK_S):
             meanwhile()
+            check_alive(died, name)
             missed = 0 if there() else missed + 1
             if missed > _GONE:
                 raise OpenArmError(Code.NOT_READY, f"the server of {name} is gone")

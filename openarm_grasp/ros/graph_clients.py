@@ -13,13 +13,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from rclpy.action import ActionClient
+from action_msgs.msg import GoalStatus
 from rclpy.subscription import Subscription
 from rclpy.task import Future
 from unique_identifier_msgs.msg import UUID
 from vision_msgs.msg import Detection3DArray
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.actions import ActionClient, check_alive
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.detections import detections_from_msg
 from openarm_common.ros.node import BASE_FRAME, BaseNode, reliable
@@ -167,7 +168,8 @@ class GraphClients:
         """Send a goal and return its result message; whatever ends the wait early cancels the goal.
 
         Raises:
-            OpenArmError: NOT_READY, without a server; EXECUTION_FAILED, when it rejects the goal; as `until`.
+            OpenArmError: NOT_READY, without a server; ROBOT_LOST, when it dies; EXECUTION_FAILED, when it rejects the
+                goal; as `until`.
         """
         limits = self._config.limits
         try:
@@ -176,9 +178,21 @@ class GraphClients:
             if error.code is Code.TIMEOUT:
                 raise OpenArmError(Code.NOT_READY, f"{what}: its action server is not there") from error
             raise
+        died = client.watch()
+
+        def watch() -> None:
+            nonlocal missed
+            check_alive(died, what, Code.ROBOT_LOST)
+            missed = 0 if client.server_is_ready() else missed + 1
+            if missed > _GONE:
+                raise OpenArmError(Code.ROBOT_LOST, f"{what}: its action server is gone")
+            if guard is not None:
+                guard()
+
+        missed = 0
         sent = client.send_goal_async(goal, goal_uuid=goal_id)
         try:
-            await self.until(sent.done, limits.answer_timeout, f"{what}: acceptance of the goal")
+            await self.until(sent.done, limits.answer_timeout, f"{what}: acceptance of the goal", watch)
         except OpenArmError:
             # Should it be accepted yet, it is withdrawn.
             sent.add_done_callback(lambda f: f.result().cancel_goal_async() if f.result().accepted else None)
@@ -187,16 +201,6 @@ class GraphClients:
         if not handle.accepted:
             raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: the goal was rejected")
         result = handle.get_result_async()
-        missed = 0
-
-        def watch() -> None:
-            nonlocal missed
-            missed = 0 if client.server_is_ready() else missed + 1
-            if missed > _GONE:
-                raise OpenArmError(Code.EXECUTION_FAILED, f"{what}: its action server is gone")
-            if guard is not None:
-                guard()
-
         try:
             await self.until(result.done, limit, what, watch)
         except OpenArmError as error:
@@ -205,7 +209,12 @@ class GraphClients:
             while not result.done() and time.monotonic() < deadline:
                 await self.tick()
             raise
-        return result.result().result
+        answer = result.result()
+        if answer.status == GoalStatus.STATUS_UNKNOWN:
+            raise OpenArmError(
+                Code.ROBOT_LOST, f"{what}: {client.name} no longer knows the goal: its node was restarted"
+            )
+        return answer.result
 
     # --- observing
     async def observe(self, count: int, topic: str, limit: float) -> Frames:

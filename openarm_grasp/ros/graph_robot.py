@@ -11,13 +11,13 @@ import numpy as np
 from control_msgs.action import GripperCommand, ParallelGripperCommand
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
 from openarm_interfaces.srv import ComputeIK, GetScene
-from rclpy.action import ActionClient
 from rclpy.client import Client
 from rclpy.task import Future
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.ros.actions import ActionClient, check_alive
 from openarm_common.ros.holds import Holder
 from openarm_common.ros.node import BASE_FRAME, BaseNode
 from openarm_common.types import Array
@@ -228,8 +228,10 @@ class GraphRobot:
         return int(answer.version)
 
     async def _answer(self, client: Client, request: object, what: str) -> Any:
-        answered = client.call_async(request)
-        await self._nodes.until(answered.done, self._config.limits.answer_timeout, what)
+        """Ask a service of the motion node."""
+        answered, died = client.call_async(request), self._plan.watch()
+        check = lambda: check_alive(died, what, Code.ROBOT_LOST)  # noqa: E731
+        await self._nodes.until(answered.done, self._config.limits.answer_timeout, what, check)
         return answered.result()
 
     async def follow(

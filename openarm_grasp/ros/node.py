@@ -15,13 +15,14 @@ from typing import Any, TypeVar
 from openarm_interfaces.action import Pick, PickTwo
 from openarm_interfaces.msg import GraspStatus
 from openarm_interfaces.srv import ConfirmPlan, Grasp, ReleaseHand
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
+from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
 from openarm_grasp.config import GraspConfig
@@ -144,7 +145,7 @@ class GraspNode(BaseNode[GraspConfig]):
         return CancelResponse.ACCEPT
 
     def _serve(self, kind: Any, name: str, execute: Callable[[ServerGoalHandle], Any]) -> ActionServer:
-        return ActionServer(self, kind, name, execute_callback=execute, cancel_callback=self._on_cancel)
+        return ActionServer(self, kind, name, execute, cancel_callback=self._on_cancel)
 
     # --- requests
     async def _one(self, request: GraspRequest, on_status: OnStatus | None = None) -> GraspOutcome:

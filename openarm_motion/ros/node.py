@@ -14,12 +14,13 @@ from typing import Any, TypeVar
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, PlanApproach
 from openarm_interfaces.msg import Refusal
 from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import CancelResponse
 from rclpy.action.server import ServerGoalHandle
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.distance_field import DistanceFieldReader, field_path
+from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix
 from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, BaseNode, run

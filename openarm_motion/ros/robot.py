@@ -8,13 +8,16 @@ from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
+from action_msgs.msg import GoalInfo
 from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionClient
 from rclpy.task import Future, Task
 from unique_identifier_msgs.msg import UUID
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.lifeline import Lifeline
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.ros.actions import LEASE, latest, owner_topic
 from openarm_common.ros.convert import ns_to_stamp, trajectory_to_msg
 from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import BaseNode
@@ -116,23 +119,28 @@ class Controller:
         self.name = name
         self._goal_id = goal_id
         self._client = ActionClient(node, FollowJointTrajectory, name)
+        self._owner = node.create_publisher(GoalInfo, owner_topic(name), LEASE.offer(latest()))
 
     def ready(self) -> bool:
         """Whether its action is in the graph."""
         return self._client.server_is_ready()
 
     def start(self, motion: Motion, begin_ns: int) -> _Goal:
-        """Send a trajectory; its stamp is where it begins."""
+        """Send a trajectory; its stamp is where it begins. The arm holds when this process dies."""
         message = trajectory_to_msg(motion.names, motion.t, motion.q, motion.v, motion.a)
         message.header.stamp = ns_to_stamp(begin_ns)
+        info = GoalInfo(goal_id=self._goal_id())
+        lifeline = Lifeline(bytes(info.goal_id.uuid).hex())
+        self._owner.publish(info)
         goal = FollowJointTrajectory.Goal(trajectory=message)
-        return _Goal(self._client.send_goal_async(goal, goal_uuid=self._goal_id()))
+        return _Goal(self._client.send_goal_async(goal, goal_uuid=info.goal_id), lifeline)
 
 
 class _Goal:
     """A goal that was sent; one that is withdrawn before it is accepted is cancelled when it is."""
 
-    def __init__(self, sent: Future) -> None:
+    def __init__(self, sent: Future, lifeline: Lifeline) -> None:
+        self._lifeline = lifeline
         self._handle: Any = None
         self._ended: Future | None = None
         self._withdrawn = False
@@ -161,6 +169,9 @@ class _Goal:
     def _on_answer(self, sent: Future) -> None:
         self._handle = sent.result()
         if self.accepted:
-            self._ended = self._handle.get_result_async()
+            self._ended = ended = self._handle.get_result_async()
+            ended.add_done_callback(lambda _: self._lifeline.close())
             if self._withdrawn:
                 self._handle.cancel_goal_async()
+        else:
+            self._lifeline.close()

@@ -106,7 +106,11 @@ class Follower(ABC):
         """
 
     def stop(self, why: str) -> None:
-        """Give up a running goal and hold the present command, without a ramp: the emergency stop."""
+        """The emergency stop: as `hold`; goals end with a code of their own."""
+        self.hold(why)
+
+    def hold(self, why: str) -> None:
+        """Give up a running goal and hold the present command, without a ramp."""
         self.abort(why)
         self._hold(self._command.position)
 

@@ -8,10 +8,11 @@ from collections.abc import Callable
 from concurrent.futures import Future as ThreadFuture
 from typing import Any, Generic, TypeVar
 
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action import CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.node import BaseNode
 from openarm_sim_bridge.control.arm import End
 from openarm_sim_bridge.simulation import Simulation

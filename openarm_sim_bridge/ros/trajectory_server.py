@@ -3,6 +3,9 @@
 
 An invalid trajectory (unknown joints, NaN, out of limits, …) is accepted as a goal and aborted at once, because only a
 result can carry the reason to the client: `error_code` INVALID_GOAL or INVALID_JOINTS and `error_string`.
+
+A client that publishes the id of its goal on `owner`, with the liveliness of `openarm_common.ros.actions`, has the arm
+hold when it dies; for other clients goals run to their end, as with ros2_control.
 """
 
 from __future__ import annotations
@@ -10,12 +13,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from action_msgs.msg import GoalInfo
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action.server import ServerGoalHandle
+from rclpy.event_handler import QoSLivelinessChangedInfo, SubscriptionEventCallbacks
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from openarm_common import lifeline
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.actions import LEASE, latest, owner_topic
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_common.types import Array
@@ -67,6 +74,32 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         node.create_timer(STATE_PERIOD_S, self._publish_state, clock=node.steady_clock)
         on_trajectory: Any = self._on_trajectory  # rclpy awaits coroutines; its type hints do not allow them
         node.create_subscription(JointTrajectory, f"{controller}/joint_trajectory", on_trajectory, QOS_COMMAND)
+        self._owned = b""
+        self._owners = 0
+        node.create_subscription(
+            GoalInfo,
+            owner_topic(f"{controller}/follow_joint_trajectory"),
+            self._on_owner,
+            LEASE.watch(latest()),
+            event_callbacks=SubscriptionEventCallbacks(liveliness=self._on_owners, use_default_callbacks=False),
+        )
+
+    def _on_owner(self, info: GoalInfo) -> None:
+        """Take note of a goal that may run only while its owner lives: one of this machine is seen to end at once."""
+        goal = self._owned = bytes(info.goal_id.uuid)
+        lifeline.watch(goal.hex(), lambda: self._lose(goal, "the client of the goal has ended"))
+
+    def _on_owners(self, event: QoSLivelinessChangedInfo) -> None:
+        """Hold when an owner of another machine is gone, or one is stopped."""
+        gone, self._owners = event.alive_count < self._owners, event.alive_count
+        if gone:
+            self._lose(self._owned, f"no sign of life of the goal's client for {LEASE.accepted:g} s")
+
+    def _lose(self, goal: bytes, why: str) -> None:
+        """Hold: nothing watches the motion any more."""
+        running = self._running
+        if running is not None and bytes(running.goal_id.uuid) == goal:
+            self._simulation.call(lambda: self._arm.hold(f"{why}; the arm holds where it is"))
 
     async def _on_trajectory(self, message: JointTrajectory) -> None:
         """Follow a trajectory that comes as a message; a refusal goes to the log."""

@@ -48,6 +48,10 @@ class FileProbe:
     def parameters(self, node: str) -> frozenset[str]:
         return frozenset({"speed"})
 
+    def emergency_stop(self, seconds: float) -> str:
+        (self.folder / "held").touch()
+        return "held"
+
     def close(self) -> None:
         pass
 
@@ -325,7 +329,7 @@ def test_stop_goes_up_the_ladder_int_term_kill(tmp_path: Path, body: str, detail
     assert seconds < 5.0
 
 
-def test_second_ctrl_c_cuts_the_patience_short(tmp_path: Path) -> None:
+def test_second_ctrl_c_is_the_emergency_stop_and_cuts_the_patience_short(tmp_path: Path) -> None:
     async def run_it() -> float:
         run = Running(tmp_path, {"deaf": toy(tmp_path, "deaf", STUBBORN)}, Ladder(30.0, 30.0))
         await run.supervisor.start()
@@ -335,9 +339,12 @@ def test_second_ctrl_c_cuts_the_patience_short(tmp_path: Path) -> None:
         began = time.monotonic()
         run.supervisor.ask_stop()
         stopping = asyncio.create_task(run.supervisor.stop())
+        await asyncio.sleep(0.3)
+        assert not (tmp_path / "held").exists(), "the first only ends the graph"
         while not stopping.done():
-            await asyncio.sleep(0.3)
             run.supervisor.ask_stop()
+            await asyncio.sleep(0.3)
+            assert (tmp_path / "held").exists(), "the second is the emergency stop"
         await stopping
         return time.monotonic() - began
 

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from rcl_interfaces.srv import ListParameters
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
 
 from openarm_bringup.messages import interface
 from openarm_bringup.supervision.graph import Ready
@@ -36,6 +37,7 @@ class ReadinessClient(ContextNode):
         super().__init__(f"openarm_probe_{os.getpid()}", domain=int(environ["ROS_DOMAIN_ID"]))
         self._waiting: dict[str, Subscription] = {}
         self._received: set[str] = set()
+        self._stop = self._node.create_client(Trigger, "/stop")
 
     def known(self, conditions: Sequence[Ready]) -> frozenset[str]:
         """Return the endpoints that fulfil the conditions now; call it before a process is started."""
@@ -68,6 +70,15 @@ class ReadinessClient(ContextNode):
             raise OpenArmError(Code.TIMEOUT, f"{client.srv_name}: no answer within {timeout_s:g} s")
         finally:
             self._node.destroy_client(client)
+
+    def emergency_stop(self, seconds: float) -> str:
+        """Let the joints hold; return the answer of who commands them, or why there is none within so long."""
+        if not self._stop.service_is_ready():
+            return "no node offers /stop"
+        answer = self._stop.call_async(Trigger.Request())
+        if not self.spin_until(answer.done, seconds):
+            return f"/stop did not answer within {seconds:g} s"
+        return str(answer.result().message)
 
     def _met(self, condition: Ready, old: frozenset[str]) -> bool:
         if condition.kind == "message":

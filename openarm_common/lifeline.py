@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Notice at once that a process of the same machine has ended, however it ended and however busy the machine is.
+
+The process listens on a Unix socket in the abstract namespace; the other connects, and reads its end when the kernel
+has closed it. Nothing is sent, and no connection has to be accepted. From another machine (or network namespace) there
+is no such socket: there a lease must do.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable
+
+
+def _address(name: str) -> bytes:
+    return b"\0openarm_lifeline_" + name.encode()
+
+
+class Lifeline:
+    """Shows that this process lives, until it is closed.
+
+    Args:
+        name: Not used by any other at this time.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.bind(_address(name))
+        self._socket.listen()
+
+    def close(self) -> None:
+        """End it."""
+        self._socket.close()
+
+
+def watch(name: str, ended: Callable[[], object]) -> bool:
+    """Call a function, in a thread, when a lifeline ends.
+
+    Args:
+        name: Of the lifeline.
+        ended: Called once.
+
+    Returns:
+        Whether there is such a lifeline on this machine.
+    """
+    connection = socket.socket(socket.AF_UNIX)
+    connection.setblocking(False)
+    try:
+        connection.connect(_address(name))
+    except OSError:
+        connection.close()
+        return False
+    connection.setblocking(True)
+
+    def wait() -> None:
+        with connection, contextlib.suppress(OSError):
+            connection.recv(1)
+        ended()
+
+    threading.Thread(target=wait, name="lifeline", daemon=True).start()
+    return True

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node is killed while a goal runs: clients of a server notice, and the trajectory of a client ends."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from control_msgs.action import FollowJointTrajectory
+
+from openarm_common.config import Config
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.actions import ActionClient
+from openarm_common.ros.client import BackgroundNode
+from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.node import BaseNode
+from openarm_grasp.config import GraspConfig
+from openarm_grasp.ros.graph_clients import GraphClients
+
+pytestmark = pytest.mark.alone
+
+NAME = "/wait"
+#: An arm that comes to rest at once is never further from there, rad.
+RINGING = 0.02
+#: A node whose goals never end.
+SERVER = """
+import rclpy
+from control_msgs.action import FollowJointTrajectory
+from openarm_common.ros.actions import ActionServer
+
+async def wait(handle):
+    handle.publish_feedback(FollowJointTrajectory.Feedback())
+    await Future()
+
+rclpy.init()
+node = rclpy.create_node("waiter")
+server = ActionServer(node, FollowJointTrajectory, "/wait", wait)
+rclpy.spin(node)
+"""
+#: A client that sends the goal of its arguments as the motion node does.
+OWNER = """
+import os, sys
+import numpy as np
+import rclpy
+from unique_identifier_msgs.msg import UUID
+from openarm_common.config import Config
+from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.node import BaseNode
+from openarm_motion.ros.robot import Controller
+from openarm_motion.timing.trajectory import Trajectory
+
+rclpy.init()
+node = BaseNode("owner", Config)
+executor = rclpy.executors.SingleThreadedExecutor()
+executor.add_node(node)
+goal_id = lambda: UUID(uuid=list(os.urandom(16)))
+controller = Controller(node, "/right_joint_trajectory_controller/follow_joint_trajectory", goal_id)
+here, there = (np.array([float(x) for x in part.split(",")]) for part in sys.argv[1:])
+names = tuple(f"openarm_right_joint{i}" for i in range(1, 8))
+t = np.array([0.0, 0.3, 2.7, 3.0])
+speed = (there - here) / 2.7
+q = np.array([here, here + 0.15 * speed, there - 0.15 * speed, there])
+v = np.array([0.0 * speed, speed, speed, 0.0 * speed])
+while not controller.ready():
+    executor.spin_once(timeout_sec=0.1)
+goal = controller.start(Trajectory(names, t, q, v, 0.0 * v), 0)
+executor.spin()
+"""
+
+
+class Children:
+    """Processes of a test."""
+
+    def __init__(self) -> None:
+        self._all: list[subprocess.Popen[bytes]] = []
+
+    def start(self, source: str, *arguments: str) -> subprocess.Popen[bytes]:
+        self._all.append(subprocess.Popen([sys.executable, "-c", source, *arguments]))
+        return self._all[-1]
+
+    def end(self) -> None:
+        for child in self._all:
+            child.kill()
+            child.wait()
+
+
+@pytest.fixture
+def children() -> Iterator[Children]:
+    made = Children()
+    yield made
+    made.end()
+
+
+def killed(process: subprocess.Popen[bytes], number: signal.Signals) -> float:
+    """Send a signal; returns when, monotonic s."""
+    process.send_signal(number)
+    return time.monotonic()
+
+
+@pytest.mark.requirement("R-21")
+def test_a_client_ends_when_its_server_is_stopped_or_killed_and_works_with_the_next(ros, children) -> None:
+    with ThreadPoolExecutor() as pool, BackgroundNode("client") as client:
+        for number in (signal.SIGSTOP, signal.SIGKILL):
+            server = children.start(SERVER)  # the one before is still in discovery, and does not answer
+            running = threading.Event()
+            deliver = lambda _, running=running: running.set()  # noqa: E731
+            goal = FollowJointTrajectory.Goal()
+            work = pool.submit(client.do, FollowJointTrajectory, NAME, goal, timeout=60.0, on_feedback=deliver)
+            assert running.wait(120.0)
+            ros.spin_until(lambda: "waiter" in client._node.get_node_names(), 60.0, "the name of the node")
+            began = killed(server, number)
+            with pytest.raises(OpenArmError, match="/wait: the node waiter is gone") as caught:
+                work.result(20.0)
+            assert time.monotonic() - began < 2.0
+            assert caught.value.code is Code.NOT_READY
+
+
+@pytest.mark.requirement("R-21")
+def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> None:
+    node = ros.add(BaseNode("grasp", Config))
+    clients = GraphClients(node, GraspConfig())
+    clients._silence.check = lambda _: None  # there is no robot
+    clients._timer.reset()
+    client = ActionClient(node, FollowJointTrajectory, NAME)
+    server = children.start(SERVER)
+    ros.spin_until(client.server_is_ready, 60.0, "the server")
+    ros.spin_until(lambda: "waiter" in node.get_node_names(), 60.0, "the name of the node")
+    errors: list[OpenArmError] = []
+
+    async def transfer() -> None:
+        try:
+            await clients.goal(client, FollowJointTrajectory.Goal(), 60.0, "right arm: transfer")
+        except OpenArmError as error:
+            errors.append(error)
+
+    ros.executor.create_task(transfer)
+    ros.spin_until(lambda: client._goal_handles, 20.0, "a goal that runs")
+    began = killed(server, signal.SIGKILL)
+    ros.spin_until(lambda: errors, 20.0, "the end")
+    assert time.monotonic() - began < 2.0
+    assert errors[0].code is Code.ROBOT_LOST
+    assert "right arm: transfer: the node waiter is gone" in errors[0].message
+    assert not client.server_is_ready()
+    client.destroy()
+
+
+@pytest.mark.requirement("R-21")
+def test_an_arm_holds_when_the_process_is_killed_that_sent_its_trajectory(bench, children) -> None:
+    there = [bench.HOME[0] + 2.0, *bench.HOME[1:]]
+    owner = children.start(OWNER, ",".join(map(str, bench.arm)), ",".join(map(str, there)))
+    column = bench.joints[-1].name.index(bench.ARM[0])
+    bench.ros.spin_until(lambda: bench.joints[-1].velocity[column] > 0.5, 120.0, "the arm to move")
+    bench.spin_sim(0.3)
+    owner.kill()
+    killed_ns = bench.node._simulation.robot.state.t_ns
+    bench.spin_sim(1.0)
+    after = [m for m in bench.joints if stamp_to_ns(m.header.stamp) > killed_ns]
+    place = after[-1].position[column]
+    assert place < there[0] - 0.3, "it does not arrive"
+    moving = [m for m in after if abs(m.position[column] - place) > RINGING]
+    assert stamp_to_ns(moving[-1].header.stamp) - killed_ns < 0.2e9
