@@ -46,7 +46,7 @@ COMMANDS = {
     "Messages": ("ros2:topic", "ros2:service", "ros2:action", "ros2:node", "ros2:param"),
     "Record and check": ("record:record", "record:replay", "record:check"),
     "Models and graphs": ("model:model", "graph:graph", "grasp:grasp", f"{EVALUATION}.detector:detector"),
-    "Develop": ("checks:test", "checks:lint", "checks:completion"),
+    "Develop": ("checks:test", "checks:lint", f"{EVALUATION}.chaos:chaos", "checks:completion"),
 }
 
 

@@ -129,6 +129,10 @@ class BackgroundNode(ContextNode):
         self._closing.set()
         self._executor.shutdown(timeout_sec=2.0)
         self._thread.join(timeout=5.0)
+        for client in self._clients.values():
+            if isinstance(client, ActionClient):  # which its node does not destroy; it would keep the participant
+                client.destroy()
+        self._clients.clear()
         super().close()
 
     def call(self, kind: Any, name: str, request: Any, timeout: float = 60.0) -> Any:

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What must hold whatever goes wrong, judged from what was seen; world frame, m, simulated time."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from openarm_common.errors import Code
+from openarm_evaluation.judging.judge import Sample, judge
+
+#: Free fall from a greater height is a drop, m.
+FALL_HEIGHT = 0.010
+#: Joint speed of an arm that nobody moves, rad/s, over `_OVER_S`.
+REST_SPEED = 0.05
+#: Bounds, s of wall clock: of a request, of the notice of a server's death, of the graph's return.
+REQUEST_S, DEATH_S, BACK_S = 180.0, 2.0, 15.0
+
+_G, _FALLING = 9.81, 0.7  # the share of g that only a fall reaches: arms accelerate less
+_OVER_S = 0.1
+#: Longest short fall, s, and the vertical speed of an object at rest, m/s.
+_SHORT_S, _AT_REST = 0.12, 0.05
+
+
+@dataclass(frozen=True)
+class Violation:
+    """Something that must not happen: which rule, and what was seen."""
+
+    rule: str
+    text: str
+
+
+def since_reset(track: Sequence[Sample]) -> list[Sample]:
+    """Return the samples since simulated time last began; that is when the simulation was restarted."""
+    starts = [k for k in range(1, len(track)) if track[k].t_ns < track[k - 1].t_ns]
+    return list(track[starts[-1] if starts else 0 :])
+
+
+def fall_of(track: Sequence[Sample]) -> float:
+    """Return the greatest height that an object fell freely, m; 0 for less than `FALL_HEIGHT`.
+
+    The speed of an object in a fall grows as nothing else makes it grow, and shows how high it fell.
+    """
+    greatest = 0.0
+    for first, second in itertools.pairwise(track):
+        dt = (second.t_ns - first.t_ns) * 1e-9
+        before, after = float(first.linear[2]), float(second.linear[2])
+        if 0.0 < dt < 0.2 and (after - before) / dt < -_FALLING * _G:
+            greatest = max(greatest, after * after / (2.0 * _G))
+    # a short fall has one sample, or none: from rest to rest in less time than an arm takes
+    for first, second in (*itertools.pairwise(track), *zip(track, track[2:], strict=False)):
+        dt = (second.t_ns - first.t_ns) * 1e-9
+        if 0.0 < dt < _SHORT_S and max(abs(float(one.linear[2])) for one in (first, second)) < _AT_REST:
+            greatest = max(greatest, float(first.p_world[2] - second.p_world[2]))
+    return greatest if greatest > FALL_HEIGHT else 0.0
+
+
+def unasked_speed(joints: Sequence[tuple[int, Mapping[str, float]]]) -> tuple[float, str]:
+    """Return the greatest speed of an arm's joint and its name, rad/s, over windows of a tenth of a second."""
+    greatest, which, k = 0.0, "", 0
+    for index, (t_ns, positions) in enumerate(joints):
+        if joints[index - 1 if index else 0][0] > t_ns:  # the simulation was restarted
+            return greatest, which
+        while k < index and t_ns - joints[k + 1][0] >= _OVER_S * 1e9:
+            k += 1
+        dt = (t_ns - joints[k][0]) * 1e-9
+        for name, position in positions.items():
+            if dt >= _OVER_S and "finger" not in name and name in joints[k][1]:
+                speed = abs(position - joints[k][1][name]) / dt
+                greatest, which = max((greatest, which), (speed, name))
+    return greatest, which
+
+
+def falls(tracks: Mapping[str, Sequence[Sample]]) -> list[Violation]:
+    """Return the objects that fell."""
+    heights = {name: fall_of(track) for name, track in tracks.items()}
+    return [
+        Violation("no object falls", f"{name} fell {1e3 * height:.0f} mm freely")
+        for name, height in heights.items()
+        if height
+    ]
+
+
+def claims(track: Sequence[Sample], success: bool, code: Code, outcome: str, place: Sequence[float]) -> list[Violation]:
+    """Return what an answer says that is not so.
+
+    Args:
+        track: Of the object that was asked for, from before the request until it is at rest.
+        success: What the answer claims.
+        code: Of the answer.
+        outcome: Of the answer, as `GraspResult.outcome`; "" when no answer came.
+        place: Where the answer says it was placed.
+    """
+    found: list[Violation] = []
+    if code is Code.INTERNAL:
+        found.append(Violation("no claim without truth", "the answer is INTERNAL, a defect of the suite"))
+    if len(track) < 2 or since_reset(track) != list(track):
+        return found  # the world is another one
+    verdict = judge(track, (float(place[0]), float(place[1])), claimed=success)
+    if verdict.false_success:
+        found.append(Violation("no claim without truth", f"claimed success, but it {'; '.join(verdict.reasons)}"))
+    moved = float(((track[-1].p_world - track[0].p_world) ** 2).sum() ** 0.5)
+    if outcome == "REFUSED" and moved > 0.02:
+        found.append(Violation("no claim without truth", f"claimed never to have touched it; it moved {moved:.3f} m"))
+    return found
