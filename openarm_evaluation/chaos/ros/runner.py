@@ -176,7 +176,7 @@ class _Work:
 
     def round(self, one: Round) -> None:
         """Ask for an object while the fault happens, and judge what was seen."""
-        from openarm_grasp.strategies.request import GraspOutcome
+        from openarm_grasp.requests.request import GraspOutcome
 
         found: list[Violation] = []
         if not self._left:
