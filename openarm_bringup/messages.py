@@ -13,11 +13,9 @@ import yaml
 from openarm_bringup.suggest import unknown
 from openarm_common.config import brief, parse_yaml
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.fields import SEQUENCE, check_field, check_length, wrong
 
 _KINDS = ("msg", "srv", "action")
-_INTEGER = re.compile(r"(?P<unsigned>u?)int(?P<bits>8|16|32|64)|octet")
-#: A field of several values: `of` and `most`, or `array` and `size`.
-SEQUENCE = re.compile(r"^sequence<(?P<of>.+?)(, (?P<most>\d+))?>$|^(?P<array>.+)\[(?P<size>\d+)\]$")
 
 
 def interface(name: str) -> Any:
@@ -75,7 +73,7 @@ def fill(message: Any, data: Any, where: str = "") -> Any:
     if data is None:
         return message
     if not isinstance(data, dict):
-        raise _wrong(where or "the message", data, f"a mapping of {', '.join(fields) or 'nothing'}")
+        raise wrong(where or "the message", data, f"a mapping of {', '.join(fields) or 'nothing'}")
     for name, value in data.items():
         path = f"{where}.{name}" if where else str(name)
         if name not in fields:
@@ -83,7 +81,7 @@ def fill(message: Any, data: Any, where: str = "") -> Any:
         try:
             setattr(message, name, _value(getattr(message, name), fields[name], value, path))
         except (AssertionError, TypeError, ValueError, OverflowError) as error:
-            raise _wrong(path, value, f"{fields[name]} ({error})") from error
+            raise wrong(path, value, f"{fields[name]} ({error})") from error
     return message
 
 
@@ -92,10 +90,8 @@ def _value(present: Any, kind: str, value: Any, where: str) -> Any:
     if match is not None:
         inner = match["of"] or match["array"]
         if not isinstance(value, list | tuple):
-            raise _wrong(where, value, f"a list of {inner}")
-        # The setters of rclpy do not check unless a variable of the environment says so.
-        if (match["size"] and len(value) != int(match["size"])) or len(value) > int(match["most"] or len(value)):
-            raise _wrong(where, value, f"{match['size'] or 'at most ' + match['most']} values")
+            raise wrong(where, value, f"a list of {inner}")
+        check_length(match, len(value), where, value)
         return [_value(None, inner, item, f"{where}[{i}]") for i, item in enumerate(value)]
     if "/" in kind:
         package, _, short = kind.partition("/")
@@ -103,26 +99,12 @@ def _value(present: Any, kind: str, value: Any, where: str) -> Any:
         return fill(fresh, value, where)
     if kind in ("float", "double"):
         if isinstance(value, bool) or not isinstance(value, int | float | str):
-            raise _wrong(where, value, "a number")
+            raise wrong(where, value, "a number")
         return float(value)  # YAML reads 1e-3 as text
-    if kind == "boolean" and not isinstance(value, bool):
-        raise _wrong(where, value, "true or false")
-    if integer := _INTEGER.fullmatch(kind):
-        lowest, highest = _limits(integer)
-        if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-            raise _wrong(where, value, f"a whole number from {lowest} to {highest}")
-    if kind.startswith(("string", "wstring")) and not isinstance(value, str):
-        raise _wrong(where, value, "text (put it in quotes)")
-    return int(value).to_bytes(1, "little") if kind == "octet" else value
-
-
-def _limits(integer: re.Match[str]) -> tuple[int, int]:
-    bits = int(integer["bits"] or 8)
-    return (0, 2**bits - 1) if integer["unsigned"] or not integer["bits"] else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-
-
-def _wrong(where: str, value: Any, expected: str) -> OpenArmError:
-    return OpenArmError(Code.INVALID_ARGUMENT, f"{where} is {value!r}; expected {expected}")
+    if kind == "octet" and type(value) is int and 0 <= value < 256:
+        return value.to_bytes(1, "little")
+    check_field(kind, value, where)
+    return value
 
 
 def fields_of(words: tuple[str, ...], name: str, kind: str) -> Any:

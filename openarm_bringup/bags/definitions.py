@@ -10,7 +10,8 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg
 
 from openarm_bringup.bags.mcap import DAMAGE
-from openarm_bringup.messages import SEQUENCE, interface
+from openarm_bringup.messages import interface
+from openarm_common.fields import SEQUENCE
 
 _LINE = "=" * 80
 #: Definitions that are longer are not parsed, characters.

@@ -19,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.fields import check_message
 from openarm_common.ros.actions import ActionClient, check_alive
 
 #: Period of checks that the server is still there, s.
@@ -142,6 +143,7 @@ class BackgroundNode(ContextNode):
             OpenArmError: NOT_READY, when there is no server; INVALID_ARGUMENT, when no message can hold the request;
                 TIMEOUT.
         """
+        _check(name, request)
         client = self._client(name, lambda: self._node.create_client(kind, name))
         if not client.wait_for_service(timeout_sec=self._timeout):
             raise OpenArmError(Code.NOT_READY, f"no service {name} within {self._timeout:g} s: {_UP}")
@@ -173,6 +175,7 @@ class BackgroundNode(ContextNode):
             OpenArmError: NOT_READY, when there is no server, or it dies; BUSY, when the goal is refused;
                 INVALID_ARGUMENT, when no message can hold the goal; TIMEOUT.
         """
+        _check(name, goal)
         client: ActionClient = self._client(name, lambda: ActionClient(self._node, kind, name))
         if not client.wait_for_server(timeout_sec=self._timeout):
             raise OpenArmError(Code.NOT_READY, f"no action {name} within {self._timeout:g} s: {_UP}")
@@ -267,6 +270,13 @@ class BackgroundNode(ContextNode):
             except Exception as error:
                 self._node.get_logger().error(f"what arrived could not be handled, the rest goes on: {error!r}")
                 self._closing.wait(_CHECK_S)  # of an error that stays, a few lines a second
+
+
+def _check(name: str, message: Any) -> None:
+    try:
+        check_message(message)
+    except OpenArmError as error:
+        raise OpenArmError(error.code, f"{name} can't be asked that: {error.message}") from None
 
 
 class _Unsent(NamedTuple):

@@ -96,8 +96,7 @@ class GraphView(ContextNode):
             OpenArmError: NOT_READY, when no grasp node answers.
         """
         request = ConfirmPlan.Request(plan_id=answer.plan_id, accept=answer.accept)
-        response = self._ask.call(ConfirmPlan, "/grasp/confirm", request, _ANSWER_S)
-        return response.success, response.message
+        return _said(self._ask.call(ConfirmPlan, "/grasp/confirm", request, _ANSWER_S))
 
     def cancel(self) -> tuple[bool, str]:
         """Cancel the grasp that runs, of whichever client of the action.
@@ -117,7 +116,7 @@ class GraphView(ContextNode):
         Raises:
             OpenArmError: NOT_READY, when no node offers it; TIMEOUT.
         """
-        return self._trigger("/stop")
+        return _said(self._urgent.call(Trigger, "/stop", Trigger.Request(), _URGENT_S))
 
     def release(self) -> tuple[bool, str]:
         """Release the emergency stop.
@@ -125,11 +124,7 @@ class GraphView(ContextNode):
         Raises:
             OpenArmError: NOT_READY, when no node offers it; TIMEOUT.
         """
-        return self._trigger("/mujoco_bridge/reset")
-
-    def _trigger(self, service: str) -> tuple[bool, str]:
-        answer = self._urgent.call(Trigger, service, Trigger.Request(), _URGENT_S)
-        return answer.success, answer.message
+        return _said(self._urgent.call(Trigger, "/mujoco_bridge/reset", Trigger.Request(), _URGENT_S))
 
     def reset(self, order: Reset) -> tuple[bool, str]:
         """Put the simulation back to its start.
@@ -138,8 +133,7 @@ class GraphView(ContextNode):
             OpenArmError: NOT_READY, when there is no simulation.
         """
         request = ResetWorld.Request(scene=order.scene, seed=order.seed)
-        answer = self._ask.call(ResetWorld, "/sim/reset_world", request, _ANSWER_S)
-        return answer.success, answer.message
+        return _said(self._ask.call(ResetWorld, "/sim/reset_world", request, _ANSWER_S))
 
     def _run(self) -> None:
         open_layers: dict[str, Layer] = {}
@@ -171,3 +165,8 @@ class GraphView(ContextNode):
         if layer.fault != before:  # none: it is shown again
             text = json.dumps({"kind": "fault", "layer": name, "text": layer.fault})
             self._on_item(Item(name, f"fault:{name}", text))
+
+
+def _said(answer: Any) -> tuple[bool, str]:
+    """What a service says of a request: whether it was fulfilled, and a sentence."""
+    return answer.success, answer.message
