@@ -12,6 +12,8 @@ from openarm_evaluation.judging.judge import Sample, judge
 
 #: Free fall from a greater height is a drop, m.
 FALL_HEIGHT = 0.010
+#: Rate of ground truth that shows a fall from 12 mm in every phase of its samples, Hz of simulated time.
+TRUTH_HZ = 100.0
 #: Joint speed of an arm that nobody moves, rad/s, over `_OVER_S`.
 REST_SPEED = 0.05
 #: Bounds, s of wall clock: of a request, of the notice of a server's death, of the graph's return.
@@ -19,8 +21,8 @@ REQUEST_S, DEATH_S, BACK_S = 180.0, 2.0, 15.0
 
 _G, _FALLING = 9.81, 0.7  # the share of g that only a fall reaches: arms accelerate less
 _OVER_S = 0.1
-#: Longest short fall, s, and the vertical speed of an object at rest, m/s.
-_SHORT_S, _AT_REST = 0.12, 0.05
+#: Longest time between two samples that say how an object moved, s.
+_GAP_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -40,19 +42,16 @@ def since_reset(track: Sequence[Sample]) -> list[Sample]:
 def fall_of(track: Sequence[Sample]) -> float:
     """Return the greatest height that an object fell freely, m; 0 for less than `FALL_HEIGHT`.
 
-    The speed of an object in a fall grows as nothing else makes it grow, and shows how high it fell.
+    The speed of an object in a fall grows as nothing else makes it grow, and shows how high it fell. After the last
+    sample it may fall on for a whole period; half a period is added.
     """
     greatest = 0.0
     for first, second in itertools.pairwise(track):
         dt = (second.t_ns - first.t_ns) * 1e-9
         before, after = float(first.linear[2]), float(second.linear[2])
-        if 0.0 < dt < 0.2 and (after - before) / dt < -_FALLING * _G:
-            greatest = max(greatest, after * after / (2.0 * _G))
-    # a short fall has one sample, or none: from rest to rest in less time than an arm takes
-    for first, second in (*itertools.pairwise(track), *zip(track, track[2:], strict=False)):
-        dt = (second.t_ns - first.t_ns) * 1e-9
-        if 0.0 < dt < _SHORT_S and max(abs(float(one.linear[2])) for one in (first, second)) < _AT_REST:
-            greatest = max(greatest, float(first.p_world[2] - second.p_world[2]))
+        if 0.0 < dt < _GAP_S and after < 0.0 and (after - before) / dt < -_FALLING * _G:
+            speed = 0.5 * _G * dt - after
+            greatest = max(greatest, speed * speed / (2.0 * _G))
     return greatest if greatest > FALL_HEIGHT else 0.0
 
 

@@ -82,7 +82,8 @@ def run(
     """
     report, domain = Report(seed), reserve_domain()
     release_domain(domain)  # to be reserved again once it is clear what the graph has left
-    graph = load_graph("sim", overrides={"domain": domain, "scene": "random", "seed": seed})
+    sets = [f"mujoco_bridge.ground_truth_rate={judge.TRUTH_HZ}"]
+    graph = load_graph("sim", overrides={"domain": domain, "scene": "random", "seed": seed}, sets=sets)
     seen: set[int] = set()
     asyncio.run(_run(graph, report, seconds, kinds, folder, show, seen, most))
     for text in left_over(domain, seen):
