@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 from openarm_bringup.daemon.client import ask
 from openarm_bringup.outcome import FOR_PEOPLE, Outcome, failure
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import printable_lines
 
 if TYPE_CHECKING:
     from cyclopts import App
@@ -177,12 +178,12 @@ def _show(outcome: Outcome, sink: str | None) -> int:
             text = "; ".join(filter(None, (outcome.message, error.message)))
             outcome = replace(outcome, success=False, code=error.code, message=text)
     if outcome.text:
-        _print(outcome.text)
+        _print(printable_lines(outcome.text))
     if outcome.success:
         if outcome.message:
-            _print(outcome.message)
+            _print(printable_lines(outcome.message, "  "))
     else:
-        sys.stderr.write(f"openarm: {outcome.code}: {outcome.message}\n")
+        sys.stderr.write(f"openarm: {outcome.code}: {printable_lines(outcome.message, '  ')}\n")
     return outcome.exit_code
 
 

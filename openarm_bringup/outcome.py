@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import printable_lines
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -52,7 +53,7 @@ class Outcome:
 def show(text: str) -> None:
     """Print something at once, of a command that goes on; with `--json` on stdout nothing is printed."""
     if FOR_PEOPLE.get():
-        sys.stdout.write(text)
+        sys.stdout.write(printable_lines(text))
         sys.stdout.flush()
 
 
@@ -60,7 +61,12 @@ def console() -> Console:
     """Return a console on stderr, for what a command shows while it runs."""
     from rich.console import Console
 
-    return Console(stderr=True, highlight=False)
+    class PrintableConsole(Console):
+        def print(self, *objects: Any, **options: Any) -> None:
+            shown = (printable_lines(one) if isinstance(one, str) else one for one in objects)
+            super().print(*shown, **options)
+
+    return PrintableConsole(stderr=True, highlight=False)
 
 
 class GraphReport:

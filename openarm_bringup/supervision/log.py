@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
 from pathlib import Path
 
+from openarm_common.printable import LONGEST_LINE, printable
+
 
 class LogFile:
     """Appends lines with the time of day; what the disk does not take is counted, and the file says how much it was.
@@ -28,7 +30,8 @@ class LogFile:
     def write(self, lines: Iterable[str]) -> None:
         """Append lines; as many as there is room for."""
         now = datetime.now().isoformat(sep=" ", timespec="milliseconds")
-        texts = [f"{now} {line}\n".encode(errors="replace") for text in lines for line in text.split("\n")]
+        shown = [printable(line, colours=True, longest=LONGEST_LINE) for text in lines for line in text.split("\n")]
+        texts = [f"{now} {line}\n".encode(errors="replace") for line in shown]
         if self._missing:
             texts.insert(0, f"{now} {self._missing} lines are missing here: {self._reason}\n".encode())
         written = self._append(texts)

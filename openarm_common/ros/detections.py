@@ -29,6 +29,7 @@ from vision_msgs.msg import (
 from openarm_common.config import brief
 from openarm_common.detection import KINDS, Described, Detection
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import check_length
 from openarm_common.ros.convert import header, matrix_to_pose, pose_to_matrix, vector, xyz
 from openarm_common.types import Array
 
@@ -69,12 +70,14 @@ def detections_from_msg(message: Detection3DArray) -> tuple[Detection, ...]:
     """Return the objects of a message, in the frame that its header names; those without a hypothesis are left out.
 
     Raises:
-        OpenArmError: INVALID_ARGUMENT, for a pose or a size that is not one, or a score that is no number.
+        OpenArmError: INVALID_ARGUMENT, for a pose or a size that is not one, a score that is no number, or a long text.
     """
     out: list[Detection] = []
     for item in message.detections:
         if not item.results:
             continue
+        for text in (item.id, *(each.hypothesis.class_id for each in item.results)):
+            check_length(text, "the id or class of a detection")
         result = max(item.results, key=lambda result: result.hypothesis.score)
         best, variance = result.hypothesis, result.pose.covariance[0]
         others = [r.hypothesis.class_id for r in item.results if r.hypothesis.class_id != best.class_id]

@@ -26,7 +26,6 @@ from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -36,6 +35,7 @@ from rclpy.task import Future
 from openarm_common.config import AT_RUN_TIME, Config, brief, validate
 from openarm_common.errors import OpenArmError
 from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.log import PrintableLogger
 
 ConfigT = TypeVar("ConfigT", bound=Config)
 P = ParamSpec("P")
@@ -107,6 +107,7 @@ class BaseNode(Node, Generic[ConfigT]):
     def __init__(self, name: str, model: type[ConfigT], **kwargs: Any) -> None:
         #: Messages that were refused, by topic.
         self.__refused = Counter[str]()
+        self.__logger: PrintableLogger | None = None
         super().__init__(name, **kwargs)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         data = _declare(self, model, "")
@@ -125,6 +126,12 @@ class BaseNode(Node, Generic[ConfigT]):
         if not hasattr(self, "_BaseNode__group"):  # used in the constructor of Node
             self.__group = ReentrantCallbackGroup()
         return self.__group
+
+    def get_logger(self) -> PrintableLogger:
+        """The logger of the node, which makes text of others printable."""
+        if self.__logger is None:
+            self.__logger = PrintableLogger(super().get_logger().name)
+        return self.__logger
 
     @property
     def description(self) -> RobotDescription:
@@ -325,7 +332,7 @@ def run(factory: Callable[[], BaseNode[Any]]) -> None:
         signals.node = node
         executor.spin()
     except OpenArmError as error:
-        get_logger("openarm").fatal(str(error))
+        PrintableLogger("openarm").fatal(str(error))
         code = 1
     except ExternalShutdownException:
         pass  # the normal end

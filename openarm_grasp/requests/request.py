@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import LONGEST_TEXT, check_length
 from openarm_grasp.config import DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
 from openarm_grasp.perception.detections import Frame, Sighting, find
@@ -63,12 +64,19 @@ class GraspRequest:
         """The object in frames of the base frame; errors as `perception.detections.find`."""
         return find(frames, self.label, limits, at=self.object_at, exclude_near=self.exclude_near, same=self.same)
 
+    def cut(self) -> GraspRequest:
+        """The request with its texts cut where they are too long to be accepted."""
+        label, arm, phase = (text[:LONGEST_TEXT] for text in (self.label, self.arm, self.phase))
+        return replace(self, label=label, arm=arm, phase=phase)
+
     def check(self) -> None:
-        """Refuse an arm or a phase that does not exist.
+        """Refuse an arm or a phase that does not exist, and a long text.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT.
         """
+        for name in ("label", "arm", "phase"):
+            check_length(getattr(self, name), name)
         arm_order(self.arm, 0.0, 0.0)
         if self.phase not in PHASES:
             raise OpenArmError(

@@ -151,12 +151,14 @@ class GraspNode(BaseNode[GraspConfig]):
     async def _one(self, request: GraspRequest, on_status: OnStatus | None = None) -> GraspOutcome:
         report = partial(self._publish, on_status=on_status)
         try:
+            request.check()
             outcome = await self._take(
                 _grasp_of(request),
                 lambda: carry_out(Task(self._session, self._skills, request, report)),
                 moves=not request.dry_run,
             )
         except OpenArmError as error:
+            request = request.cut()
             self._refused(f"grasp of {request.label!r}", error)
             outcome = GraspOutcome(error.code, error.message, request.label)
         else:
@@ -167,12 +169,15 @@ class GraspNode(BaseNode[GraspConfig]):
         report = partial(self._publish, on_status=on_status)
         robots: dict[Side, RobotInterface] = {arm: self._robot.next_to_other() for arm in ARMS}
         try:
+            for request in requests:
+                request.check()
             outcome = await self._take(
                 _grasp_of(*requests),
                 lambda: carry_out_pair(Pair(self._session, self._skills, robots, requests, report, carry_out)),
                 moves=not requests[0].dry_run,
             )
         except OpenArmError as error:
+            requests = (requests[0].cut(), requests[1].cut())
             self._refused(f"grasp of {requests[0].label!r} and {requests[1].label!r}", error)
             outcome = PairOutcome((), error.code, error.message)
         for answer in outcome.answers:
