@@ -64,7 +64,6 @@ def up(
 async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
     from openarm_bringup.supervision.environment import domain_id
     from openarm_bringup.supervision.session import running_graph
-    from openarm_bringup.view.viz import app_link
 
     shown = console()
 
@@ -88,7 +87,7 @@ async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
                 soft_wrap=True,
             )
             if viz_address:
-                text = f"Foxglove: open the connection {viz_address}\n  or {app_link(viz_address)}"
+                text = f"Foxglove: open the connection {viz_address}"
                 shown.print(text, markup=False, soft_wrap=True)
             await supervisor.wait_stop_asked()
             data["states"] = supervisor.states()

@@ -6,6 +6,8 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -69,12 +71,21 @@ async def _serve(host: str, port: int, show: bool) -> str:
             address = f"http://{shown}:{runner.addresses[0][1]}/"
             url = f"{address}?token={server.guard.token}"
             console().print(f"the page is at {url}", markup=False, soft_wrap=True)
-            if show:
-                webbrowser.open(url)
-            await stop
+            with TemporaryDirectory(prefix="openarm_view_") as folder:  # which no other user may read
+                if show:
+                    webbrowser.open(redirect(Path(folder), url).as_uri())
+                await stop
         finally:
             await runner.cleanup()
     return address
+
+
+def redirect(folder: Path, url: str) -> Path:
+    """Write a page that leads to an address: the command line of a browser can be read by all users, a file can't."""
+    page = folder / "open.html"
+    page.touch(mode=0o600)
+    page.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={url}">', encoding="utf-8")
+    return page
 
 
 @contextmanager

@@ -6,7 +6,6 @@ from __future__ import annotations
 import importlib.util
 import secrets
 import socket
-from urllib.parse import quote
 
 from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_bringup.view.guard import LOOPBACK
@@ -47,11 +46,6 @@ def with_viz(graph: Graph, port: int) -> tuple[Graph, str]:
     )
     address = f"ws://{LOOPBACK}:{port}/?token={token}"
     return graph.model_copy(update={"nodes": {**graph.nodes, NODE: node}}), address
-
-
-def app_link(address: str) -> str:
-    """The same as a link that opens Foxglove's web app on it."""
-    return f"https://app.foxglove.dev/~/view?ds=foxglove-websocket&ds.url={quote(address, safe='')}"
 
 
 def require_sdk() -> None:

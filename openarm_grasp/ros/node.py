@@ -151,9 +151,8 @@ class GraspNode(BaseNode[GraspConfig]):
     async def _one(self, request: GraspRequest, on_status: OnStatus | None = None) -> GraspOutcome:
         report = partial(self._publish, on_status=on_status)
         try:
-            request.check()
             outcome = await self._take(
-                _grasp_of(request),
+                _grasp_of(request.cut()),
                 lambda: carry_out(Task(self._session, self._skills, request, report)),
                 moves=not request.dry_run,
             )
@@ -169,10 +168,8 @@ class GraspNode(BaseNode[GraspConfig]):
         report = partial(self._publish, on_status=on_status)
         robots: dict[Side, RobotInterface] = {arm: self._robot.next_to_other() for arm in ARMS}
         try:
-            for request in requests:
-                request.check()
             outcome = await self._take(
-                _grasp_of(*requests),
+                _grasp_of(*(request.cut() for request in requests)),
                 lambda: carry_out_pair(Pair(self._session, self._skills, robots, requests, report, carry_out)),
                 moves=not requests[0].dry_run,
             )

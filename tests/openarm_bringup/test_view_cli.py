@@ -12,6 +12,8 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
+from openarm_bringup.commands.view import redirect
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -19,6 +21,13 @@ def start(port: str, folder: Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "openarm_bringup.cli", "view", "--port", port]
     env = {**os.environ, "XDG_RUNTIME_DIR": str(folder)}  # a graph that runs on this machine is not found
     return subprocess.Popen(command, env=env, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+
+
+def test_a_browser_gets_a_private_page_that_leads_to_the_address(tmp_path: Path) -> None:
+    page = redirect(tmp_path, "http://127.0.0.1:1/?token=secret")
+    assert page.stat().st_mode & 0o777 == 0o600
+    assert 'content="0;url=http://127.0.0.1:1/?token=secret"' in page.read_text()
+    assert "secret" not in page.as_uri()
 
 
 def test_it_prints_an_address_that_opens_and_ends_with_ctrl_c(tmp_path: Path) -> None:

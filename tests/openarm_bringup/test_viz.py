@@ -18,7 +18,7 @@ from openarm_bringup.commands import up
 from openarm_bringup.outcome import Outcome
 from openarm_bringup.supervision.graph import Graph, load_graph
 from openarm_bringup.view.proxy import hidden_address
-from openarm_bringup.view.viz import NODE, TOKEN_VARIABLE, app_link, with_viz
+from openarm_bringup.view.viz import NODE, TOKEN_VARIABLE, with_viz
 from openarm_common.errors import Code, OpenArmError
 
 ROOT = Path(__file__).parents[2]
@@ -46,7 +46,6 @@ def test_the_node_is_added_and_its_token_is_in_no_parameter() -> None:
     assert node.env[TOKEN_VARIABLE] == token
     assert token not in str(node.params)
     assert len(graph.nodes) == len(load_graph("sim_only").nodes) + 1
-    assert parse_qs(urlsplit(app_link(address)).query)["ds.url"] == [address]
     assert with_viz(load_graph("sim_only"), free_port())[1] != address
 
 

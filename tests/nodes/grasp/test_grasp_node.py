@@ -145,6 +145,9 @@ def test_an_unknown_arm_and_a_place_off_the_table_are_refused(bench):
     answer = bench.ros.call(bench.service, request, 20.0)
     assert answer.code == "INVALID_ARGUMENT"
     assert "not on the table" in answer.message
+    answer = bench.ask(label="x" * 1_000_000)
+    assert (answer.code, len(answer.label)) == ("INVALID_ARGUMENT", 256)
+    assert "has 1000000 characters; expected at most 256" in answer.message
 
 
 def test_a_dry_run_moves_nothing(bench):
