@@ -221,7 +221,7 @@ class Localizer:
     @staticmethod
     def _top_height(heights: Array, band: float) -> float:
         # the quantile lies on the top as long as the top is a tenth of what is seen; the median takes the noise off
-        near_top = np.quantile(heights, 0.95)
+        near_top = np.quantile(heights, 0.95, method="lower")  # of the points: between two there may be none
         return float(np.median(heights[np.abs(heights - near_top) <= band]))
 
     @staticmethod

@@ -255,3 +255,9 @@ def test_the_way_from_pixel_to_robot_needs_no_ros() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_top_of_few_points_is_one_of_them() -> None:
+    """Between two of them, where the quantile would fall, there may be none within the noise."""
+    heights = np.array([0.41] * 9 + [0.6])
+    assert Localizer._top_height(heights, 0.004) == pytest.approx(0.41)
