@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
 from openarm_common.config import Config, brief, parse_json, read_text, validate
 from openarm_common.errors import Code, OpenArmError
@@ -33,7 +33,7 @@ class _Grasp(_Known):
     placed: bool
     place_error_mm: float | None
     sim_s: float | None
-    states: tuple[_State, ...] = ()
+    states: list[_State] = Field(default_factory=list[_State])
 
 
 class CompareRow(_Known):

@@ -205,7 +205,7 @@ def model_path(model: str) -> Path:
     if not is_file(path):
         names = ", ".join(sorted(file.stem for file in folder.glob("*.onnx"))) or "none"
         raise OpenArmError(
-            Code.CONFIG_INVALID, f"there is no network {brief(str(path))}; models: {names}, or the path of an ONNX file"
+            Code.CONFIG_INVALID, f"there is no network {str(path)!r:.300}; models: {names}, or the path of an ONNX file"
         )
     return path
 

@@ -91,7 +91,7 @@ def test_the_detector_is_switched_while_it_runs(ros, camera, model, tmp_path) ->
     becomes(bench)
     (refused,) = change(bench, network__model="nothing.onnx")
     assert not refused.successful
-    assert "there is no network nothing.onnx; models: " in refused.reason
+    assert "there is no network 'nothing.onnx'; models: " in refused.reason
     (refused,) = change(bench, detector="hearing")
     assert "'color', 'network', 'both', 'tag' or 'anything'" in refused.reason
     (refused,) = change(bench, network__threshold=1.5)

@@ -129,7 +129,9 @@ def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> 
     clients._timer.reset()
     client = ActionClient(node, FollowJointTrajectory, NAME)
     server = children.start(SERVER)
-    ros.spin_until(client.server_is_ready, 60.0, "the server")
+    ros.spin_until(
+        lambda: client.server_is_ready() and client._alive, 60.0, "the server, which has shown that it lives"
+    )
     ros.spin_until(lambda: "waiter" in node.get_node_names(), 60.0, "the name of the node")
     errors: list[OpenArmError] = []
 
@@ -163,5 +165,5 @@ def test_an_arm_holds_when_the_process_is_killed_that_sent_its_trajectory(bench,
     after = [m for m in bench.joints if stamp_to_ns(m.header.stamp) > killed_ns]
     place = after[-1].position[column]
     assert place < there[0] - 0.3, "it does not arrive"
-    moving = [m for m in after if abs(m.position[column] - place) > RINGING]
-    assert stamp_to_ns(moving[-1].header.stamp) - killed_ns < 0.3e9, "0.2 s on a machine that is not busy"
+    moving = [stamp_to_ns(m.header.stamp) for m in after if abs(m.position[column] - place) > RINGING]
+    assert max(moving, default=killed_ns) - killed_ns < 0.3e9, "0.2 s on a machine that is not busy"

@@ -38,7 +38,8 @@ def row(
     detector: str = "color",
 ):  # fmt: skip
     """A row as `campaign_trial.row_of` makes it, of one object."""
-    grasp = {"placed": placed, "arm": "left", "place_error_mm": 2.0 if placed else None, "sim_s": 10.0,
+    grasp = {"label": "red", "attempts": attempts, "arm": "left", "placed": placed,
+             "place_error_mm": 2.0 if placed else None, "sim_s": 10.0,
              "states": [{"state": "LIFT", "seconds": 1.5}]}  # fmt: skip
     right = not false and (placed if "placed" in expected else code in expected)
     return {
