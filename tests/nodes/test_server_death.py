@@ -129,9 +129,7 @@ def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> 
     clients._timer.reset()
     client = ActionClient(node, FollowJointTrajectory, NAME)
     server = children.start(SERVER)
-    ros.spin_until(
-        lambda: client.server_is_ready() and client._alive, 60.0, "the server, which has shown that it lives"
-    )
+    ros.spin_until(lambda: client.server_is_ready() and client._alive, 60.0, "the server, known to live")
     ros.spin_until(lambda: "waiter" in node.get_node_names(), 60.0, "the name of the node")
     errors: list[OpenArmError] = []
 

@@ -124,7 +124,7 @@ def test_files_of_another_layout_are_refused_by_name(tmp_path, output, kwargs, w
 
 
 def test_missing_and_damaged_files_are_refused_by_name(tmp_path) -> None:
-    with pytest.raises(OpenArmError, match=r"there is no network .*nowhere\.onnx; models: ") as caught:
+    with pytest.raises(OpenArmError, match=r"there is no network .*nowhere\.onnx'; models: ") as caught:
         NetworkDetector(NetworkConfig(model=str(tmp_path / "nowhere.onnx")))
     assert "shapes_640x480" in caught.value.message
     path = write_network(tmp_path / "half.onnx", boxes())
