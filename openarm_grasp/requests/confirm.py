@@ -2,7 +2,7 @@
 """Plans that a person confirms: show one, wait for the answer, and see that it may still be executed.
 
 What is shown are the very trajectories that are executed after it. A plan that the world has overtaken is not replaced
-silently: `agree` says so, and what is planned anew is shown under another id. Base frame, m, rad.
+silently: `agree` says so, and what is planned again is shown under another id. Base frame, m, rad.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ async def agree(
     if not fault and standing:
         frames = (await robot.observe_in_base(task.context.config.detect.frames)).frames
         fault = changed(standing, frames, task.context.config.held.moved, task.context.table.top_z)
-    return f"plan {shown.id!r} is not executed: {fault}; planning anew" if fault else ""
+    return f"plan {shown.id!r} is not executed: {fault}; planning again" if fault else ""
 
 
 async def outdated(robot: Skills, plans: Sequence[Planned], start: Mapping[str, float], tolerance: float) -> str:

@@ -107,7 +107,7 @@ def _missing(run: Run, seen: Frames) -> OpenArmError | None:
 
 
 async def _clear_view(run: Run) -> None:
-    """Send the arms home that may hide something. A dry run moves nothing, nor does what nobody has confirmed yet."""
+    """Send the arms home that may hide something. A dry run moves nothing, nor does what is not confirmed yet."""
     if run.request.dry_run or run.request.confirm or run.missed > 0 or run.plans_failed > 0:
         return
     if run.kept is not None:
@@ -255,7 +255,7 @@ async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why:
         why = await outdated(run.robot, (ready,), ready.start, run.config.confirm.joints)
         if not why:
             return ready, ways[ready.chosen]
-        run.enter(State.PLACE, f"the confirmed place has to be planned anew: {why}")
+        run.enter(State.PLACE, f"the confirmed place has to be planned again: {why}")
     while True:
         plan = await run.robot.plan_place(grasp.arm, ways, grasp.sighting, grasp.candidate)
         target = ways[plan.chosen]
@@ -268,7 +268,7 @@ async def plan_place(run: Run, grasp: Grasp, ways: tuple[PlaceTarget, ...], why:
 async def agreed(
     run: Run, state: State, grasp: Grasp, why: str, plan: Planned | None = None, place: Planned | None = None
 ) -> str:
-    """Let a person confirm what is planned; returns why it has to be planned anew, "" when it has not."""
+    """Let a person confirm what is planned; returns why it has to be planned again, "" when it has not."""
     plans = [(names, part) for names, part in ((GRASP, plan), (PLACE, place)) if part is not None]
     standing = (grasp.sighting.target, *grasp.sighting.others) if state is State.PLAN else ()
     return await agree(

@@ -83,7 +83,7 @@ async def push(task: Task) -> GraspOutcome | None:
         standing = (found.target, *found.others)
         changed = await agree(task, planned.arm, str(planned), [(PUSH, planned.plan)], task.note, standing)
         if changed:
-            raise OpenArmError(Code.STALE_DATA, f"{changed.removesuffix('; planning anew')}; ask again")
+            raise OpenArmError(Code.STALE_DATA, f"{changed.removesuffix('; planning again')}; ask again")
         task.attempts = max(task.attempts, 1)
         try:
             pushed, observed = await carry_out_push(task, planned, found, number)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import coal
 import numpy as np
@@ -293,7 +293,7 @@ class _Packer:
         )
 
 
-@cache
+@lru_cache(maxsize=512)
 def cover(kind: int, size: tuple[float, float, float]) -> Array:
     """Spheres (m, 4), centre and radius, that together hold a shape, in its frame."""
     if kind == SPHERE:

@@ -149,6 +149,7 @@ def test_what_others_can_open_is_not_asked(answers: Any, what: str) -> None:
     assert daemon.asked == []
 
 
+@pytest.mark.requirement("R-23")
 def test_what_is_another_users_is_not_asked(answers: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     daemon = answers(*ANSWER)
     assert is_private(socket_path(os.getpid()))

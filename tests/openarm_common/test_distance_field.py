@@ -132,6 +132,7 @@ def test_no_room_and_other_files_are_named(tmp_path: Path) -> None:
             DistanceFieldReader(tmp_path / "g").latest()
 
 
+@pytest.mark.requirement("R-23")
 def test_a_field_of_another_user_or_that_others_may_write_is_refused_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from openarm_bringup import warm
+from openarm_bringup import byte_code
 
 
 def test_byte_code_is_kept_also_where_the_environment_keeps_none(
@@ -19,6 +19,6 @@ def test_byte_code_is_kept_also_where_the_environment_keeps_none(
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     module = tmp_path / "module.py"
     module.write_text("VALUE = 1\n")
-    monkeypatch.setattr(warm, "imported_by_nodes", lambda: [module])
-    warm.keep_byte_code()
+    monkeypatch.setattr(byte_code, "imported_by_nodes", lambda: [module])
+    byte_code.keep_byte_code()
     assert Path(importlib.util.cache_from_source(str(module))).is_file()
