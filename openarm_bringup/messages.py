@@ -11,9 +11,10 @@ from typing import Any
 import yaml
 
 from openarm_bringup.suggest import unknown
-from openarm_common.config import brief, parse_yaml
+from openarm_common.config import parse_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.fields import SEQUENCE, check_field, check_length, wrong
+from openarm_common.printable import brief
 
 _KINDS = ("msg", "srv", "action")
 

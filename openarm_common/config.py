@@ -17,6 +17,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
 from openarm_common.errors import Code, OpenArmError, said
+from openarm_common.printable import brief, brief_text
 
 
 class Config(BaseModel):
@@ -33,22 +34,6 @@ MAX_YAML_BYTES, MAX_YAML_DEPTH = 4 * 2**20, 32
 
 #: Most faults that an error names.
 _FAULTS = 12
-#: Longest representation of a value in an error, characters.
-_BRIEF = 80
-
-
-def brief(value: object) -> str:
-    """Return the representation of a value, cut where it is long."""
-    try:
-        text = repr(value)
-    except ValueError:  # an integer of more than 4300 digits
-        return f"a {type(value).__name__}"
-    return brief_text(text)
-
-
-def brief_text(text: str) -> str:
-    """Return a text, cut where it is long."""
-    return text if len(text) <= _BRIEF else f"{text[: _BRIEF - 1]}…"
 
 
 class _Loader(yaml.SafeLoader):
@@ -236,7 +221,7 @@ def describe_faults(error: ValidationError, where: str, model: type[BaseModel]) 
     faults: list[str] = []
     for item in error.errors():
         key = ".".join(str(part) for part in item["loc"]) or "(top level)"
-        key = key if key.isprintable() and len(key) < 2 * _BRIEF else brief(key)
+        key = key if key.isprintable() and len(key) < 160 else brief(key)
         text = item["msg"].removeprefix("Value error, ")
         if item["type"] == "extra_forbidden":
             text = "unknown key" + (f"; valid keys: {', '.join(model.model_fields)}" if len(item["loc"]) == 1 else "")

@@ -10,8 +10,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from openarm_common.config import brief
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import brief
 
 #: A field of several values: `of` and `most`, or `array` and `size`.
 SEQUENCE = re.compile(r"^sequence<(?P<of>.+?)(, (?P<most>\d+))?>$|^(?P<array>.+)\[(?P<size>\d+)\]$")

@@ -5,15 +5,30 @@ from __future__ import annotations
 
 import re
 
-from openarm_common.config import brief
 from openarm_common.errors import Code, OpenArmError
 
 #: Longest label, name or other text that a request or a detection may hold, characters.
 LONGEST_TEXT = 256
 #: Longest line of a log, characters.
 LONGEST_LINE = 10_000
+#: Longest representation of a value in an error, characters.
+_BRIEF = 80
 #: Colours and weights of a terminal, which move nothing and hide nothing that is copied.
 _COLOUR = re.compile(r"(\x1b\[[0-9;]*m)")
+
+
+def brief(value: object) -> str:
+    """Return the representation of a value, cut where it is long."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of more than 4300 digits
+        return f"a {type(value).__name__}"
+    return brief_text(text)
+
+
+def brief_text(text: str) -> str:
+    """Return a text, cut where it is long."""
+    return text if len(text) <= _BRIEF else f"{text[: _BRIEF - 1]}…"
 
 
 def printable(text: str, *, colours: bool = False, longest: int | None = None) -> str:

@@ -18,8 +18,9 @@ from pydantic import Field, model_validator
 
 from openarm_bringup.supervision.discovery import LAST_DOMAIN, Discovery
 from openarm_bringup.supervision.params import flatten, read_params, substitute
-from openarm_common.config import Config, ConfigT, brief, load_yaml, parse_yaml, validate
+from openarm_common.config import Config, ConfigT, load_yaml, parse_yaml, validate
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import brief
 from openarm_common.resources import config_dir, is_file
 
 ConditionKind = Literal["topic", "message", "service", "action"]

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError, field_validator, model_validator
 
-from openarm_common.config import Config, brief, describe_faults, parse_yaml
+from openarm_common.config import Config, describe_faults, parse_yaml
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import brief
 from openarm_common.types import Array
 
 Pixels = NDArray[np.uint8]

@@ -25,8 +25,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.config import brief
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import brief
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 

@@ -25,8 +25,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
-from openarm_common.config import brief, brief_text
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import brief, brief_text
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import LONGEST_NAME
 from openarm_common.types import Array, Bytes, Floats

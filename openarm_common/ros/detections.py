@@ -26,10 +26,9 @@ from vision_msgs.msg import (
     ObjectHypothesisWithPose,
 )
 
-from openarm_common.config import brief
 from openarm_common.detection import KINDS, Described, Detection
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.printable import check_length
+from openarm_common.printable import brief, check_length
 from openarm_common.ros.convert import header, matrix_to_pose, pose_to_matrix, vector, xyz
 from openarm_common.types import Array
 

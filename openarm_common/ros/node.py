@@ -32,8 +32,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from openarm_common.config import AT_RUN_TIME, Config, brief, validate
+from openarm_common.config import AT_RUN_TIME, Config, validate
 from openarm_common.errors import OpenArmError
+from openarm_common.printable import brief
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.log import PrintableLogger
 

@@ -19,8 +19,9 @@ import numpy as np
 from pydantic import Field, FiniteFloat, field_validator, model_validator
 
 from openarm_common import se3
-from openarm_common.config import Config, brief, load_yaml, validate
+from openarm_common.config import Config, load_yaml, validate
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import brief
 from openarm_common.resources import is_file, models_dir
 from openarm_common.types import Array
 

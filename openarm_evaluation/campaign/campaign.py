@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from openarm_bringup.supervision import runs
-from openarm_common.config import brief, load_json
+from openarm_common.config import load_json
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import brief
 from openarm_evaluation.campaign import cluster, report
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.parameters import suite_config

@@ -8,8 +8,9 @@ from typing import Any
 
 from pydantic import ConfigDict, Field
 
-from openarm_common.config import Config, brief, parse_json, read_text, validate
+from openarm_common.config import Config, parse_json, read_text, validate
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import brief
 
 #: File of the rows, one JSON object a line.
 ROWS = "rows.jsonl"

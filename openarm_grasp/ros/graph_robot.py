@@ -85,8 +85,8 @@ class GraphRobot:
         self._nodes.robot.follow_table(on_height)
 
     def close(self) -> None:
-        """Take the clients down."""
-        self._nodes.end()
+        """Leave the arms to others, and take the clients down."""
+        self.end()
         for client in (self._plan, self._execute, self._move, *self._grippers.values()):
             client.destroy()
 

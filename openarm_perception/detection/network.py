@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from openarm_common.config import Config, RunTimeField, brief, load_yaml
+from openarm_common.config import Config, RunTimeField, load_yaml
 from openarm_common.detection import KINDS
 from openarm_common.errors import Code, OpenArmError, said
+from openarm_common.printable import brief
 from openarm_common.resources import is_file, models_dir
 from openarm_perception.detection.boxes import Candidates, Letterbox, blob, decode
 from openarm_perception.detection.detector import Detection2D, Image, require_rgb

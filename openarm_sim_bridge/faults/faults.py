@@ -14,8 +14,9 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import Field
 
-from openarm_common.config import Config, brief, parse_yaml, validate
+from openarm_common.config import Config, parse_yaml, validate
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import brief
 
 ParametersT = TypeVar("ParametersT", bound=Config)
 

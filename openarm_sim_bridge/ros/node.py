@@ -23,8 +23,8 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from openarm_common.camera.cameras import CameraConfig, load_cameras
-from openarm_common.config import brief
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.printable import brief
 from openarm_common.resources import config_dir
 from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import QOS_COMMAND, BaseNode, reliable, run
