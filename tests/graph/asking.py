@@ -17,16 +17,14 @@ class Asked(Generic[T]):
     """A request in a thread of its own that does not block the test.
 
     Args:
-        observer: Of the graph; it has heard ground truth.
+        observer: Of the graph; it keeps what is entered from now on.
         ask: The request; what it raises is raised where the result is read.
     """
 
     def __init__(self, observer: Observer, ask: Callable[[], T]) -> None:
-        truth = observer.truth()
-        assert truth is not None, "wait for ground truth first"
+        assert observer.truth() is not None, "wait for ground truth first"
+        observer.forget()
         self._observer = observer
-        #: /grasp/status is latched: a new observer also hears states of grasps before this time.
-        self._since_ns = truth.t_ns
         self._future: Future[T] = Future()
         threading.Thread(target=self._work, args=(ask,), name="asking", daemon=True).start()
 
@@ -48,7 +46,7 @@ class Asked(Generic[T]):
         """Wait until the grasp has entered a state; fail at once, with the answer, when the request ends before."""
 
         def entered() -> bool:
-            return any(step.state == state and step.t_ns >= self._since_ns for step in self._observer.steps())
+            return any(step.state == state for step in self._observer.steps())
 
         self._observer.wait(lambda: entered() or self._future.done(), seconds, f"the state {state}")
         assert entered(), f"the request ended before {state}: {self._future.result()}"

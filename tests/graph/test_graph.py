@@ -284,8 +284,6 @@ def test_a_confirmed_grasp_by_service_places_within_5_mm_around_what_only_the_ma
         return answer.success and answer.states[0] == QueryMap.Response.OCCUPIED
 
     observer.wait(mapped, 20.0, "the screen in the map")
-    observer.forget()
-    observer.wait(lambda: observer.track("red_box") or None, 5.0, "ground truth")
     place = Point(x=0.26, y=0.43)
     request = Asked(
         observer,
@@ -327,7 +325,6 @@ def test_bridge_killed_during_a_grasp_is_a_named_code_and_the_graph_comes_back(
 ) -> None:
     after_ns = observer.reset_world("demo", 0)
     wait_scene(observer, load_scene("demo"), after_ns)
-    observer.forget()
     bridge = up.record()["nodes"]["mujoco_bridge"]["pid"]
     request = Asked(observer, lambda: client.pick("red"))
     request.wait_state("MOVE_TO_GRASP")

@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 from openarm_bringup.supervision.graph import Ready
 from openarm_bringup.supervision.ros.readiness import ReadinessClient
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import ns_to_stamp
 from openarm_evaluation.judging.ros.observer import Observer
 from openarm_evaluation.judging.trial import Step
 
@@ -130,6 +131,13 @@ def test_observer_keeps_tracks_states_and_resets_the_world(ros) -> None:
             assert caught.value.code == Code.SCENE_INVALID
             observer.forget()
             assert observer.steps() == []
+            now_ns = observer.truth().t_ns
+            for state, t_ns in (("PLAN", 1), ("DETECT", now_ns + 10**9)):  # the first comes late, of a request before
+                status = GraspStatus(state=state)
+                status.header.stamp = ns_to_stamp(t_ns)
+                world.status.publish(status)
+            observer.wait(lambda: observer.steps() or None, 10.0, "a state")
+            assert [step.state for step in observer.steps()] == ["DETECT"]
             with pytest.raises(OpenArmError, match=r"a unicorn was not there within 0.2 s"):
                 observer.wait(lambda: None, 0.2, "a unicorn")
     finally:

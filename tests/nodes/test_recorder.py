@@ -153,17 +153,31 @@ def test_what_never_came_is_counted_as_lost(ros, tmp_path: Path, monkeypatch: py
         assert bag.counts["/chatter"] == 500 - recorded.lost["/chatter"]
 
 
+def head(t_ns: int) -> bytes:
+    """The beginning of a message with a header."""
+    return bytes(4) + (t_ns // 10**9).to_bytes(4, "little") + (t_ns % 10**9).to_bytes(4, "little")
+
+
 def test_frames_are_thinned_as_a_whole() -> None:
     thin = Thinner(2.0)
     stamps = [round(i * 1e9 / 30) for i in range(300)]
     kept = []
     for t in stamps:
-        head = bytes(4) + (t // 10**9).to_bytes(4, "little") + (t % 10**9).to_bytes(4, "little")
-        answers = {thin.keeps(f"/wrist/{kind}", head) for kind in ("color/image_raw", "depth/camera_info")}
+        answers = {thin.keeps(f"/wrist/{kind}", head(t)) for kind in ("color/image_raw", "depth/camera_info")}
         assert len(answers) == 1
         kept += [t] if answers.pop() else []
     assert len(kept) == 20
     assert thin.keeps("/joint_states", bytes(12))
+
+
+def test_a_stream_that_lasts_less_than_a_period_is_kept() -> None:
+    thin = Thinner(1.0)
+    depth, colour = "/overhead/depth/image_raw", "/overhead/color/image_raw"
+    kept = {depth: [], colour: []}
+    for t in range(0, 3_000_000_000, 100_000_000):
+        for topic in (depth, colour) if 300_000_000 <= t < 700_000_000 else (depth,):
+            kept[topic] += [t] if thin.keeps(topic, head(t)) else []
+    assert kept == {depth: [0, 1_000_000_000, 2_000_000_000], colour: [300_000_000]}
 
 
 def test_replay_refuses_what_makes_no_sense(ros, tmp_path: Path) -> None:

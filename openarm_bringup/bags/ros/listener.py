@@ -182,7 +182,9 @@ class _Polled(CallbackGroup):
 
 
 class Thinner:
-    """Keeps whole frames of the cameras at a lower rate: all streams of one stamp, or none.
+    """Keeps frames of the cameras at a lower rate: all streams of one stamp, and one message of each stream a period.
+
+    A stream that begins in mid-period, as colour does when a detector wakes, is not left out until the next one.
 
     Args:
         rate: Hz of the stamps; 0 keeps all.
@@ -190,18 +192,22 @@ class Thinner:
 
     def __init__(self, rate: float) -> None:
         self._period_ns = round(1e9 / rate) if rate > 0.0 else 0
-        #: Stamp that was kept, by camera and period; of the newest periods.
-        self._kept: dict[tuple[str, int], int] = {}
+        #: Stamps and streams that were kept, by camera and period; of the newest periods.
+        self._kept: dict[tuple[str, int], tuple[set[int], set[str]]] = {}
 
     def keeps(self, topic: str, data: bytes) -> bool:
         """Whether to keep a message. Stamps decide, so that colour and depth of a frame stay together."""
         if not self._period_ns or not topic.endswith(("/image_raw", "/camera_info", "/points")):
             return True
         stamp_ns = int.from_bytes(data[4:8], "little") * 1_000_000_000 + int.from_bytes(data[8:12], "little")
-        kept = self._kept.setdefault((topic.split("/")[1], stamp_ns // self._period_ns), stamp_ns)
+        stamps, streams = self._kept.setdefault((topic.split("/")[1], stamp_ns // self._period_ns), (set(), set()))
         if len(self._kept) > _PERIODS:
             del self._kept[next(iter(self._kept))]
-        return kept == stamp_ns
+        if stamp_ns not in stamps and topic in streams:
+            return False
+        stamps.add(stamp_ns)
+        streams.add(topic)
+        return True
 
 
 def from_profile(profile: QoSProfile) -> Qos:

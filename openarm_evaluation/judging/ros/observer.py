@@ -53,6 +53,8 @@ class Observer(BackgroundNode):
         self._truth: Truth | None = None
         self._tracks: dict[str, list[Sample]] = {}
         self._steps: list[Step] = []
+        #: /grasp/status is latched: a new observer hears states of earlier requests too, at any time after its start.
+        self._since_ns = 0
         self._joints: list[tuple[int, dict[str, float]]] = []
         self._joint_states: Subscription | None = None
         self._cameras: dict[str, Subscription] = {}
@@ -101,8 +103,9 @@ class Observer(BackgroundNode):
         return {endpoint.node_name for endpoint in self._node.get_subscriptions_info_by_topic(topic)}
 
     def forget(self) -> None:
-        """Begin new tracks and a new list of states."""
+        """Begin new tracks and a new list of states: of those that are entered after the newest ground truth."""
         with self._changed:
+            self._since_ns = self._truth.t_ns if self._truth is not None else 0
             self._tracks.clear()
             self._steps.clear()
             self._joints.clear()
@@ -148,6 +151,8 @@ class Observer(BackgroundNode):
         t_ns = stamp_to_ns(message.header.stamp)
         samples = {state.name: _sample(t_ns, state) for state in message.objects}
         with self._changed:
+            if t_ns < self._since_ns:  # the bridge was started again
+                self._since_ns = 0
             self._truth = Truth(t_ns, samples)
             for name, sample in samples.items():
                 self._tracks.setdefault(name, []).append(sample)
@@ -171,6 +176,8 @@ class Observer(BackgroundNode):
             message.arm,
         )
         with self._changed:
+            if 0 < step.t_ns < self._since_ns:
+                return
             self._steps.append(step)
             self._changed.notify_all()
         if self._on_step is not None:
