@@ -268,6 +268,8 @@ class BackgroundNode(ContextNode):
                 self._node.get_logger().debug("the context was shut down")
                 return
             except Exception as error:
+                if self._closing.is_set():  # what is waited for is being destroyed
+                    return
                 self._node.get_logger().error(f"what arrived could not be handled, the rest goes on: {error!r}")
                 self._closing.wait(_CHECK_S)  # of an error that stays, a few lines a second
 
