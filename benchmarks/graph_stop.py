@@ -155,6 +155,8 @@ def busy(count: int) -> Iterator[None]:
 
 def stopped(client: Client, pids: list[int], sign: float) -> tuple[float, float, float]:
     """Answer and hold of /stop in mid-swing, ms, and travel, mrad, while processes hang."""
+    for name in ("/stop", "/mujoco_bridge/reset"):  # a client that is ready to stop
+        client.call(Trigger, name, Trigger.Request(), 10.0)
     thread, ended = client.swinging(sign)
     with hanging(pids):
         t0 = time.time_ns()
