@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ask for a grasp by plain service, with nothing of the suite but its messages."""
+"""Ask for a grasp by plain service, with nothing of the suite but its messages.
+
+A client of a service does not notice that the node dies that serves it: it waits for all of its timeout. The client of
+the action /grasp/pick does (docs/interfaces.md, When a node dies), has feedback, and can cancel; prefer it.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Action servers that show that they live, and clients that notice within a lease when they do not.
+"""Servers that show that they live, and clients that notice within a lease when they do not.
 
-A server's status topic is offered with automatic liveliness: the middleware asserts it from a thread of its own, so a
-process that computes is alive, and one that was killed or stopped is not. A client whose server offers no liveliness
-(another vendor's controller) works as with `rclpy.action.ActionClient`.
+The status topic of an action, and the topic `~/_alive` of a node for its services, are offered with automatic
+liveliness: the middleware asserts it from a thread of its own, so a process that computes is alive, and one that was
+killed or stopped is not. A client whose server offers no liveliness (another vendor's) works as with rclpy's.
 """
 
 from __future__ import annotations
@@ -63,6 +63,58 @@ def owner_topic(action_name: str) -> str:
     return f"{action_name.rpartition('/')[0]}/owner"
 
 
+def alive_topic(node_name: str) -> str:
+    """Return the hidden topic on which nothing is published: that its publisher is alive shows that the node is.
+
+    Args:
+        node_name: Fully qualified.
+    """
+    return f"{node_name}/_alive"
+
+
+class Watch:
+    """Notices when the publisher of a topic dies, which discovery says up to 20 s later.
+
+    Args:
+        node: Owner.
+        kind: Type of the topic.
+        topic: Offered by `LEASE`.
+        what: Names its publisher where its node is not known.
+    """
+
+    def __init__(self, node: Node, kind: Any, topic: str, what: str) -> None:
+        self._node, self._topic, self._what = node, topic, what
+        #: Publishers that live, and deaths so far.
+        self.alive = self.deaths = 0
+        self._who = ""
+        events = SubscriptionEventCallbacks(liveliness=self._on_liveliness, use_default_callbacks=False)
+        self._subscription = node.create_subscription(
+            kind, topic, lambda _: None, LEASE.watch(latest()), event_callbacks=events
+        )
+
+    def destroy(self) -> None:
+        """End it."""
+        self._node.destroy_subscription(self._subscription)
+
+    def begin(self) -> Callable[[], str]:
+        """Return a function that says who has died since this call: the node's name; "" while it lives."""
+        self._look()
+        before = self.deaths
+        return lambda: (self._who or self._what) if self.deaths != before else ""
+
+    def _on_liveliness(self, event: QoSLivelinessChangedInfo) -> None:
+        self._look()
+        if event.alive_count < self.alive:
+            self.deaths += 1
+        self.alive = event.alive_count
+
+    def _look(self) -> None:
+        """Keep the name of the node: the graph may have lost it when it is asked for."""
+        for info in self._node.get_publishers_info_by_topic(self._topic):
+            if not info.node_name.startswith("_"):
+                self._who = f"the node {info.node_name}"
+
+
 class ActionServer(action.ActionServer):
     """An action server whose clients notice its death; arguments as `rclpy.action.ActionServer`."""
 
@@ -72,7 +124,7 @@ class ActionServer(action.ActionServer):
 
 
 class ActionClient(action.ActionClient):
-    """An action client that knows when its server has died, which discovery says up to 20 s later.
+    """An action client that knows when its server has died.
 
     Args:
         node: Owner.
@@ -83,41 +135,21 @@ class ActionClient(action.ActionClient):
     def __init__(self, node: Node, kind: Any, name: str) -> None:
         super().__init__(node, kind, name)
         self.name = name
-        self._topic = f"{node.resolve_topic_name(name)}/_action/status"
-        self._alive = self._deaths = 0
-        self._server = ""
-        events = SubscriptionEventCallbacks(liveliness=self._on_liveliness, use_default_callbacks=False)
-        profile = LEASE.watch(latest())
-        self._subscription = node.create_subscription(
-            GoalStatusArray, self._topic, lambda _: None, profile, event_callbacks=events
-        )
+        topic = f"{node.resolve_topic_name(name)}/_action/status"
+        self._watch = Watch(node, GoalStatusArray, topic, f"the server of {name}")
 
     def destroy(self) -> None:
         """Take the client down."""
-        self._node.destroy_subscription(self._subscription)
+        self._watch.destroy()
         super().destroy()
 
     def server_is_ready(self) -> bool:
         """Whether a server is in the graph that is not known to be dead."""
-        return bool(super().server_is_ready()) and (self._alive > 0 or self._deaths == 0)
+        return bool(super().server_is_ready()) and (self._watch.alive > 0 or self._watch.deaths == 0)
 
     def watch(self) -> Callable[[], str]:
         """Return a function that says who has died since this call: the node's name; "" while its server lives."""
-        self._look()
-        before = self._deaths
-        return lambda: (self._server or f"the server of {self.name}") if self._deaths != before else ""
-
-    def _on_liveliness(self, event: QoSLivelinessChangedInfo) -> None:
-        self._look()
-        if event.alive_count < self._alive:
-            self._deaths += 1
-        self._alive = event.alive_count
-
-    def _look(self) -> None:
-        """Keep the name of the server's node: the graph may have lost it when it is asked for."""
-        for info in self._node.get_publishers_info_by_topic(self._topic):
-            if not info.node_name.startswith("_"):
-                self._server = f"the node {info.node_name}"
+        return self._watch.begin()
 
 
 def check_alive(died: Callable[[], str], what: str, code: Code = Code.NOT_READY) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -14,13 +15,14 @@ import rclpy
 from action_msgs.msg import GoalStatus
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
+from std_msgs.msg import Empty
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.fields import check_message
-from openarm_common.ros.actions import ActionClient, check_alive
+from openarm_common.ros.actions import ActionClient, Watch, alive_topic, check_alive
 
 #: Period of checks that the server is still there, s.
 _CHECK_S = 0.25
@@ -120,6 +122,7 @@ class BackgroundNode(ContextNode):
         super().__init__(name, domain=domain)
         self._timeout = timeout
         self._clients: dict[str, Any] = {}
+        self._watches: dict[str, Watch] = {}
         self._making = threading.Lock()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._spin, name=name, daemon=True)
@@ -140,14 +143,15 @@ class BackgroundNode(ContextNode):
         """Call a service and return its response.
 
         Raises:
-            OpenArmError: NOT_READY, when there is no server; INVALID_ARGUMENT, when no message can hold the request;
-                TIMEOUT.
+            OpenArmError: NOT_READY, when there is no server, or a node of the suite that is the server dies;
+                INVALID_ARGUMENT, when no message can hold the request; TIMEOUT.
         """
         _check(name, request)
         client = self._client(name, lambda: self._node.create_client(kind, name))
         if not client.wait_for_service(timeout_sec=self._timeout):
             raise OpenArmError(Code.NOT_READY, f"no service {name} within {self._timeout:g} s: {_UP}")
-        return self._wait(self._begin(client.call_async, request), timeout, name, client.service_is_ready)
+        died = self._watch_service(self._node.resolve_service_name(name))
+        return self._wait(self._begin(client.call_async, request), timeout, name, client.service_is_ready, died=died)
 
     def do(
         self,
@@ -197,6 +201,20 @@ class BackgroundNode(ContextNode):
         if answer.status == GoalStatus.STATUS_UNKNOWN:
             raise OpenArmError(Code.NOT_READY, f"{name} no longer knows the goal: its node was restarted")
         return answer.result
+
+    def _watch_service(self, service: str) -> Callable[[], str]:
+        """Return a function that says when a node has died that offers a service, as `Watch.begin`."""
+        watches: list[Watch] = []
+        for name, namespace in self._node.get_node_names_and_namespaces():
+            with suppress(NodeNameNonExistentError):  # it has gone meanwhile
+                if any(service == one for one, _ in self._node.get_service_names_and_types_by_node(name, namespace)):
+                    topic = alive_topic(f"{namespace.rstrip('/')}/{name}")
+                    with self._making:
+                        if topic not in self._watches:
+                            self._watches[topic] = Watch(self._node, Empty, topic, f"the node {name}")
+                    watches.append(self._watches[topic])
+        begun = [watch.begin() for watch in watches]
+        return lambda: next((who for died in begun if (who := died())), "")
 
     def _client(self, name: str, make: Callable[[], Any]) -> Any:
         with self._making:

@@ -31,11 +31,13 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
+from std_msgs.msg import Empty
 
 from openarm_common.config import AT_RUN_TIME, Config, validate
 from openarm_common.errors import OpenArmError
 from openarm_common.printable import brief
 from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.actions import LEASE, alive_topic, latest
 from openarm_common.ros.log import PrintableLogger
 
 ConfigT = TypeVar("ConfigT", bound=Config)
@@ -119,6 +121,8 @@ class BaseNode(Node, Generic[ConfigT]):
             level=DiagnosticStatus.STALE, name=f"{self.get_name()}: status", hardware_id="openarm"
         )
         self.__diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
+        # While it is there, clients of services know that they will be answered.
+        self.__alive = self.create_publisher(Empty, alive_topic(self.get_fully_qualified_name()), LEASE.offer(latest()))
         self.create_timer(self.REPORT_PERIOD_S, self.__publish_diagnostics, clock=self.steady_clock)
 
     @property

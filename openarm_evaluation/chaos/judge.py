@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from openarm_common.errors import Code
+from openarm_evaluation.chaos.schedule import Fault
 from openarm_evaluation.judging.judge import Sample, judge
 
 #: Free fall from a greater height is a drop, m.
@@ -18,6 +19,33 @@ TRUTH_HZ = 100.0
 REST_SPEED = 0.05
 #: Bounds, s of wall clock: of a request, of the notice of a server's death, of the graph's return.
 REQUEST_S, DEATH_S, BACK_S = 180.0, 2.0, 15.0
+
+#: How a pick may end though nothing goes wrong: by what stands on the table, or what a busy machine makes late.
+NATURAL = frozenset(
+    {
+        Code.OK,
+        Code.UNKNOWN_OBJECT,
+        Code.NOTHING_DETECTED,
+        Code.STALE_DATA,
+        Code.UNREACHABLE,
+        Code.IN_COLLISION,
+        Code.NO_PLAN,
+        Code.TOO_WIDE,
+        Code.GRASP_MISSED,
+        Code.GRASP_LOST,
+        Code.HAND_COLLISION,
+        Code.PLACE_FAILED,
+    }
+)
+_OF_NODES = frozenset({Code.NOT_READY, Code.ROBOT_LOST, Code.NO_TRANSFORM, Code.EXECUTION_FAILED, Code.TIMEOUT})
+#: How else it may end, by the kind of the fault; kinds that are not here must not be felt.
+OF_KIND: Mapping[str, frozenset[Code]] = {
+    "kill": _OF_NODES,
+    "stop": _OF_NODES,
+    "joints": _OF_NODES,
+    "camera": frozenset({Code.NO_TRANSFORM}),
+    "services": frozenset({Code.TIMEOUT}),
+}
 
 _G, _FALLING = 9.81, 0.7  # the share of g that only a fall reaches: arms accelerate less
 _OVER_S = 0.1
@@ -81,19 +109,27 @@ def falls(tracks: Mapping[str, Sequence[Sample]]) -> list[Violation]:
     ]
 
 
-def claims(track: Sequence[Sample], success: bool, code: Code, outcome: str, place: Sequence[float]) -> list[Violation]:
+def fits(code: Code, fault: Fault | None) -> list[Violation]:
+    """Return what is wrong with the code of an answer after a fault; None: nothing had gone wrong before the answer."""
+    if fault is not None and (fault.kind, fault.node) == ("kill", "grasp"):
+        fitting = frozenset({Code.NOT_READY})  # nobody else could know
+    else:
+        fitting = NATURAL | OF_KIND.get(fault.kind if fault else "", frozenset())
+    if code in fitting:
+        return []
+    return [Violation("a failure names its cause", f"{code} does not fit {fault or 'a pick without a fault'}")]
+
+
+def claims(track: Sequence[Sample], success: bool, outcome: str, place: Sequence[float]) -> list[Violation]:
     """Return what an answer says that is not so.
 
     Args:
         track: Of the object that was asked for, from before the request until it is at rest.
         success: What the answer claims.
-        code: Of the answer.
         outcome: Of the answer, as `GraspResult.outcome`; "" when no answer came.
         place: Where the answer says it was placed.
     """
     found: list[Violation] = []
-    if code is Code.INTERNAL:
-        found.append(Violation("no claim without truth", "the answer is INTERNAL, a defect of the suite"))
     if len(track) < 2 or since_reset(track) != list(track):
         return found  # the world is another one
     verdict = judge(track, (float(place[0]), float(place[1])), claimed=success)

@@ -20,9 +20,15 @@ KINDS: Mapping[str, str] = {
     "disk": "a full run folder",
     "camera": "frames that are lost, late or frozen",
     "joints": "gaps in /joint_states",
+    "detector": "objects that the detector misses",
+    "plans": "plans that fail",
+    "intruder": "valid /joint_commands of another client",
+    "rival": "requests and goals of another client",
 }
 #: States of the grasp that a fault waits for; "" is before the request.
 STATES = ("", "DETECT", "PLAN", "MOVE_TO_PREGRASP", "MOVE_TO_GRASP", "CLOSE_GRIPPER", "LIFT", "PLACE", "RESET")
+#: Those in which the grasp holds an arm.
+HOLDING = ("MOVE_TO_PREGRASP", "MOVE_TO_GRASP", "CLOSE_GRIPPER", "LIFT", "PLACE")
 
 _CAMERA_FAULTS: Sequence[tuple[str, Mapping[str, Any]]] = (
     ("camera_drop", {"share": 1.0}),
@@ -40,8 +46,9 @@ class Fault:
         when: State of the grasp in which it begins; "": before the request.
         after: From the beginning of that state, s.
         seconds: How long it lasts; 0 for a kill.
-        node: That is killed or stopped.
+        node: That is killed or stopped, or whose parameters change.
         injected: Name and parameters of the simulation's fault.
+        share: Parameter of the node that is the share of what fails, and its value.
     """
 
     kind: str
@@ -50,9 +57,15 @@ class Fault:
     seconds: float
     node: str = ""
     injected: tuple[str, Mapping[str, Any]] | None = None
+    share: tuple[str, float] = ("", 0.0)
+
+    @property
+    def target(self) -> str:
+        """What it hits: a node, or a camera; "" where the kind says it."""
+        return f"{self.injected[0]} {self.injected[1].get('camera', '')}".strip() if self.injected else self.node
 
     def __str__(self) -> str:
-        what = self.injected[0] if self.injected else self.node
+        what = f"{self.target} {self.share[1]:.0%}" if self.share[0] else self.target
         lasting = f" for {self.seconds:.1f} s" if self.seconds else ""
         return f"{self.kind} {what}".strip() + f"{lasting}, {self.after:.1f} s into {self.when or 'rest'}"
 
@@ -120,6 +133,13 @@ def _fault(rng: np.random.Generator, bags: Mapping[str, Iterator[str]]) -> Fault
         return Fault(kind, when, after, seconds, injected=(name, {"camera": camera, **parameters}))
     if kind == "joints":
         return Fault(kind, when, after, seconds, injected=("joint_state_gap", {"ms": int(rng.integers(50, 400))}))
+    if kind in ("detector", "plans"):
+        names = ("detector", "wrist_detector") if kind == "detector" else ("motion",)
+        parameter = "faults.miss_share" if kind == "detector" else "faults.no_plan_share"
+        node, share = names[int(rng.integers(len(names)))], (0.5, 1.0)[int(rng.integers(2))]
+        return Fault(kind, when, after, seconds, node, share=(parameter, share))
+    if kind in ("intruder", "rival"):
+        when = HOLDING[int(rng.integers(len(HOLDING)))]
     return Fault(kind, when, after, seconds)
 
 

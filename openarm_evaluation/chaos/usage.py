@@ -108,6 +108,8 @@ def draw(uses: list[Use], path: Path) -> None:
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0.0)
         axes.grid(alpha=0.3)
-    figure.axes[0].legend(ncols=3, fontsize=7)
     figure.axes[-1].set_xlabel("min")
+    figure.subplots_adjust(top=0.87, bottom=0.07, left=0.09, right=0.98)
+    names, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(names, labels, loc="upper center", ncols=4, fontsize=7, frameon=False)  # above the curves
     path.write_bytes(render_figure(figure.axes[0], "png", dpi=90.0))

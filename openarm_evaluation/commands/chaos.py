@@ -22,14 +22,16 @@ def chaos(
 ) -> Outcome:
     """Pick objects on a graph of its own while a seeded schedule of faults runs, and hold what must never happen.
 
-    No object falls; no answer claims what is not so; every request is answered within its bound; the graph is back
-    within 15 s; no arm moves without a request; nothing is left after the end. The exit code is 1 when one of them did
-    not hold. The same seed gives the same requests and faults.
+    No object falls; no answer claims what is not so, and a failure names its cause; every request is answered within
+    its bound; the graph is back within 15 s; no arm moves without a request, and one that is held obeys its holder
+    alone; nothing is left after the end. The exit code is 1 when one of them did not hold, or the run was cut short.
+    The same seed gives the same requests and faults.
 
     Args:
         minutes: How long; a request that has begun is finished.
         seed: Of scenes, requests and faults.
-        faults: Kinds of faults: kill, stop, commands, services, disk, camera, joints; all when not given; none.
+        faults: Kinds of faults: kill, stop, commands, services, disk, camera, joints, detector, plans, intruder,
+            rival; all when not given; none.
         rounds: Requests at most.
         plot: PNG of the memory, descriptors and threads of each node over time.
         out: Folder for logs, report and memory; a new one below runs/ when not given.
@@ -55,8 +57,6 @@ def chaos(
 
     report = run(seed, 60.0 * minutes, kinds, folder, show, rounds)
     uses = report.usage.uses if report.usage else []
-    if plot is not None:
-        draw(uses, plot)
     found = {
         "folder": str(folder),
         "seed": seed,
@@ -64,11 +64,18 @@ def chaos(
         "requests": len(report.rounds),
         "placed": sum(row["code"] == "OK" for row in report.rounds),
         "faults": report.faults(),
+        "in_the_wanted_state": sum(row["reached"] for row in report.rounds),
         "growth_mib_per_hour": growth(uses),
         "violations": report.violations,
+        "cut_short": report.cut,
     }
     (folder / "chaos.json").write_text(json.dumps({**found, "rounds": report.rounds}, indent=1), encoding="utf-8")
+    if plot is not None:
+        draw(uses, plot)
     text = "\n".join(f"{kind:<12} {count}" for kind, count in report.faults().items())
     number, most = len(report.violations), f"{len(report.rounds)} requests, {sum(report.faults().values())} faults"
+    most += f" ({found['in_the_wanted_state']} in the state that was wanted)"
     message = f"{most}, {number} violations. Report: {folder}/chaos.json"
-    return Outcome(not number, message, Code.INTERNAL if number else Code.OK, found, text)
+    if report.cut:
+        message = f"cut short after {report.seconds:.0f} s: {report.cut}; {message}"
+    return Outcome(not number and not report.cut, message, Code.VIOLATION if number else report.code, found, text)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_common.errors import OpenArmError
-from openarm_evaluation.chaos.schedule import KINDS, STATES, known_kinds, rounds
+from openarm_evaluation.chaos.schedule import HOLDING, KINDS, STATES, known_kinds, rounds
 
 NODES = ["bridge", "motion", "grasp"]
 
@@ -23,7 +23,9 @@ def test_a_seed_repeats_its_faults_and_every_kind_has_its_turn(seed: int, kinds:
     for one in first:
         assert one.fault is not None
         assert one.fault.when in STATES
-        assert (one.fault.node in NODES) == (one.fault.kind in ("kill", "stop"))
+        assert bool(one.fault.node) == (one.fault.kind in ("kill", "stop", "detector", "plans"))
+        assert one.fault.node in NODES or one.fault.kind not in ("kill", "stop")
+        assert one.fault.when in HOLDING or one.fault.kind not in ("intruder", "rival")
     killed = [one.fault.node for one in first if one.fault and one.fault.kind == "kill"]
     assert not killed or sorted(killed) == sorted(NODES)
 

@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from control_msgs.action import FollowJointTrajectory
+from std_srvs.srv import Trigger
 
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
@@ -41,6 +42,22 @@ async def wait(handle):
 rclpy.init()
 node = rclpy.create_node("waiter")
 server = ActionServer(node, FollowJointTrajectory, "/wait", wait)
+rclpy.spin(node)
+"""
+#: A node of the suite whose service never answers.
+SERVICE = """
+import rclpy
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+from openarm_common.config import Config
+from openarm_common.ros.node import BaseNode
+
+async def wait(request, response):
+    await Future()
+
+rclpy.init()
+node = BaseNode("waiter", Config)
+node.create_service(Trigger, "/wait", wait)
 rclpy.spin(node)
 """
 #: A client that sends the goal of its arguments as the motion node does.
@@ -122,6 +139,21 @@ def test_a_client_ends_when_its_server_is_stopped_or_killed_and_works_with_the_n
 
 
 @pytest.mark.requirement("R-21")
+def test_a_call_of_a_service_ends_when_its_node_is_killed(ros, children) -> None:
+    with ThreadPoolExecutor() as pool, BackgroundNode("client", timeout=120.0) as client:
+        server = children.start(SERVICE)
+        work = pool.submit(client.call, Trigger, NAME, Trigger.Request(), 60.0)
+        ros.spin_until(
+            lambda: any(watch.alive for watch in client._watches.values()), 120.0, "a call to a node that lives"
+        )
+        began = killed(server, signal.SIGKILL)
+        with pytest.raises(OpenArmError, match="/wait: the node waiter is gone") as caught:
+            work.result(20.0)
+        assert time.monotonic() - began < 2.0
+        assert caught.value.code is Code.NOT_READY
+
+
+@pytest.mark.requirement("R-21")
 def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> None:
     node = ros.add(BaseNode("grasp", Config))
     clients = GraphClients(node, GraspConfig())
@@ -129,7 +161,7 @@ def test_a_grasp_ends_when_a_node_that_it_waits_for_is_killed(ros, children) -> 
     clients._timer.reset()
     client = ActionClient(node, FollowJointTrajectory, NAME)
     server = children.start(SERVER)
-    ros.spin_until(lambda: client.server_is_ready() and client._alive, 60.0, "the server, known to live")
+    ros.spin_until(lambda: client.server_is_ready() and client._watch.alive, 60.0, "the server, known to live")
     ros.spin_until(lambda: "waiter" in node.get_node_names(), 60.0, "the name of the node")
     errors: list[OpenArmError] = []
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import math
 import shutil
 import threading
 import time
@@ -28,7 +29,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import Scene, SceneObject, random_scene
 from openarm_evaluation.chaos import judge
 from openarm_evaluation.chaos.judge import Violation
-from openarm_evaluation.chaos.schedule import Fault, Round, rounds
+from openarm_evaluation.chaos.schedule import HOLDING, Fault, Round, rounds
 from openarm_evaluation.chaos.usage import Usage
 from openarm_evaluation.judging.trial import Step, wait_scene
 
@@ -36,6 +37,35 @@ from openarm_evaluation.judging.trial import Step, wait_scene
 _SETTLE_S, _WATCH_S, _WALL_S = 1.0, 2.0, 30.0
 #: Longest wait for a graph that does not come back, s.
 _NEVER_RETURNS_S = 90.0
+#: So long the supervisor has for noticing that a node was killed, s.
+_NOTICED_S = 5.0
+
+
+@dataclass
+class Hit:
+    """When a fault really happened.
+
+    Attributes:
+        state: Of the grasp at that time; None: not yet.
+        began: s, monotonic.
+        ended: The same of its end.
+        back: s from its end until the graph was ready.
+        over: The request was answered before it began.
+    """
+
+    state: str | None = None
+    began: float = math.inf
+    ended: float = 0.0
+    back: float = 0.0
+    over: bool = False
+
+    def where(self, fault: Fault) -> str:
+        """Return the state of the grasp that was hit, and whether it is the one that was wanted."""
+        if not fault.when:
+            return "before the request"
+        if self.over:
+            return f"after the answer; {fault.when} was never reached"
+        return self.state or "before the first state"
 
 
 @dataclass
@@ -47,7 +77,9 @@ class Report:
         seconds: s of wall clock.
         rounds: One row each: request, answer, fault, times.
         violations: Each with its round, fault and time.
-        uses: Memory, descriptors and threads of the nodes.
+        usage: Memory, descriptors and threads of the nodes.
+        cut: Why it ended early; "" when it did not.
+        code: Of that.
     """
 
     seed: int
@@ -55,6 +87,8 @@ class Report:
     rounds: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     violations: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     usage: Usage | None = None
+    cut: str = ""
+    code: Code = Code.OK
 
     def faults(self) -> dict[str, int]:
         """Return how many faults of each kind there were."""
@@ -70,7 +104,7 @@ def run(
     show: Callable[[dict[str, Any]], None],
     most: int | None = None,
 ) -> Report:
-    """Run picks and faults on a graph of its own until the time is over; return what was seen.
+    """Run picks and faults on a graph of its own until the time is over, or something ends it; return what was seen.
 
     Args:
         seed: Of scenes, requests and faults.
@@ -85,7 +119,12 @@ def run(
     sets = [f"mujoco_bridge.ground_truth_rate={judge.TRUTH_HZ}"]
     graph = load_graph("sim", overrides={"domain": domain, "scene": "random", "seed": seed}, sets=sets)
     seen: set[int] = set()
-    asyncio.run(_run(graph, report, seconds, kinds, folder, show, seen, most))
+    try:
+        asyncio.run(_run(graph, report, seconds, kinds, folder, show, seen, most))
+    except OpenArmError as error:
+        report.cut, report.code = error.message, error.code
+    except (Exception, KeyboardInterrupt) as error:
+        report.cut, report.code = f"{type(error).__name__}: {error}", Code.INTERNAL
     for text in left_over(domain, seen):
         report.violations.append({"rule": "nothing is left", "text": text, "seed": seed})
     return report
@@ -188,8 +227,8 @@ class _Work:
         self._observer.joints()
         self._observer.forget()
         self._observer.wait(lambda: self._observer.track(item.name) or None, _WALL_S, f"ground truth of {item.name}")
-        over, fault_end = threading.Event(), [0.0]
-        actor = threading.Thread(target=self._act, args=(one.fault, over, fault_end, found), daemon=True)
+        over, hit = threading.Event(), Hit()
+        actor = threading.Thread(target=self._act, args=(one.fault, over, hit, found), daemon=True)
         actor.start()
         if one.fault is not None and not one.fault.when:
             actor.join()
@@ -206,25 +245,33 @@ class _Work:
         over.set()
         actor.join()
         killed = one.fault is not None and one.fault.kind == "kill" and one.fault.node == "grasp"
-        if killed and began < fault_end[0] < answered and answered - fault_end[0] > judge.DEATH_S:
-            late = f"the client learnt of the death of grasp after {answered - fault_end[0]:.1f} s"
+        if killed and began < hit.began < answered and answered - hit.began > judge.DEATH_S:
+            late = f"the client learnt of the death of grasp after {answered - hit.began:.1f} s"
             found.append(Violation("every request is answered", late))
-        back_s = self._wait_back(max(answered, fault_end[0]), found)
+        self._wait_back(answered, found)  # also without a fault, or when it is felt late
         found += self._watch_rest(answered)
         tracks = {thing.name: self._observer.track(thing.name) for thing in (self._scene or random_scene(0)).objects}
         found += judge.falls(tracks)
         place = answer.place_position if any(answer.place_position) else (float("nan"),) * 2
-        found += judge.claims(tracks[item.name], answer.success, answer.code, outcome, place)
+        if not self.ended.is_set():
+            felt = None if hit.began > answered or (killed and hit.began < began) else one.fault
+            found += judge.fits(answer.code, felt)
+        found += judge.claims(tracks[item.name], answer.success, outcome, place)
         row = {
             "round": one.number,
             "label": label,
             "arm": one.arm,
             "fault": str(one.fault or ""),
             "kind": one.fault.kind if one.fault else "",
+            "target": one.fault.target if one.fault else "",
+            "wanted_state": (one.fault.when or "before the request") if one.fault else "",
+            "state": hit.where(one.fault) if one.fault else "",
+            "reached": one.fault is not None and (not one.fault.when or hit.state == one.fault.when) and not hit.over,
             "code": str(answer.code),
             "message": answer.message,
             "seconds": round(answered - began, 1),
-            "back_s": round(back_s, 1),
+            "known_s": round(answered - hit.began, 1) if began < hit.began < answered else None,
+            "back_s": round(hit.back, 1),
             "violations": [asdict(violation) for violation in found],
         }
         self._report.rounds.append(row)
@@ -242,7 +289,7 @@ class _Work:
             self._state = step.state
             self._steps.notify_all()
 
-    def _act(self, fault: Fault | None, over: threading.Event, ended: list[float], found: list[Violation]) -> None:
+    def _act(self, fault: Fault | None, over: threading.Event, hit: Hit, found: list[Violation]) -> None:
         """Wait for the state in which a fault begins, or for the end of the request, and carry it out."""
         if fault is None:
             return
@@ -250,14 +297,19 @@ class _Work:
             while fault.when and self._state != fault.when and not over.is_set():
                 self._steps.wait(timeout=0.05)
         over.wait(fault.after if fault.when else 0.0)
+        hit.over, hit.state, hit.began = over.is_set(), self._state, time.monotonic()
         try:
-            found += self._actors.carry_out(fault)
+            found += self._actors.carry_out(fault, lambda: not over.is_set() and self._state in HOLDING)
         except OpenArmError as error:  # the simulation did not answer: its own fault is judged by the rest
             found.append(Violation("every request is answered", f"{fault}: {error}"))
-        ended[0] = time.monotonic()
+        hit.ended = time.monotonic()
+        ready = lambda: self._supervisor.states().get(fault.node) is NodeState.READY  # noqa: E731
+        while fault.kind == "kill" and ready() and time.monotonic() - hit.ended < _NOTICED_S:
+            time.sleep(0.02)
+        hit.back = self._wait_back(hit.ended, found)
 
     def _wait_back(self, since: float, found: list[Violation]) -> float:
-        """Wait until the graph is ready again; return how long that took after the last fault, s."""
+        """Wait until the graph is ready again; return how long that took since then, s."""
         while True:
             states = self._supervisor.states()
             lacking = [f"{name} is {state}" for name, state in states.items() if state is not NodeState.READY]
