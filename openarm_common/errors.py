@@ -73,6 +73,17 @@ class OpenArmError(Exception):
         self.code = code
         self.message = text
 
+    def settled(self) -> Self:
+        """Return the error without the frames that it passed through, for what keeps it.
+
+        They would keep everything that they worked on until the next full garbage collection.
+        """
+        error: BaseException | None = self
+        while error is not None:
+            error.__traceback__ = None
+            error = error.__cause__ or error.__context__
+        return self
+
     def __reduce__(self) -> tuple[type[OpenArmError], tuple[Code, str]]:
         """Let the error cross process borders (worker pools pickle it)."""
         return (type(self), (self.code, self.message))

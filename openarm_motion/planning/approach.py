@@ -316,7 +316,7 @@ class _Checks:
             try:
                 approach, retreat = self._lines(target, solution)
             except PlanFailedError as error:
-                faults.append(error)
+                faults.append(error.settled())
                 continue
             travel = segment_time(self._now.start, approach.q[0], limits)
             closest = arm.kinematics.margin(np.vstack([approach.q, retreat.q]))

@@ -230,7 +230,7 @@ def plan_staggered(both: DualArm, now: StartState, wanted: DualArmGoals, time_li
         except OpenArmError as error:
             if error.code not in (Code.NO_PLAN, Code.IN_COLLISION):
                 raise
-            faults.append(error)
+            faults.append(error.settled())
     if not found:
         text = "; ".join(f"{arm.name} first: {e.message}" for arm, e in zip(both.arms, faults, strict=True))
         raise OpenArmError(faults[0].code, f"neither arm can go first: {text}")

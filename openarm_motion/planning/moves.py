@@ -107,7 +107,7 @@ def to_pose_on_line(arm: Arm, now: StartState, pose: Array, around: RequestBoxes
             try:
                 validate_trajectory(scene, trajectory)
             except PlanFailedError as error:
-                faults.append(error)
+                faults.append(error.settled())
                 continue
         return trajectory
     worst = next((fault for fault in faults if fault.code == Code.IN_COLLISION), faults[0])

@@ -127,7 +127,7 @@ class ArmCoordination:
                 try:
                     await follower.follow(motions[k], begin_ns, lambda: bool(faults) or cancelled(), one_progress)
                 except OpenArmError as error:
-                    faults.append(error)
+                    faults.append(error.settled())
 
             return run
 

@@ -162,6 +162,10 @@ class MotionAnswer:
     planning_time: float = 0.0
     start_delay: float = 0.0
 
+    def __post_init__(self) -> None:
+        if self.error is not None:
+            self.error.settled()
+
     @property
     def code(self) -> Code:
         """OK, or the error's."""

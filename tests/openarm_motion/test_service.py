@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_motion.collision.exact import CollisionScene
 from openarm_motion.collision.solids import Sphere
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.approach import ApproachRequest, Target
@@ -288,3 +290,29 @@ def test_an_unreachable_pose_carries_the_nearest_alternative(bench) -> None:
     ik = bench.service.compute_ik("right", pose, (), position_only=False)
     assert ik.error is not None
     assert ik.nearest.position_error > 0.05
+
+
+def test_a_failed_request_keeps_no_scene_alive(bench) -> None:
+    """Exceptions that are kept with their frames would, until a full garbage collection."""
+    service = bench.service
+    q = np.array([bench.robot.state[name] for name in service.arms["right"].names])
+    T = service.arms["right"].kinematics.fk(q)
+    far, aside = T.copy(), T.copy()
+    far[0, 3] += 0.9
+    aside[2, 3] -= 0.8
+    aside[0, 3] += 0.2
+    lines = (np.array([0.0, 0.0, 0.1]), np.array([0.0, 0.0, 0.05]))
+    ways = tuple(Target(f"w{k}", pose, *lines, 1.0) for k, pose in enumerate((far, aside)))
+    gc.collect()
+    gc.disable()
+    try:
+        before = sum(isinstance(one, CollisionScene) for one in gc.get_objects())
+        for request in (PoseGoal(far), LineGoal(far), PoseGoal(aside), LineGoal(aside)):
+            (answer,) = bench.run(service.move(MoveRequest("right", request, plan_only=True)))
+            assert answer.code is not Code.OK
+        (answer,) = bench.run(service.plan_approach(PlanApproachRequest("right", ApproachRequest(ways))))
+        assert answer.code is not Code.OK
+        del answer
+        assert sum(isinstance(one, CollisionScene) for one in gc.get_objects()) == before
+    finally:
+        gc.enable()
