@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
 from openarm_bringup.suggest import unknown
-from openarm_bringup.supervision import environment, shm
+from openarm_bringup.supervision import environment, ports, shm
 from openarm_bringup.supervision.graph import Ready
 from openarm_bringup.supervision.process import NodeProcess
 from openarm_common.errors import Code, OpenArmError
@@ -70,6 +70,7 @@ class Keeper:
         self.mapped: set[str] = set()
         self._supervisor = supervisor
         self._was_ready = False
+        self._ports: frozenset[int] = frozenset()
 
     @property
     def pid(self) -> int | None:
@@ -158,6 +159,7 @@ class Keeper:
                 self._was_ready = True
                 self.ready.set()
                 self.mapped |= shm.mapped_by(process.pid)
+                self._ports = ports.used_by(process.pid, environment.domain_id(supervisor.graph))
                 self._enter(NodeState.READY, f"after {ready_at - began:.1f} s")
             code = await ended
         finally:
@@ -167,6 +169,7 @@ class Keeper:
         self.ready.clear()
         supervisor.tell_guard(f"-{process.pid}")
         if code < 0 or process.killed:
+            supervisor.ports.hold(self._ports)
             # Killed processes leave their segments behind; free them before the next start needs the space.
             supervisor.say(await asyncio.to_thread(shm.clean_shm))
         return code, f"ended by signal {-code}" if code < 0 else f"ended with code {code}", ready_s

@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from openarm_bringup.supervision.graph import Graph
+from openarm_bringup.supervision.ports import in_domain
 from openarm_common.errors import Code, OpenArmError
 
 SHM = Path("/dev/shm")
@@ -108,7 +109,7 @@ def names_of(domain: int, shm: Path = SHM) -> set[str]:
     """
     field = re.compile(rf"openarm_field_{domain}([a-z0-9_]{{8}})?")
     names = [entry.name for entry in shm.iterdir()]
-    ports = {name for name in names if (port := _PORT.fullmatch(name)) and (int(port[1]) - 7400) // 250 == domain}
+    ports = {name for name in names if (port := _PORT.fullmatch(name)) and in_domain(int(port[1]), domain)}
     return ports | {name for name in names if field.fullmatch(name)}
 
 

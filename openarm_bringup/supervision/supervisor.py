@@ -26,6 +26,7 @@ from openarm_bringup.supervision.activation import Activation
 from openarm_bringup.supervision.graph import Graph
 from openarm_bringup.supervision.keeper import Keeper, NodeState, Probe
 from openarm_bringup.supervision.log import LogFile
+from openarm_bringup.supervision.ports import HeldPorts
 from openarm_bringup.supervision.process import Ladder
 from openarm_common.errors import Code, OpenArmError
 
@@ -85,6 +86,7 @@ class Supervisor:
         self._logs: list[LogFile] = []
         self._log = self.log_file("supervisor")
         self._disk_faults: set[Path] = set()
+        self.ports = HeldPorts()
         self._keepers = {name: Keeper(name, self) for name in self.graph.nodes}
         self.daemon = Activation(self)
 
@@ -175,6 +177,7 @@ class Supervisor:
             # A node that is slow to end does not hold back the rest: its own ladder goes on meanwhile.
             await asyncio.wait(tasks, timeout=1.0)
         await asyncio.gather(*stops)
+        self.ports.close()
         mapped = shm.mapped_by(os.getpid())
         if self._probe is not None and (await asyncio.wait([self._probe])) and self._probe.exception() is None:
             await self.ask(lambda probe: probe.close())

@@ -8,6 +8,7 @@ import contextlib
 import errno
 import os
 import signal
+import socket
 import subprocess
 import sys
 import textwrap
@@ -215,6 +216,35 @@ def test_failed_node_comes_back_and_old_endpoints_do_not_count_as_ready(tmp_path
             NodeState.READY,
             NodeState.STOPPED,
         ]
+
+    asyncio.run(body())
+
+
+def test_a_successor_does_not_get_the_ports_of_the_one_that_was_killed(tmp_path: Path) -> None:
+    """Others would go on writing into the shared memory that has their numbers."""
+    take = """
+import itertools, socket, time
+for port in itertools.count(7400 + 250 * 67 + 10):
+    try:
+        taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); taken.bind(("127.0.0.1", port)); break
+    except OSError: pass
+pathlib.Path(sys.argv[1] + ".port").write_text(str(port))
+pathlib.Path(sys.argv[1]).write_text(str(os.getpid()))
+time.sleep(60)
+"""
+    spec = toy(tmp_path, "arm", restart=Restart(backoff=0.05))
+    command = ("python", "-S", "-c", f"import os, pathlib, sys{take}", str(tmp_path / "arm"))
+    port = tmp_path / "arm.port"
+
+    async def body() -> None:
+        async with running(tmp_path, {"arm": spec.model_copy(update={"command": command})}) as run:
+            await run.supervisor.wait_ready()
+            first = int(port.read_text())
+            os.kill(run.supervisor.pid("arm"), signal.SIGKILL)
+            await run.until(lambda: run.seen("arm").count(NodeState.READY) == 2)
+            assert int(port.read_text()) != first
+        with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as one:
+            one.bind(("", first))  # released at the end
 
     asyncio.run(body())
 

@@ -21,6 +21,7 @@ import yaml
 from openarm_bringup.supervision import environment, shm
 from openarm_bringup.supervision.graph import Graph, load_graph
 from openarm_bringup.supervision.keeper import NodeState
+from openarm_bringup.supervision.ports import in_domain
 from openarm_bringup.supervision.session import running_graph, work_until_stopped
 from openarm_bringup.supervision.state import socket_path, state_dir
 from openarm_bringup.supervision.supervisor import Supervisor
@@ -135,8 +136,7 @@ def left_over(domain: int, pids: set[int]) -> list[str]:
     found = [f"process {pid}" for pid in pids if psutil.pid_exists(pid)]
     found += [f"/dev/shm/{name}" for name in sorted(shm.names_of(domain))]
     found += [str(path) for path in (socket_path(_me()), state_dir() / f"{_me()}.json") if path.exists()]
-    ports = range(7400 + 250 * domain, 7650 + 250 * domain)
-    held = {c.laddr.port for c in psutil.net_connections("udp") if c.laddr and c.laddr.port in ports}
+    held = {c.laddr.port for c in psutil.net_connections("udp") if c.laddr and in_domain(c.laddr.port, domain)}
     return [*found, *(f"port {port}" for port in sorted(held))]
 
 

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""UDP ports of nodes that died, kept from their successors.
+
+Fast DDS numbers its ports in shared memory as those of UDP, and takes the lowest that are free. A process that is
+started again would get the numbers of the one that was killed, while all others still write into the memory of that
+one: they notice after 2 to 4 s, or never when it died in the middle of a message (eProsima/Fast-DDS#4728). With other
+numbers they reach it at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Iterable, Sequence
+
+import psutil
+
+#: Of a domain, by the DDS interoperability protocol.
+_FIRST, _PER_DOMAIN = 7400, 250
+#: Participants forget one that is silent after 20 s.
+_KEPT_S = 25.0
+
+
+def in_domain(port: int, domain: int) -> bool:
+    """Whether a port belongs to a ROS domain."""
+    return (port - _FIRST) // _PER_DOMAIN == domain
+
+
+def used_by(pid: int, domain: int) -> frozenset[int]:
+    """Return the UDP ports of a domain on which a process and those below it listen; none when it has ended."""
+    try:
+        process = psutil.Process(pid)
+        family = [process, *process.children(recursive=True)]
+        found = [c.laddr.port for one in family for c in one.net_connections("udp") if c.laddr]
+    except psutil.Error:
+        return frozenset()
+    return frozenset(port for port in found if in_domain(port, domain))
+
+
+class HeldPorts:
+    """Holds ports for as long as others may take their next owner for the last one."""
+
+    def __init__(self) -> None:
+        self._held: set[socket.socket] = set()
+
+    def hold(self, ports: Iterable[int]) -> None:
+        """Hold those that are free; in the loop of the supervisor."""
+        taken: list[socket.socket] = []
+        for port in ports:
+            one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            try:
+                one.bind(("", port))
+            except OSError:  # of several participants, as those for multicast
+                one.close()
+            else:
+                taken.append(one)
+        self._held.update(taken)
+        asyncio.get_running_loop().call_later(_KEPT_S, self._release, taken)
+
+    def close(self) -> None:
+        """Release all."""
+        self._release(list(self._held))
+
+    def _release(self, held: Sequence[socket.socket]) -> None:
+        for one in held:
+            with contextlib.suppress(OSError):
+                one.close()
+        self._held.difference_update(held)
