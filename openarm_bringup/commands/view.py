@@ -47,7 +47,7 @@ async def _serve(host: str, port: int, show: bool) -> str:
     import asyncio
     import webbrowser
 
-    from aiohttp import web
+    from openarm_bringup.view.gate import listening
 
     loop = asyncio.get_running_loop()
     stop: asyncio.Future[None] = loop.create_future()
@@ -58,25 +58,18 @@ async def _serve(host: str, port: int, show: bool) -> str:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, end)
-    with make_server(host, end) as server:
-        runner = web.AppRunner(server.app(), access_log=None, shutdown_timeout=1.0)
-        await runner.setup()
+    with make_server(host, end) as server, TemporaryDirectory(prefix="openarm_view_") as folder:  # of this user alone
         try:
-            try:
-                await web.TCPSite(runner, host, port).start()
-            except OSError as error:
-                text = f"can't listen on {host}:{port}: {error.strerror}; choose another with --port or --host"
-                raise OpenArmError(Code.ENVIRONMENT, text) from error
-            shown = f"[{host}]" if ":" in host else host
-            address = f"http://{shown}:{runner.addresses[0][1]}/"
-            url = f"{address}?token={server.guard.token}"
-            console().print(f"the page is at {url}", markup=False, soft_wrap=True)
-            with TemporaryDirectory(prefix="openarm_view_") as folder:  # which no other user may read
+            async with listening(server.app(), host, port) as taken:
+                address = f"http://{f'[{host}]' if ':' in host else host}:{taken}/"
+                url = f"{address}#{server.guard.token}"
+                console().print(f"the page is at {url}", markup=False, soft_wrap=True)
                 if show:
                     webbrowser.open(redirect(Path(folder), url).as_uri())
                 await stop
-        finally:
-            await runner.cleanup()
+        except OSError as error:
+            text = f"can't listen on {host}:{port}: {error.strerror}; choose another with --port or --host"
+            raise OpenArmError(Code.ENVIRONMENT, text) from error
     return address
 
 

@@ -77,7 +77,7 @@ class Guard:
         """
         if not hmac.compare_digest((token or "").encode(), self.token.encode()):
             what = "wrong token" if token else "no token"
-            raise _refused(f"{what}; open the address that was printed when the server started, with its ?token=…")
+            raise _refused(f"{what}; open the whole address that was printed when the server started")
 
 
 def _refused(why: str) -> OpenArmError:

@@ -10,10 +10,12 @@ from __future__ import annotations
 import asyncio
 import secrets
 import threading
+from contextlib import AsyncExitStack
 
 import aiohttp
 from aiohttp import WSMsgType, web
 
+from openarm_bringup.view.gate import listening, one_answer
 from openarm_bringup.view.guard import LOOPBACK, Guard
 from openarm_common.errors import Code, OpenArmError
 
@@ -43,24 +45,21 @@ class Proxy:
         self._thread.start()
         app = web.Application()
         app.router.add_get("/", self._connect)
-        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.5)
+        app.on_response_prepare.append(one_answer)
+        self._open = AsyncExitStack()
         try:
-            self.port = asyncio.run_coroutine_threadsafe(self._open(port), self._loop).result(10.0)
+            opening = self._open.enter_async_context(listening(app, LOOPBACK, port, shutdown_s=0.5))
+            self.port = asyncio.run_coroutine_threadsafe(opening, self._loop).result(10.0)
         except OSError as error:
             self.close()
             raise OpenArmError(Code.ENVIRONMENT, f"can't listen on {LOOPBACK}:{port}: {error.strerror}") from error
 
     def close(self) -> None:
         """Close all connections and stop listening."""
-        asyncio.run_coroutine_threadsafe(self._runner.cleanup(), self._loop).result(10.0)
+        asyncio.run_coroutine_threadsafe(self._open.aclose(), self._loop).result(10.0)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(timeout=5.0)
         self._loop.close()
-
-    async def _open(self, port: int) -> int:
-        await self._runner.setup()
-        await web.TCPSite(self._runner, LOOPBACK, port).start()
-        return self._runner.addresses[0][1]
 
     async def _connect(self, request: web.Request) -> web.StreamResponse:
         host, origin = request.headers.get("Host"), request.headers.get("Origin")

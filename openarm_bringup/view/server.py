@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from aiohttp import WSCloseCode, WSMsgType, web
 from pydantic import Field, ValidationError
 
+from openarm_bringup.view.gate import one_answer
 from openarm_bringup.view.guard import Guard
 from openarm_common.config import Config, describe_faults
 from openarm_common.errors import Code, OpenArmError
@@ -122,7 +123,7 @@ class ViewServer:
     def app(self) -> web.Application:
         """The aiohttp application."""
         app = web.Application(client_max_size=_MAX_BYTES, middlewares=[self._check])
-        app.on_response_prepare.append(_add_headers)
+        app.on_response_prepare.extend((_add_headers, one_answer))
         app.router.add_get("/", self._page)
         app.router.add_get("/socket", self._socket)
         app.router.add_post("/pick", self._pick)
@@ -151,9 +152,10 @@ class ViewServer:
             self.guard.check_host(host)
             if acts or request.path == "/socket":
                 self.guard.check_origin(request.headers.get("Origin"), host)
-            if acts or request.path in ("/", "/socket"):
                 scheme, _, bearer = request.headers.get("Authorization", "").partition(" ")
-                self.guard.check_token(request.query.get("token") or (bearer if scheme == "Bearer" else None))
+                # a script can give a websocket no header
+                asked = request.query.get("token") if request.path == "/socket" else None
+                self.guard.check_token(asked or (bearer if scheme == "Bearer" else None))
         except OpenArmError as error:
             return web.json_response(_failed(error), status=403)
         try:

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from aiohttp import web
 
+from openarm_bringup.view.gate import listening
 from openarm_common.domain import release_domain, reserve_domain
 
 #: A label that would be run if it were ever taken for markup.
@@ -43,6 +43,7 @@ class StandIns:
         from rclpy.context import Context
         from rclpy.executors import MultiThreadedExecutor
         from sensor_msgs.msg import Image, JointState
+        from std_srvs.srv import Trigger
         from vision_msgs.msg import Detection3DArray
         from visualization_msgs.msg import MarkerArray
 
@@ -54,6 +55,7 @@ class StandIns:
 
         self.picks: list[Any] = []
         self.resets: list[Any] = []
+        self.stops = 0
         self.answers: list[tuple[str, bool]] = []
         self._context = Context()
         rclpy.init(context=self._context, domain_id=int(os.environ["ROS_DOMAIN_ID"]))
@@ -94,6 +96,7 @@ class StandIns:
         group = ReentrantCallbackGroup()
         node.create_service(ConfirmPlan, "/grasp/confirm", self._confirm)
         node.create_service(ResetWorld, "/sim/reset_world", self._reset)
+        node.create_service(Trigger, "/stop", self._stop)
         self._action = ActionServer(
             *(node, Pick, "/grasp/pick", self._pick),
             cancel_callback=lambda _: CancelResponse.ACCEPT,
@@ -118,6 +121,11 @@ class StandIns:
     def _reset(self, request: Any, response: Any) -> Any:
         self.resets.append(request)
         response.success, response.message = True, "the world is as it was"
+        return response
+
+    def _stop(self, _: Any, response: Any) -> Any:
+        self.stops += 1
+        response.success, response.message = True, "the arms hold"
         return response
 
     def _confirm(self, request: Any, response: Any) -> Any:
@@ -185,15 +193,10 @@ def with_page(open_tab: Any, test: Callable[[Any], Awaitable[None]]) -> None:
     async def main() -> None:
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         with make_server("127.0.0.1", ended.set_exception) as server:
-            runner = web.AppRunner(server.app(), shutdown_timeout=0.2)
-            await runner.setup()
-            try:
-                await web.TCPSite(runner, "127.0.0.1", 0).start()
-                url = f"http://127.0.0.1:{runner.addresses[0][1]}/?token={server.guard.token}"
+            async with listening(server.app(), "127.0.0.1", 0, 0.2) as port:
+                url = f"http://127.0.0.1:{port}/#{server.guard.token}"
                 async with asyncio.timeout(120.0), open_tab(url) as tab:
                     await test(tab)
-            finally:
-                await runner.cleanup()
             assert not ended.done(), ended.exception()
 
     asyncio.run(main())
@@ -219,6 +222,9 @@ def test_the_page_shows_the_graph_and_asks_it(stand_ins: StandIns, open_tab: Any
 
     async def walk(tab: Any) -> None:
         await tab.until("document.querySelector('#link').dataset.level === 'ok'")
+        assert await tab.js("location.pathname + location.search + location.hash") == "/", "the token is not shown"
+        await tab.do("Page.reload")
+        await tab.until("document.querySelector('#link')?.dataset.level === 'ok'")
 
         # the state of the grasp, nodes, detections: as text
         await tab.until("document.querySelector('#state').textContent === 'Idle'")
@@ -272,6 +278,14 @@ def test_the_page_shows_the_graph_and_asks_it(stand_ins: StandIns, open_tab: Any
         assert await tab.js("document.querySelector('#facts').textContent") == "blue · left arm · attempt 1"
         await tab.click("#cancel")
         await tab.until("document.querySelector('#outcome').textContent.startsWith('CANCELLED: cancelled while')")
+
+        # the emergency stop, by key and by button
+        await tab.js(
+            "document.dispatchEvent(new KeyboardEvent('keydown', { key: 'Escape', shiftKey: true, bubbles: true }))"
+        )
+        await tab.until("document.querySelector('#stop-answer').textContent.includes('the arms hold')")
+        await tab.click("#stop")
+        await tab.until("!document.querySelector('#stopped').hidden")
         await tab.click("#shuffle")
         await tab.until("document.querySelector('#world-answer').textContent === 'the world is as it was'")
 
@@ -308,4 +322,5 @@ def test_the_page_shows_the_graph_and_asks_it(stand_ins: StandIns, open_tab: Any
     with_page(open_tab, walk)
     assert [(p.label, p.arm, p.dry_run, p.confirm) for p in stand_ins.picks] == [("blue", "left", True, True)]
     assert stand_ins.answers == [("run", True), ("reject", False)]
+    assert stand_ins.stops == 2
     assert [reset.scene for reset in stand_ins.resets] == ["random"]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hashlib
 import json
 import re
@@ -15,8 +16,9 @@ from typing import Any
 
 import aiohttp
 import pytest
-from aiohttp import web
 
+from openarm_bringup.view import gate
+from openarm_bringup.view.gate import listening
 from openarm_bringup.view.guard import Guard
 from openarm_bringup.view.server import PAGE, Confirmation, Item, Order, Reset, ViewServer
 from openarm_common.errors import Code, OpenArmError
@@ -92,15 +94,11 @@ def json_body(headers: dict[str, str]) -> dict[str, str]:
 async def serving(host: str = "127.0.0.1") -> AsyncIterator[Bench]:
     graph = Graph()
     server = ViewServer(Guard(host), {"robot": {}, "cameras": [], "states": []}, graph)
-    runner = web.AppRunner(server.app(), shutdown_timeout=0.2)
-    await runner.setup()
-    await web.TCPSite(runner, "127.0.0.1", 0).start()
-    try:
-        async with aiohttp.ClientSession() as session:
-            yield Bench(server, graph, session, runner.addresses[0][1])
-    finally:
-        graph.go_on.set()
-        await runner.cleanup()
+    async with listening(server.app(), "127.0.0.1", 0, 0.2) as port, aiohttp.ClientSession() as session:
+        try:
+            yield Bench(server, graph, session, port)
+        finally:
+            graph.go_on.set()
 
 
 def with_bench(test: Callable[[Bench], Awaitable[None]]) -> None:
@@ -119,7 +117,7 @@ async def until(condition: Callable[[], object]) -> None:
 
 # --- who may
 WRONG = {
-    "no token": ({"token": ""}, "no token; open the address that was printed"),
+    "no token": ({"token": ""}, "no token; open the whole address that was printed"),
     "wrong token": ({"token": "x" * 32}, "wrong token"),
     "foreign origin": ({"Origin": "https://evil.example"}, "the page 'https://evil.example' may not ask"),
     "another port of this machine": ({"Origin": "http://127.0.0.1:1"}, "may not ask"),
@@ -152,18 +150,21 @@ def test_who_may_not_gets_403_and_nothing_is_asked_of_the_robot(wrong: str) -> N
     with_bench(test)
 
 
-def test_the_page_itself_needs_the_token_and_one_of_our_names() -> None:
+def test_the_page_itself_has_one_of_our_names_and_shows_nothing_without_the_token() -> None:
+    """The token comes after the # of the address, which no server gets."""
+
     async def test(bench: Bench) -> None:
-        good = f"/?token={bench.token}"
-        assert (await bench.get(good))[0] == 200
-        assert (await bench.get(good, Host="localhost:8088"))[0] == 200
-        assert (await bench.get(good, Host="[::1]:8088"))[0] == 200
-        assert (await bench.get("/"))[0] == 403
-        assert (await bench.get(f"/?token={bench.token[:-1]}"))[0] == 403
+        for name in ("localhost:8088", "[::1]:8088"):
+            status, text = await bench.get("/", Host=name)
+            assert (status, bench.token in text) == (200, False)
         for name in ("evil.example", "192.168.1.2:8088", "127.0.0.1.evil.example", "[::1", "@127.0.0.1"):
-            status, text = await bench.get(good, Host=name)
+            status, text = await bench.get("/", Host=name)
             assert status == 403, name
             assert "answers to" in text
+        for path in ("/socket", f"/socket?token={bench.token[:-1]}", f"/socket?other={bench.token}"):
+            assert (await bench.get(path, **bench.origin))[0] == 403
+        async with bench.session.post(f"{bench.url}/stop?token={bench.token}", headers=bench.origin) as response:
+            assert response.status == 403  # an address that is kept somewhere moves nothing
 
     with_bench(test)
 
@@ -204,7 +205,7 @@ def test_a_token_is_new_each_time_and_never_short() -> None:
 
 def test_every_answer_forbids_scripts_of_others() -> None:
     async def test(bench: Bench) -> None:
-        for path in (f"/?token={bench.token}", "/view.js", "/nothing", "/"):
+        for path in ("/", "/view.js", "/nothing", "/socket"):
             async with bench.session.get(bench.url + path) as response:
                 policy = response.headers["Content-Security-Policy"]
                 assert "default-src 'none'" in policy
@@ -406,5 +407,65 @@ def test_requests_that_wait_hold_up_neither_cancel_nor_stop() -> None:
         assert (await bench.post("/stop", {}))[1]["message"] == "the arms hold"
         bench.graph.go_on.set()
         assert sorted([(await task)[0] for task in waiting])[:2] == [200, 200]
+
+    with_bench(test)
+
+
+# --- what is no request
+HEAD = b"POST /stop HTTP/1.1\r\nHost: localhost\r\n"
+#: What is sent, and the statuses that fit; the connection ends in each case.
+NO_HTTP = {
+    "no request line": (b"\x00\xff\x16\x03\x01 nonsense\r\n\r\n", (400,)),
+    "unknown method": (b"BREW / HTTP/1.1\r\nHost: localhost\r\n\r\n", (400, 403, 405)),
+    "another version": (b"GET / HTTP/9.9\r\nHost: localhost\r\n\r\n", (400, 505)),
+    "negative length": (HEAD + b"Content-Length: -1\r\n\r\n", (400,)),
+    "length in words": (HEAD + b"Content-Length: many\r\n\r\n", (400,)),
+    "huge length": (HEAD + b"Content-Length: 99999999999999999999\r\n\r\n", (400, 403, 413)),
+    "two lengths": (HEAD + b"Content-Length: 1\r\nContent-Length: 2\r\n\r\n12", (400,)),
+    "chunks that are none": (HEAD + b"Transfer-Encoding: chunked\r\n\r\nzz\r\n", (400, 403)),
+    "NUL in a header": (b"GET / HTTP/1.1\r\nHost: local\x00host\r\n\r\n", (400, 403)),
+    "header of a megabyte": (b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 2**20 + b"\r\n\r\n", (400, 431)),
+    "no host": (b"GET / HTTP/1.1\r\n\r\n", (400, 403)),
+}
+
+
+@pytest.mark.parametrize("case", NO_HTTP)
+def test_what_is_no_request_is_answered_without_a_traceback(case: str, caplog: pytest.LogCaptureFixture) -> None:
+    sent, statuses = NO_HTTP[case]
+
+    async def test(bench: Bench) -> None:
+        reader, writer = await asyncio.open_connection("127.0.0.1", int(bench.url.rpartition(":")[2]))
+        writer.write(sent)
+        with contextlib.suppress(ConnectionError):
+            await writer.drain()
+            answer = await reader.read()
+            assert int(answer.split()[1]) in statuses, answer[:200]
+        writer.close()
+        assert (await bench.post("/cancel", {}))[0] == 200
+        assert bench.graph.asked == ["cancel"]
+
+    with_bench(test)
+    assert [record.getMessage() for record in caplog.records if record.exc_info] == []
+
+
+def test_connections_that_ask_nothing_keep_no_one_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More than are taken, some silent, some in the middle of a head; a page asks meanwhile, and they are closed."""
+    monkeypatch.setattr(gate, "HEAD_S", 1.0)
+
+    async def test(bench: Bench) -> None:
+        port = int(bench.url.rpartition(":")[2])
+        idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(2 * gate.MOST)]
+        for _, writer in idle[::2]:
+            writer.write(b"GET / HTTP/1.1\r\nHost: local")
+        assert (await bench.post("/stop", {}))[0] == 200
+        async with bench.socket() as socket:
+            assert json.loads((await socket.receive()).data)["kind"] == "hello"
+            async with asyncio.timeout(10.0):
+                for reader, writer in idle:
+                    with contextlib.suppress(ConnectionError):
+                        while await reader.read(4096):
+                            pass
+                    writer.close()
+            assert not socket.closed
 
     with_bench(test)

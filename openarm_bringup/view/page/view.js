@@ -5,7 +5,7 @@ import { AskPanel, GraspPanel, HealthPanel, StopPanel, element } from "./panel.j
 import { Scene, boxEdges, cubes, group, lines, place, points, solid } from "./scene.js";
 
 const $ = (id) => document.getElementById(id);
-const token = new URLSearchParams(location.search).get("token") ?? "";
+const token = takeToken();
 
 const LAYERS = { detections: "Objects", cloud: "Cloud", map: "Map", plan: "Plan" };
 const wanted = new Set(["robot", "detections", "cloud", "plan"]);
@@ -71,6 +71,16 @@ const handlers = {
   outcome: (message) => asking.showOutcome(message),
   fault: showFault,
 };
+
+// The token comes after the # of the address: no server, Referer or log gets it. This tab keeps it for a reload, and it
+// does not stay in the address bar or the history.
+function takeToken() {
+  if (location.hash.length > 1) {
+    sessionStorage.setItem("token", location.hash.slice(1));
+    history.replaceState(null, "", location.pathname);
+  }
+  return sessionStorage.getItem("token") ?? "";
+}
 
 // --- the line to the server
 function connect() {
