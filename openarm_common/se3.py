@@ -149,10 +149,11 @@ def matrix_from_quat_xyzw(q_xyzw: ArrayLike) -> Array:
         ValueError: When the quaternion is zero or not finite.
     """
     q = np.asarray(q_xyzw, dtype=np.float64)
-    n = float(q @ q)
-    if not np.isfinite(n) or n < 1e-18:
+    largest = float(np.abs(q).max())  # squares of finite numbers may be infinite
+    if not 1e-9 <= largest < np.inf:
         raise ValueError(f"quaternion (x, y, z, w) {q.tolist()} is not a rotation: expected a finite, non-zero norm")
-    x, y, z, w = q / np.sqrt(n)
+    q = q / largest
+    x, y, z, w = q / np.linalg.norm(q)
     return np.array(
         [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],

@@ -151,7 +151,18 @@ class BackgroundNode(ContextNode):
         if not client.wait_for_service(timeout_sec=self._timeout):
             raise OpenArmError(Code.NOT_READY, f"no service {name} within {self._timeout:g} s: {_UP}")
         died = self._watch_service(self._node.resolve_service_name(name))
-        return self._wait(self._begin(client.call_async, request), timeout, name, client.service_is_ready, died=died)
+        sent: list[Future] = []
+
+        def ask() -> Future:
+            sent.append(client.call_async(request))
+            return sent[0]
+
+        try:
+            return self._wait(self._begin(ask), timeout, name, client.service_is_ready, died=died)
+        finally:
+            for future in sent:  # one that has no answer is no longer waited for
+                client.remove_pending_request(future)
+                future.cancel()
 
     def do(
         self,

@@ -231,7 +231,10 @@ class GraphRobot:
         """Ask a service of the motion node."""
         answered, died = client.call_async(request), self._plan.watch()
         check = lambda: check_alive(died, what, Code.ROBOT_LOST)  # noqa: E731
-        await self._nodes.until(answered.done, self._config.limits.answer_timeout, what, check)
+        try:
+            await self._nodes.until(answered.done, self._config.limits.answer_timeout, what, check)
+        finally:
+            client.remove_pending_request(answered)
         return answered.result()
 
     async def follow(

@@ -151,6 +151,7 @@ def test_a_call_of_a_service_ends_when_its_node_is_killed(ros, children) -> None
             work.result(20.0)
         assert time.monotonic() - began < 2.0
         assert caught.value.code is Code.NOT_READY
+        assert not client._clients[NAME]._pending_requests, "what has no answer is no longer waited for"
 
 
 @pytest.mark.requirement("R-21")

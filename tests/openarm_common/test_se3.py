@@ -50,7 +50,8 @@ def test_quaternion_round_trip_is_xyzw_with_w_not_negative(w: np.ndarray) -> Non
     assert q[3] >= 0.0
     assert np.linalg.norm(q) == pytest.approx(1.0)
     assert np.allclose(se3.matrix_from_quat_xyzw(q), R, atol=1e-9)
-    assert np.allclose(se3.matrix_from_quat_xyzw(-7.0 * q), R, atol=1e-9)
+    for scale in (-7.0, 1e200, 1e-8):
+        assert np.allclose(se3.matrix_from_quat_xyzw(scale * q), R, atol=1e-9)
 
 
 @pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0), (np.inf, 0.0, 0.0, 1.0)])
