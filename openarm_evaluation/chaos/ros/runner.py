@@ -248,7 +248,8 @@ class _Work:
         if killed and began < hit.began < answered and answered - hit.began > judge.DEATH_S:
             late = f"the client learnt of the death of grasp after {answered - hit.began:.1f} s"
             found.append(Violation("every request is answered", late))
-        self._wait_back(answered, found)  # also without a fault, or when it is felt late
+        if hit.back <= judge.BACK_S:  # else it is said already
+            self._wait_back(answered, found)  # also without a fault, or when it is felt late
         found += self._watch_rest(answered)
         tracks = {thing.name: self._observer.track(thing.name) for thing in (self._scene or random_scene(0)).objects}
         found += judge.falls(tracks)
