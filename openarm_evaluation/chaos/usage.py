@@ -84,10 +84,10 @@ def growth(uses: list[Use]) -> dict[str, float]:
     rates: dict[str, float] = {}
     middle = max((use.seconds for use in uses), default=0.0) / 2.0
     for node in dict.fromkeys(use.node for use in uses):
-        late = [(use.seconds, use.pss) for use in uses if use.node == node and use.seconds > middle]
+        late = [(use.seconds, use.rss) for use in uses if use.node == node and use.seconds > middle]
         if len(late) > 2:
-            t, pss = np.array(late).T
-            rates[node] = round(float(np.polyfit(t, pss, 1)[0]) * 3600.0, 1)
+            t, memory = np.array(late).T
+            rates[node] = round(float(np.polyfit(t, memory, 1)[0]) * 3600.0, 1)
     return rates
 
 
@@ -99,7 +99,7 @@ def draw(uses: list[Use], path: Path) -> None:
     page.remove()
     for axes, (name, label) in zip(
         figure.subplots(3, 1, sharex=True),
-        (("pss", "memory (PSS), MiB"), ("descriptors", "descriptors"), ("threads", "threads")),
+        (("rss", "memory (RSS), MiB"), ("descriptors", "descriptors"), ("threads", "threads")),
         strict=True,
     ):
         for node in dict.fromkeys(use.node for use in uses):
