@@ -112,9 +112,15 @@ class Daemon:
             sys.stderr.write(f"{error}\n")  # each request looks again
 
     def run(self) -> None:
-        """Answer until KeyboardInterrupt; the next client of a changed code meets the next daemon."""
+        """Answer until a signal; the next client of a changed code meets the next daemon."""
+        # A signal that another thread gets, or that comes just before `select`, would not end it.
+        signalled, wakeup = socket.socketpair()
+        wakeup.setblocking(False)
+        signal.set_wakeup_fd(wakeup.fileno())
         while True:
-            select.select([self._listener], [], [])
+            ready, _, _ = select.select([self._listener, signalled], [], [])
+            if signalled in ready:
+                return
             self._threads = {thread for thread in self._threads if thread.is_alive()}
             if build() != self._greeting["build"]:
                 return

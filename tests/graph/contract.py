@@ -25,7 +25,7 @@ QOS = {
 #: What rclpy and actions add by themselves, subscriptions of the bridge, and the camera info of the spectator camera.
 IMPLICIT = re.compile(
     r"/_action/|^/rosout$|^/parameter_events$|^/joint_commands$|/joint_trajectory$|^/cloud_in$"
-    r"|^/spectator/color/camera_info$"
+    r"|^/spectator/color/camera_info$|/_alive$"
 )
 #: Services that every node has, or every managed node.
 STANDARD = (

@@ -12,6 +12,8 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
+import pytest
+
 from openarm_bringup.commands.view import redirect
 
 ROOT = Path(__file__).parents[2]
@@ -24,9 +26,9 @@ def start(port: str, folder: Path) -> subprocess.Popen[str]:
 
 
 def test_a_browser_gets_a_private_page_that_leads_to_the_address(tmp_path: Path) -> None:
-    page = redirect(tmp_path, "http://127.0.0.1:1/?token=secret")
+    page = redirect(tmp_path, "http://127.0.0.1:1/#secret")
     assert page.stat().st_mode & 0o777 == 0o600
-    assert 'content="0;url=http://127.0.0.1:1/?token=secret"' in page.read_text()
+    assert 'content="0;url=http://127.0.0.1:1/#secret"' in page.read_text()
     assert "secret" not in page.as_uri()
 
 
@@ -34,16 +36,14 @@ def test_it_prints_an_address_that_opens_and_ends_with_ctrl_c(tmp_path: Path) ->
     first = start("0", tmp_path)
     assert first.stderr is not None
     try:
-        printed = re.search(r"the page is at (http://127\.0\.0\.1:(\d+)/)(\?token=[\w-]{32})$", first.stderr.readline())
+        printed = re.search(r"the page is at (http://127\.0\.0\.1:(\d+)/)#([\w-]{32})$", first.stderr.readline())
         assert printed is not None
-        with urllib.request.urlopen(printed[1] + printed[3], timeout=10.0) as page:
-            assert "<title>OpenArm</title>" in page.read().decode()
-        try:
-            urllib.request.urlopen(printed[1], timeout=10.0)
-            status = 200
-        except urllib.error.HTTPError as error:
-            status = error.code
-        assert status == 403
+        with urllib.request.urlopen(printed[1], timeout=10.0) as page:
+            shown = page.read().decode()
+        assert "<title>OpenArm</title>" in shown
+        assert printed[3] not in shown
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(urllib.request.Request(f"{printed[1]}stop", method="POST"), timeout=10.0)
 
         second = start(printed[2], tmp_path)
         said = second.communicate(timeout=60.0)[1]
