@@ -2,14 +2,15 @@
 """Plans executed in MuJoCo, judged by its contacts with the robot itself, the table and obstacles (N-11, N-12).
 
     python -m benchmarks.motion_sim [--plans 1000] [--both 200] [--beside 200] [--blind 20]
-        [--first-seed 1000] [--runs FILE] [--json PATH]
+        [--profile openarm] [--first-seed 1000] [--runs FILE] [--json PATH]
 
 Core and physics in one process, without DDS and faster than real time. Each scene is drawn from its seed: a table with
 boxes on it and in the air, ten plans one after the other from wherever the arm stands. Trajectories go through the
 bridge's own follower to the actuators; contacts are looked at after every step of the physics, the distance of the arms
 ten milliseconds apart. The planner knows the boxes' sizes and poses and nothing of the judge. What is done already
-(`--runs`, a line a scene) is not done again, so the command goes on where it was stopped. `--blind` plans know nothing
-of the boxes in the air: they show that the judge sees contacts.
+(`--runs`, a line a scene) is not done again, so the command goes on where it was stopped. `off_path` is how far the
+tool is from the reference by the joint states. `--blind` plans know nothing of the boxes in the air: they show that
+the judge sees contacts.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -45,6 +46,7 @@ from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.coordination import ActiveMotion, least_delay
 from openarm_motion.planning.dual_arm import DualArm, DualArmGoals, plan_staggered, plan_together
 from openarm_motion.timing.trajectory import Trajectory
+from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig
 
 #: Plans of one scene.
 _A_SCENE = 10
@@ -52,6 +54,9 @@ _A_SCENE = 10
 _DRAWS = 40
 #: Distance from where the other arm will end that the motion node plans with, m.
 _BESIDE = 0.035
+#: Makes the simulated robot of a seed among boxes.
+MakeStand = Callable[[tuple[Box, ...], int], Stand]
+PROFILES: Mapping[str, HardwareConfig] = {"ideal": IDEAL, "openarm": HardwareConfig()}
 #: Faults of a request that make another goal be drawn: drawn goals may well be out of reach or blocked.
 _REFUSED = (Code.UNREACHABLE, Code.IN_COLLISION, Code.NO_PLAN, Code.LIMITS)
 
@@ -90,21 +95,19 @@ def single(
     return kind, moves.to_pose_on_line(arm, now, pose, around)
 
 
-def run_blind(
-    arms: Mapping[str, Arm], description: RobotDescription, home: Mapping[str, float], seed: int
-) -> list[Seen]:
+def run_blind(arms: Mapping[str, Arm], make: MakeStand, home: Mapping[str, float], seed: int) -> list[Seen]:
     """As `run_single`, without the boxes in the planner's eyes."""
-    return run_single(arms, description, home, seed, blind=True)
+    return run_single(arms, make, home, seed, blind=True)
 
 
 def run_single(
-    arms: Mapping[str, Arm], description: RobotDescription, home: Mapping[str, float], seed: int, *, blind: bool = False
+    arms: Mapping[str, Arm], make: MakeStand, home: Mapping[str, float], seed: int, *, blind: bool = False
 ) -> list[Seen]:
     """The plans of one scene, the arms in turns."""
     rng = np.random.default_rng(seed)
     boxes = scene_boxes(arms, home, rng)
     known = tuple(box for box in boxes if not (blind and box.id.startswith("air")))
-    stand, out = Stand(description, boxes), list[Seen]()
+    stand, out = make(boxes, seed), list[Seen]()
     for k in range(_A_SCENE):
         arm, refused = list(arms.values())[k % 2], 0
         while refused < _DRAWS:
@@ -123,13 +126,11 @@ def run_single(
     return out
 
 
-def run_both(
-    arms: Mapping[str, Arm], description: RobotDescription, home: Mapping[str, float], seed: int
-) -> list[Seen]:
+def run_both(arms: Mapping[str, Arm], make: MakeStand, home: Mapping[str, float], seed: int) -> list[Seen]:
     """Plans of both arms of one scene, together and staggered in turns."""
     rng = np.random.default_rng(seed)
     boxes = scene_boxes(arms, home, rng)
-    stand, both, out = Stand(description, boxes), DualArm(arms["left"], arms["right"]), list[Seen]()
+    stand, both, out = make(boxes, seed), DualArm(arms["left"], arms["right"]), list[Seen]()
     for k in range(_A_SCENE):
         refused = 0
         while refused < _DRAWS:
@@ -153,13 +154,11 @@ def run_both(
     return out
 
 
-def run_beside(
-    arms: Mapping[str, Arm], description: RobotDescription, home: Mapping[str, float], seed: int
-) -> list[Seen]:
+def run_beside(arms: Mapping[str, Arm], make: MakeStand, home: Mapping[str, float], seed: int) -> list[Seen]:
     """Plans of one arm, made and begun while the other is under way, as the motion node does it."""
     rng = np.random.default_rng(seed)
     boxes = scene_boxes(arms, home, rng)
-    stand, out = Stand(description, boxes), list[Seen]()
+    stand, out = make(boxes, seed), list[Seen]()
     under_way: dict[str, tuple[Trajectory, int]] = {}
     nearest = FAR
     for k in range(2 * _A_SCENE):
@@ -223,6 +222,7 @@ def main() -> None:
     parser.add_argument("--both", type=int, default=200, help="plans of both arms")
     parser.add_argument("--beside", type=int, default=200, help="plans of one arm while the other is under way")
     parser.add_argument("--blind", type=int, default=20, help="plans that know nothing of the boxes in the air")
+    parser.add_argument("--profile", choices=list(PROFILES), default="ideal", help="motors of the arms; ten robots")
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--runs", type=Path, default=Path("runs/motion_sim.jsonl"), help="a line a scene; continued")
     parser.add_argument("--json", type=Path, default=None)
@@ -234,6 +234,10 @@ def main() -> None:
     static = [box_from("table", (*table.centre, table.top_z - 0.5 * table.thickness), table.extents)]
     robot = with_housings(plain, load_cameras().values())
     arms = {side: Arm(side, robot, MotionConfig(), static) for side in ("left", "right")}
+
+    def make(boxes: tuple[Box, ...], seed: int) -> Stand:
+        return Stand(plain, boxes, PROFILES[args.profile].of_seed(1 + seed % 10))
+
     args.runs.parent.mkdir(parents=True, exist_ok=True)
     done = _done(args.runs)
     rows: list[Row] = []
@@ -247,7 +251,7 @@ def main() -> None:
         seed = args.first_seed
         while len(seen) < count:
             if (name, seed) not in done:
-                found = run(arms, plain, home, seed)
+                found = run(arms, make, home, seed)
                 with args.runs.open("a", encoding="utf-8") as file:
                     file.write(json.dumps({"what": name, "seed": seed, "plans": [asdict(s) for s in found]}) + "\n")
                 done[name, seed] = found
@@ -283,6 +287,8 @@ def _rows(name: str, seen: list[Seen]) -> list[Row]:
         Row(f"{name}_failed", len(failed), "", "lower", 0, n=n),
         Row(f"{name}_refused_draws", sum(s.refused for s in seen), "", "lower", None, n=n),
         Row(f"{name}_plan_p95_ms", float(np.percentile(planning, 95)) * 1e3, "ms", "lower", None, n=n),
+        Row(f"{name}_off_path_p95_mm", float(np.percentile([s.off for s in seen], 95)) * 1e3, "mm", "lower", None, n=n),
+        Row(f"{name}_off_path_worst_mm", max(s.off for s in seen) * 1e3, "mm", "lower", None, n=n),
         Row(f"{name}_moved_s", sum(s.duration for s in seen), "s", "higher", None, n=n),
     ]
     if name in ("n12", "beside"):

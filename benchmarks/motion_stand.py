@@ -10,17 +10,17 @@ import mujoco
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.servos import ArmLoad
 from openarm_common.scene.scene import load_scene
+from openarm_control.arm import TrajectoryConfig, TrajectoryOutcome
+from openarm_control.trajectory import Trajectory as Commanded
 from openarm_motion.collision.solids import Box
 from openarm_motion.timing.trajectory import Trajectory
-from openarm_sim_bridge.control.arm import TrajectoryConfig, TrajectoryOutcome
-from openarm_sim_bridge.control.controller import RobotController
-from openarm_sim_bridge.control.gripper import GripperConfig
-from openarm_sim_bridge.control.trajectory import Trajectory as Commanded
-from openarm_sim_bridge.world.model import PhysicsConfig, build_spec
+from openarm_sim_bridge.robot import SimulatedRobot
+from openarm_sim_bridge.world.hardware import HardwareConfig
+from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
-from openarm_sim_bridge.world.world import World
 
 #: Distances of the arms are looked for up to here, m.
 FAR = 0.3
@@ -36,25 +36,27 @@ class Seen:
     separation: float = FAR
     duration: float = 0.0
     planning: float = 0.0
+    off: float = 0.0
     refused: int = 0
 
 
 class Stand:
     """The simulated robot among boxes, and who moves it."""
 
-    def __init__(self, description: RobotDescription, boxes: tuple[Box, ...]) -> None:
-        scene = load_scene("empty")
-        stage = Stage(description, {}, None, PhysicsConfig())
-        spec = build_spec(description, scene, {}, None, PhysicsConfig())
-        for box in boxes:
-            quaternion = np.roll(se3.quat_xyzw_from_matrix(box.T[:3, :3]), 1)
-            spec.worldbody.add_geom(
-                name=box.id, type=mujoco.mjtGeom.mjGEOM_BOX, size=box.size / 2, pos=box.T[:3, 3], quat=quaternion
-            )
-        self.world = World(spec, joint_names=stage.joint_names, home=stage.home)
-        self._controller = RobotController(
-            stage.arms(), stage.grippers(), self.world, TrajectoryConfig(), GripperConfig()
-        )
+    def __init__(self, description: RobotDescription, boxes: tuple[Box, ...], hardware: HardwareConfig) -> None:
+        def add(spec: mujoco.MjSpec) -> None:
+            for box in boxes:
+                quaternion = np.roll(se3.quat_xyzw_from_matrix(box.T[:3, :3]), 1)
+                spec.worldbody.add_geom(
+                    name=box.id, type=mujoco.mjtGeom.mjGEOM_BOX, size=box.size / 2, pos=box.T[:3, 3], quat=quaternion
+                )
+
+        stage = Stage(description, {}, None, PhysicsConfig(), hardware)
+        self._loads = {
+            side: ArmLoad(description, description.arm_joints(side), description.tcp_link(side)) for side in SIDES
+        }
+        self.world = stage.world(load_scene("empty"), add)
+        self._controller = SimulatedRobot.controllers(stage, self.world, TrajectoryConfig())
         self._geoms = [
             [
                 g
@@ -104,6 +106,10 @@ class Stand:
         for _ in range(world.steps_per_tick):
             world.step(1)
             self._contacts |= set(self._touching()) - self._usual
+        for side in self.busy:
+            state = self._controller.arms[side].state
+            if state is not None:
+                seen.off = max(seen.off, self._loads[side].tool_offset(state.desired, state.desired - state.actual))
         if distances:
             seen.separation = min(seen.separation, self._separation(seen.separation))
 

@@ -35,6 +35,19 @@ class Lifeline:
         self._socket.close()
 
 
+def lives(name: str) -> bool:
+    """Return whether there is a lifeline of that name on this machine; that of a stopped process is there, too."""
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.setblocking(False)
+        try:
+            connection.connect(_address(name))
+        except BlockingIOError:  # as many wait for it as it can have
+            return True
+        except OSError:
+            return False
+    return True
+
+
 def watch(name: str, ended: Callable[[], object]) -> bool:
     """Call a function, in a thread, when a lifeline ends.
 

@@ -264,6 +264,10 @@ class BudgetConfig(Config):
     reset: float = _budget(6.0, "go home and observe the place")
 
 
+#: ParallelGripperCommand, the older GripperCommand, or FollowJointTrajectory.
+GripperAction = Literal["parallel", "classic", "trajectory"]
+
+
 class DriftConfig(Config):
     """When residuals of grasps raise an alarm."""
 
@@ -277,8 +281,11 @@ class GraspConfig(Config):
     """Parameters of the grasp node."""
 
     scene: str = Field(default="demo", description="scene file whose table the objects stand on")
-    gripper_action: Literal["parallel", "classic"] = Field(
-        default="parallel", description="type of gripper_cmd, as the bridge or the driver serves it"
+    gripper_action: GripperAction = Field(
+        default="parallel", description="type of the action `gripper`, as the bridge or the driver serves it"
+    )
+    gripper: str = Field(
+        default="/{arm}_gripper_controller/gripper_cmd", description="action of a gripper; {arm} stands for its side"
     )
     home_state: str = Field(
         default="home", description="SRDF group state of both arms that keeps the camera's view free"

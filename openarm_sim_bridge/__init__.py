@@ -18,7 +18,6 @@ from openarm_common.lazy import attach
 if TYPE_CHECKING:
     from openarm_sim_bridge.cameras.cameras import SimulatedCameras as SimulatedCameras
     from openarm_sim_bridge.cameras.renderer import SnapshotRenderer as SnapshotRenderer
-    from openarm_sim_bridge.control.controller import RobotController as RobotController
     from openarm_sim_bridge.faults.faults import Fault as Fault
     from openarm_sim_bridge.faults.faults import checked_fault as checked_fault
     from openarm_sim_bridge.robot import SimulatedRobot as SimulatedRobot

@@ -6,17 +6,25 @@ The node `mujoco_bridge` and campaigns in process run this same code; only who c
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Generic, TypeVar
+
+from openarm_common.robot.description import SIDES, Side
+from openarm_common.robot.servos import ServoModel
 from openarm_common.scene.scene import Scene
 from openarm_common.types import Array
-from openarm_sim_bridge.control.arm import TrajectoryConfig
-from openarm_sim_bridge.control.controller import RobotController
-from openarm_sim_bridge.control.gripper import GripperConfig
+from openarm_control.arm import TrajectoryConfig
+from openarm_control.controller import JointController, RobotController
+from openarm_control.gripper import GripperConfig
+from openarm_control.joints import JointReadout, arm_groups, carriers, gripper_groups
 from openarm_sim_bridge.faults.world_faults import WorldFaults
 from openarm_sim_bridge.world.stage import Stage
-from openarm_sim_bridge.world.world import JointReadout, World
+from openarm_sim_bridge.world.world import World
+
+ControllerT = TypeVar("ControllerT", bound=JointController, covariant=True)
 
 
-class SimulatedRobot:
+class SimulatedRobot(Generic[ControllerT]):
     """A world with controllers and faults. One thread.
 
     Args:
@@ -29,21 +37,21 @@ class SimulatedRobot:
         targets: (n,) actuator targets of the last tick, in the order of the world's joints.
     """
 
-    def __init__(self, world: World, controller: RobotController) -> None:
+    def __init__(self, world: World, controller: ControllerT) -> None:
         self.world = world
         self.controller = controller
         self.faults = WorldFaults(world.joint_names, world.period_ns)
         self.state: JointReadout = world.read_joints()
         self.targets: Array = self.state.position
 
-    @classmethod
+    @staticmethod
     def on(
-        cls,
         stage: Stage,
         scene: Scene,
         trajectory: TrajectoryConfig | None = None,
         gripper: GripperConfig | None = None,
-    ) -> SimulatedRobot:
+        servos: Mapping[Side, ServoModel] | None = None,
+    ) -> SimulatedRobot[RobotController]:
         """Return the robot of a stage in a scene.
 
         Args:
@@ -51,15 +59,35 @@ class SimulatedRobot:
             scene: Table and objects.
             trajectory: How arms follow trajectories; None is the defaults.
             gripper: How grippers move; None is the defaults.
+            servos: Of the arms as identified, by side; None is what the profile says of them.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the model can't be built.
         """
         world = stage.world(scene)
-        controller = RobotController(
-            stage.arms(), stage.grippers(), world, trajectory or TrajectoryConfig(), gripper or GripperConfig()
+        controllers = SimulatedRobot.controllers(stage, world, trajectory or TrajectoryConfig(), gripper, servos)
+        return SimulatedRobot(world, controllers)
+
+    @staticmethod
+    def controllers(
+        stage: Stage,
+        world: World,
+        trajectory: TrajectoryConfig,
+        gripper: GripperConfig | None = None,
+        servos: Mapping[Side, ServoModel] | None = None,
+    ) -> RobotController:
+        """Return the controllers of a world of a stage; arguments as `on`."""
+        description, limits = stage.description, world.effort_limits()
+        return RobotController(
+            arm_groups(description),
+            gripper_groups(description),
+            world.joint_names,
+            world.read_joints(),
+            {side: float(limits[world.joint_names.index(description.finger_joint(side))]) for side in SIDES},
+            trajectory,
+            gripper or GripperConfig(),
+            carriers(description, trajectory.carrier, stage.servos if servos is None else servos),
         )
-        return cls(world, controller)
 
     def tick(self, steps: int | None = None) -> None:
         """Compute the targets of a control tick and advance the world.

@@ -32,6 +32,8 @@ MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 
 #: These orchestrate processes and measure the whole: they may import any package.
 OUTER = ("openarm_bringup", "openarm_evaluation")
+#: These are libraries: the others may import them, and each of them those before it.
+INNER = ("openarm_common", "openarm_control")
 #: Modules of the longest import chain that a package may have.
 LONGEST = 10
 ROS = ("rclpy", "rosidl", "ament", "tf2_ros", "rpyutils")
@@ -61,7 +63,8 @@ def test_arrows_point_inwards(path: Path) -> None:
         top = name.partition(".")[0]
         if is_ros(name) and not is_shell(path):
             faults.append(f"{path.name}:{line} is core and imports {name}")
-        if top in PACKAGES and top not in (package, "openarm_common") and package not in OUTER:
+        inner = INNER[: INNER.index(package)] if package in INNER else INNER
+        if top in PACKAGES and top not in (package, *inner) and package not in OUTER:
             faults.append(f"{path.name}:{line} imports the sibling {name}; packages meet over DDS")
         if package == "openarm_bringup" and top == "openarm_evaluation":
             faults.append(f"{path.name}:{line} imports {name}, which imports openarm_bringup")

@@ -82,7 +82,7 @@ def with_solved(
     """
     from openarm_calibration.handeye.offline import REFINED, calibrate, checked_algorithm, without_named
     from openarm_calibration.handeye.solve import SolveConfig
-    from openarm_calibration.store.records import now
+    from openarm_common.records import now
 
     name = checked_algorithm(algorithm)
     if free_intrinsics and name != REFINED:
@@ -158,8 +158,8 @@ def store_in(folder: Path | None) -> CalibrationStore:
     Raises:
         OpenArmError: INVALID_ARGUMENT, when it is a file.
     """
-    from openarm_calibration.store.records import default_folder
     from openarm_calibration.store.store import CalibrationStore
+    from openarm_common.records import default_folder
 
     if folder is not None and folder.exists() and not folder.is_dir():
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--store {folder} is a file, expected a folder")

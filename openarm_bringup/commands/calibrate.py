@@ -22,6 +22,7 @@ calibrate = App(name="calibrate", help="Hand-eye calibration: boards, sampling, 
 calibrate.command(calibrate_live.auto)
 calibrate.command(calibrate_live.sample)
 calibrate.command(calibrate_live.table)
+calibrate.command(calibrate_live.dynamics)
 
 
 @calibrate.command
@@ -119,7 +120,7 @@ def together(*sessions: Path, save: bool = False, store: Path | None = None) -> 
     from openarm_calibration.handeye.offline import calibrate_together
     from openarm_calibration.report.report import summary
     from openarm_calibration.sampling.samples import load_session
-    from openarm_calibration.store.records import now
+    from openarm_common.records import now
     from openarm_common.robot.description import RobotDescription
 
     if len(sessions) < 2:

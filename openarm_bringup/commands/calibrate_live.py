@@ -17,9 +17,12 @@ if TYPE_CHECKING:
     from openarm_interfaces.action import AutoCalibrate
 
     from openarm_bringup.calibration.run import CalibrationOptions
+    from openarm_common.robot.servo_store import StoredServos
 
 #: Of the node's parameter auto.poses.
 MOST_POSES = 100
+#: In which servos can be identified at all.
+LEAST_POSTURES = 2
 
 
 def auto(
@@ -138,6 +141,56 @@ def table(
     return Outcome(saved.success, saved.message, Code(saved.code), data | {"stored": saved.path}, text)
 
 
+def dynamics(*, arm: str = "both", postures: int = 6, dry_run: bool = False, domain: Domain = None) -> Outcome:
+    """Identify the servos of the arms in the running graph and store them: gain, damping, friction, latency a joint.
+
+    The arm goes to some postures and moves around each; nothing may be within its reach but the table. The bridge
+    carries the arms by what is stored from then on.
+
+    Args:
+        arm: left, right or both.
+        postures: In which it moves; more are slower and more exact.
+        dry_run: Identify, and store nothing.
+    """
+    join_graph(domain)
+    from openarm_bringup.calibration.ros.dynamics import DynamicsClient, arm_sides
+    from openarm_common.records import default_folder
+    from openarm_common.robot.servo_store import ServoStore
+
+    if not LEAST_POSTURES <= postures <= MOST_POSES:
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--postures {postures}: expected {LEAST_POSTURES} to {MOST_POSES}")
+    sides, store = arm_sides(arm), ServoStore(default_folder())
+    data, lines, show = dict[str, Any](), list[str](), _Show()
+    with requires_node("motion", "motion"), DynamicsClient() as client:
+        seed = client.dynamics_seed()
+        for side in sides:
+            found = client.identify(side, postures, show.posture)
+            record = found.record(side, seed)
+            data[side] = record.model_dump(mode="json")
+            lines += [f"{side} arm", *_servo_lines(record)]
+            if not dry_run:
+                data[side]["stored"] = str(store.save(record))
+    done = "nothing is stored" if dry_run else f"stored in {store.folder}"
+    return Outcome(True, f"identified: {' and '.join(sides)}; {done}", data=data, text="\n".join(lines))
+
+
+def _servo_lines(record: StoredServos) -> list[str]:
+    """Return a table of the servos, with standard deviations."""
+    lines = ["  joint  gain, N m/rad  damping, N m s/rad   friction, N m     latency, ms"]
+    for j in range(len(record.stiffness)):
+        cells = [
+            f"{values[j]:8.{digits}f} ± {stds[j]:.{digits}f}"
+            for values, stds, digits in (
+                (record.stiffness, record.stiffness_std, 1),
+                (record.damping, record.damping_std, 2),
+                (record.friction, record.friction_std, 2),
+            )
+        ]
+        latency = f"{1e3 * record.latency[j]:8.0f} ± {1e3 * record.latency_std[j]:.1f}"
+        lines.append(f"  {j + 1:5d} " + " ".join(f"{cell:>17}" for cell in (*cells, latency)))
+    return lines
+
+
 def _running(options: CalibrationOptions, show: _Show) -> Outcome:
     camera, *others = options.cameras
     if others:
@@ -164,6 +217,9 @@ class _Show(GraphReport):
 
     def camera(self, camera: str) -> None:
         self._console.print(f"{camera}", style="bold")
+
+    def posture(self, number: int, count: int) -> None:
+        self._console.print(f"posture {number} of {count}", markup=False)
 
     def feedback(self, feedback: AutoCalibrate.Feedback) -> None:
         sigma = ""

@@ -43,7 +43,7 @@ def pick(
 ) -> Outcome:
     """Pick an object and place it, or two simultaneously; the states are shown while it runs, Ctrl-C cancels it.
 
-    A second Ctrl-C, while the first waits for the answer to the cancel, is the emergency stop.
+    A second Ctrl-C, before the robot holds, is the emergency stop.
 
     `openarm pick red blue` picks two objects with both arms in parallel, or one after the other where the arms would
     come too near to each other. Options of two objects are given once for each: `--arm left --arm right`.
@@ -94,7 +94,7 @@ def pick(
             result = client.pick(**wanted[0], phase=phase, confirm=ask, **run)
         except KeyboardInterrupt as interrupt:
             asked = {"labels": labels} if second else {"label": label}
-            if isinstance(interrupt.__context__, KeyboardInterrupt):  # the second, while the first waits for the cancel
+            if isinstance(interrupt.__context__, KeyboardInterrupt):  # the second, before the goal has ended
                 from openarm_bringup.ros.stop_client import emergency_stop
 
                 return Outcome(False, f"emergency stop: {emergency_stop()[1]}", Code.STOPPED, asked)

@@ -34,6 +34,8 @@ _REQUEST_S = 5.0
 _MOST = 16
 #: Longest wait for requests to end when the daemon does, s.
 _END_S = 1.0
+#: Leaving the graph takes so long at most, s.
+_LEAVE_S = 5.0
 _CLIENT: ContextVar[Client | None] = ContextVar("_CLIENT", default=None)
 _WARM = (processes, ros2, tf)
 
@@ -141,6 +143,9 @@ class Daemon:
         deadline = time.monotonic() + _END_S
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
+        hurry = threading.Timer(_LEAVE_S, os._exit, (0,))  # the middleware may wait for a process that was killed
+        hurry.daemon = True
+        hurry.start()
         self._resident.close()
         self._context.try_shutdown()
 

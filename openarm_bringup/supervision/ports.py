@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import psutil
 
@@ -27,6 +27,12 @@ def in_domain(port: int, domain: int) -> bool:
     return (port - _FIRST) // _PER_DOMAIN == domain
 
 
+def unicast(port: int) -> bool:
+    """Whether a port is one on which a participant takes messages; it takes discovery on the one before."""
+    offset = (port - _FIRST) % _PER_DOMAIN
+    return offset > 10 and offset % 2 == 1
+
+
 def used_by(pid: int, domain: int) -> frozenset[int]:
     """Return the UDP ports of a domain on which a process and those below it listen; none when it has ended."""
     try:
@@ -38,32 +44,37 @@ def used_by(pid: int, domain: int) -> frozenset[int]:
     return frozenset(port for port in found if in_domain(port, domain))
 
 
+def held(ports: Iterable[int]) -> contextlib.ExitStack:
+    """Return a context in which no other socket can have those of the ports that are free."""
+    stack = contextlib.ExitStack()
+    for port in ports:
+        one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            one.bind(("", port))
+        except OSError:  # of several participants, as those for multicast
+            one.close()
+        else:
+            stack.enter_context(one)
+    return stack
+
+
 class HeldPorts:
     """Holds ports for as long as others may take their next owner for the last one."""
 
     def __init__(self) -> None:
-        self._held: set[socket.socket] = set()
+        self._held: set[contextlib.ExitStack] = set()
 
     def hold(self, ports: Iterable[int]) -> None:
         """Hold those that are free; in the loop of the supervisor."""
-        taken: list[socket.socket] = []
-        for port in ports:
-            one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            try:
-                one.bind(("", port))
-            except OSError:  # of several participants, as those for multicast
-                one.close()
-            else:
-                taken.append(one)
-        self._held.update(taken)
+        taken = held(ports)
+        self._held.add(taken)
         asyncio.get_running_loop().call_later(_KEPT_S, self._release, taken)
 
     def close(self) -> None:
         """Release all."""
-        self._release(list(self._held))
+        for taken in tuple(self._held):
+            self._release(taken)
 
-    def _release(self, held: Sequence[socket.socket]) -> None:
-        for one in held:
-            with contextlib.suppress(OSError):
-                one.close()
-        self._held.difference_update(held)
+    def _release(self, taken: contextlib.ExitStack) -> None:
+        taken.close()
+        self._held.discard(taken)

@@ -8,6 +8,7 @@ What runs now is one small JSON file a supervisor in $XDG_RUNTIME_DIR/openarm (o
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -19,7 +20,7 @@ from typing import Any
 import psutil
 from pydantic import ValidationError
 
-from openarm_bringup.supervision.state import state_dir
+from openarm_bringup.supervision.state import foreign, state_dir
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 
@@ -111,8 +112,14 @@ def _make_run_dir(root: Path) -> Path:
 
 
 def write_record(record: RunRecord) -> Path:
-    """Write the record of this supervisor, atomically."""
+    """Write the record of this supervisor, atomically.
+
+    Raises:
+        OSError: It can't be written, or the folder is not this user's.
+    """
     folder = state_dir()
+    if why := foreign(folder):
+        raise PermissionError(errno.EPERM, why, str(folder))
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     path = folder / f"{record.pid}.json"
     draft = path.with_suffix(".tmp")
@@ -130,9 +137,17 @@ def remove_record(pid: int) -> None:
 
 
 def running() -> list[RunRecord]:
-    """Return the graphs that run now, oldest first; records of dead supervisors are removed."""
+    """Return the graphs that run now, oldest first; records of dead supervisors are removed.
+
+    Raises:
+        OpenArmError: ENVIRONMENT, when the folder of the records is not this user's.
+    """
     records: list[RunRecord] = []
-    for path in sorted(state_dir().glob("*.json")) if state_dir().is_dir() else []:
+    folder = state_dir()
+    if why := foreign(folder):
+        text = f"{folder}, where graphs leave their records: {why}, so none of them is believed"
+        raise OpenArmError(Code.ENVIRONMENT, f"{text}; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
+    for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
         try:
             record = RunRecord.model_validate_json(path.read_text(encoding="utf-8"))
         except (ValidationError, FileNotFoundError):

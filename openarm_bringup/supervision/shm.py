@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from openarm_bringup.supervision.graph import Graph
-from openarm_bringup.supervision.ports import in_domain
+from openarm_bringup.supervision.ports import in_domain, unicast
 from openarm_common.errors import Code, OpenArmError
 
 SHM = Path("/dev/shm")
@@ -111,6 +111,13 @@ def names_of(domain: int, shm: Path = SHM) -> set[str]:
     names = [entry.name for entry in shm.iterdir()]
     ports = {name for name in names if (port := _PORT.fullmatch(name)) and in_domain(int(port[1]), domain)}
     return ports | {name for name in names if field.fullmatch(name)}
+
+
+def without_reader(domain: int, shm: Path = SHM) -> list[int]:
+    """Return the UDP ports of participants whose ports in shared memory are there, and read by no process."""
+    names = [name for name in names_of(domain, shm) if not _locked(shm / f"{name}_el")]
+    ports = [int(port[1]) for name in names if (port := _PORT.fullmatch(name))]
+    return [one for port in ports if unicast(port) for one in (port - 1, port)]
 
 
 def unborn(shm: Path = SHM) -> list[str]:

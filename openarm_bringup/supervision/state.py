@@ -28,3 +28,16 @@ def is_private(path: Path) -> bool:
     found = path.lstat()
     kind = stat.S_ISDIR(found.st_mode) or stat.S_ISSOCK(found.st_mode)
     return kind and found.st_uid == os.geteuid() and not found.st_mode & 0o077
+
+
+def foreign(folder: Path) -> str:
+    """Say why what stands in a folder may not be this user's; empty when it is, or there is no folder."""
+    try:
+        found = folder.lstat()
+    except FileNotFoundError:
+        return ""
+    if not stat.S_ISDIR(found.st_mode):
+        return "it is no folder"
+    if found.st_uid != os.geteuid():
+        return f"it is the folder of user {found.st_uid}"
+    return "other users may write there" if found.st_mode & 0o022 else ""

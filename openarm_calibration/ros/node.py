@@ -36,11 +36,11 @@ from openarm_calibration.ros.image_capture import ImageCapture, grey
 from openarm_calibration.sampling.gate import Matched, match
 from openarm_calibration.sampling.next_pose import advice
 from openarm_calibration.sampling.samples import SESSION_SUFFIXES, Sample, SampleSet, SessionHead, head_of, load_session
-from openarm_calibration.store.records import default_folder, now
 from openarm_calibration.store.store import CalibrationStore
 from openarm_common.asked_files import file_to_read, file_to_write
 from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.records import default_folder, now
 from openarm_common.ros.answers import answer_async
 from openarm_common.ros.convert import intrinsics_from_info
 from openarm_common.ros.node import BaseNode, run

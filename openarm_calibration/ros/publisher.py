@@ -22,13 +22,13 @@ from openarm_interfaces.srv import SaveTable
 from sensor_msgs.msg import CameraInfo
 from tf2_msgs.msg import TFMessage
 
-from openarm_calibration.store.records import default_folder, now
 from openarm_calibration.store.store import PublisherConfig, of_these_mounts, places
 from openarm_calibration.store.table import TABLE, StoredTable, TableStore
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL, CameraConfig, Intrinsics, load_cameras
 from openarm_common.config import validate
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.records import default_folder, now
 from openarm_common.ros.answers import answering
 from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform
 from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, BaseNode, run

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field, field_validator
 
-from openarm_calibration.store.records import Found, Record, RecordStore
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.config import Config, validate
 from openarm_common.errors import OpenArmError
+from openarm_common.records import Found, Record, RecordStore
 from openarm_common.resources import config_dir
 from openarm_common.types import Array
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pydantic import Field
 
-from openarm_calibration.store.records import Record, RecordStore
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.records import Record, RecordStore
 
 #: Name of the record, and of the folder below that of the calibrations.
 TABLE = "table"

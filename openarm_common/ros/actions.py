@@ -3,23 +3,31 @@
 
 The status topic of an action, and the topic `~/_alive` of a node for its services, are offered with automatic
 liveliness: the middleware asserts it from a thread of its own, so a process that computes is alive, and one that was
-killed or stopped is not. A client whose server offers no liveliness (another vendor's) works as with rclpy's.
+killed or stopped is not. On the same machine a lifeline tells the one from the other. A client whose server offers no
+liveliness (another vendor's) works as with rclpy's.
 """
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from action_msgs.msg import GoalStatusArray
 from rclpy import action
+from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.event_handler import QoSLivelinessChangedInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.lifeline import Lifeline, lives, watch
 
 
 @dataclass(frozen=True)
@@ -72,8 +80,51 @@ def alive_topic(node_name: str) -> str:
     return f"{node_name}/_alive"
 
 
+#: A process of this machine that lives and is silent for so much longer than the lease counts as gone, s: it is
+#: stopped, or hangs. Fast DDS halts a process for a second or two when another one that it writes to was killed.
+_SILENT_S = 3.0
+#: Lifelines of this process by participant of the middleware.
+_LIFELINES: dict[str, _ParticipantLifeline] = {}
+
+
+class _ParticipantLifeline(Lifeline):
+    """Shows that the process of a participant lives, until its context shuts down."""
+
+    def __init__(self, participant: str, context: Context) -> None:
+        super().__init__(participant)
+        self._participant = participant
+        _LIFELINES[participant] = self
+        context.on_shutdown(self.end)
+
+    def end(self) -> None:
+        _LIFELINES.pop(self._participant, None)
+        self.close()
+
+
+def show_life(node: Node, topic: str) -> None:
+    """Let watchers of this machine tell the death of this process from its silence.
+
+    Args:
+        node: Publishes the topic.
+        topic: Offered by `LEASE`.
+    """
+    for info in node.get_publishers_info_by_topic(topic):
+        own = (info.node_name, info.node_namespace) == (node.get_name(), node.get_namespace())
+        if own and _participant(info) not in _LIFELINES:
+            with suppress(OSError):  # without it, silence counts as death
+                _ParticipantLifeline(_participant(info), node.context)
+
+
+def _participant(info: TopicEndpointInfo) -> str:
+    """Return the name of an endpoint's participant: the prefix of its GUID."""
+    return bytes(info.endpoint_gid[:12]).hex()
+
+
 class Watch:
     """Notices when the publisher of a topic dies, which discovery says up to 20 s later.
+
+    Without a sign of life it counts as dead, unless its process is of this machine and lives: then after `_SILENT_S`
+    more of silence.
 
     Args:
         node: Owner.
@@ -87,6 +138,10 @@ class Watch:
         #: Publishers that live, and deaths so far.
         self.alive = self.deaths = 0
         self._who = ""
+        self._participants = set[str]()
+        self._buried = set[str]()
+        #: Since when there has been no sign of life of a process that lives, monotonic; infinite: there is.
+        self._silent_since = math.inf
         events = SubscriptionEventCallbacks(liveliness=self._on_liveliness, use_default_callbacks=False)
         self._subscription = node.create_subscription(
             kind, topic, lambda _: None, LEASE.watch(latest()), event_callbacks=events
@@ -100,19 +155,54 @@ class Watch:
         """Return a function that says who has died since this call: the node's name; "" while it lives."""
         self._look()
         before = self.deaths
-        return lambda: (self._who or self._what) if self.deaths != before else ""
+
+        def died() -> str:
+            self._judge_silence()
+            return (self._who or self._what) if self.deaths != before else ""
+
+        return died
+
+    @property
+    def dead(self) -> bool:
+        """Whether there was a publisher, and there is none that lives."""
+        self._judge_silence()
+        return not self.alive and bool(self.deaths)
+
+    def _judge_silence(self) -> None:
+        """Count one that has been silent for too long as dead."""
+        if time.monotonic() - self._silent_since > _SILENT_S:
+            self._silent_since = math.inf
+            self._buried |= self._participants
+            self.deaths += 1
 
     def _on_liveliness(self, event: QoSLivelinessChangedInfo) -> None:
         self._look()
-        if event.alive_count < self.alive:
+        lost, self.alive = event.alive_count < self.alive, event.alive_count
+        if not lost:
+            self._silent_since = math.inf
+            return
+        known = self._participants - self._buried
+        dead = {participant for participant in known if not lives(participant)}
+        if known and not dead:
+            self._silent_since = time.monotonic()
+            for participant in known:
+                watch(participant, partial(self._bury, participant))
+        else:
+            self._buried |= dead
             self.deaths += 1
-        self.alive = event.alive_count
+
+    def _bury(self, participant: str) -> None:
+        """Count the end of a process that was silent before; in a thread of its own."""
+        if participant not in self._buried and self._silent_since < math.inf:
+            self._buried.add(participant)
+            self.deaths += 1
 
     def _look(self) -> None:
         """Keep the name of the node: the graph may have lost it when it is asked for."""
         for info in self._node.get_publishers_info_by_topic(self._topic):
             if not info.node_name.startswith("_"):
                 self._who = f"the node {info.node_name}"
+            self._participants.add(_participant(info))
 
 
 class ActionServer(action.ActionServer):
@@ -121,6 +211,7 @@ class ActionServer(action.ActionServer):
     def __init__(self, node: Node, kind: Any, name: str, execute: Callable[..., Any], **kwargs: Any) -> None:
         status = LEASE.offer(latest())
         super().__init__(node, kind, name, execute, status_pub_qos_profile=status, **kwargs)
+        show_life(node, f"{node.resolve_topic_name(name)}/_action/status")
 
 
 class ActionClient(action.ActionClient):
@@ -145,7 +236,7 @@ class ActionClient(action.ActionClient):
 
     def server_is_ready(self) -> bool:
         """Whether a server is in the graph that is not known to be dead."""
-        return bool(super().server_is_ready()) and (self._watch.alive > 0 or self._watch.deaths == 0)
+        return bool(super().server_is_ready()) and not self._watch.dead
 
     def watch(self) -> Callable[[], str]:
         """Return a function that says who has died since this call: the node's name; "" while its server lives."""

@@ -28,6 +28,8 @@ from openarm_common.ros.actions import ActionClient, Watch, alive_topic, check_a
 _CHECK_S = 0.25
 #: Checks without a server before it counts as gone: discovery may lose it for a moment.
 _GONE = 20
+#: Longest wait for the end of a goal that was cancelled, s: a robot ramps down, and a plan may have to be dropped.
+_HALT_S = 5.0
 _UP = "is the graph up, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE?"
 
 
@@ -181,7 +183,8 @@ class BackgroundNode(ContextNode):
             kind: Type of the action.
             name: Of the action.
             goal: To send.
-            timeout: Longest wait for the end, s of wall clock; then, and at any exception, the goal is cancelled.
+            timeout: Longest wait for the end, s of wall clock; then, and at any exception, the goal is cancelled, and
+                its end is waited for.
             on_feedback: Called with each feedback, in the background thread; what it raises is raised here.
             stop: When it is set the goal is cancelled, and its result waited for.
             meanwhile: Called again and again in the thread of the caller while the goal is active.
@@ -189,6 +192,8 @@ class BackgroundNode(ContextNode):
         Raises:
             OpenArmError: NOT_READY, when there is no server, or it dies; BUSY, when the goal is refused;
                 INVALID_ARGUMENT, when no message can hold the goal; TIMEOUT.
+            KeyboardInterrupt: The goal has ended; a second one, raised in the handling of the first, says that it may
+                not have.
         """
         _check(name, goal)
         client: ActionClient = self._client(name, lambda: ActionClient(self._node, kind, name))
@@ -198,34 +203,65 @@ class BackgroundNode(ContextNode):
         deliver = None if on_feedback is None else _guarded(on_feedback, trouble)
         there, died = client.server_is_ready, client.watch()
         sent = self._begin(client.send_goal_async, goal, deliver)
-        handle = self._wait(sent, self._timeout, name, there, died=died)
-        if not handle.accepted:
-            raise OpenArmError(Code.BUSY, f"{name} refused the goal")
         try:
+            handle = self._wait(sent, self._timeout, name, there, died=died)
+            if not handle.accepted:
+                raise OpenArmError(Code.BUSY, f"{name} refused the goal")
             ended = self._begin(handle.get_result_async)
             cancel = partial(self._begin, handle.cancel_goal_async)
             answer = self._wait(ended, timeout, name, there, stop, cancel, trouble, meanwhile, died)
-        except BaseException:
+        except BaseException as error:
             # Whatever keeps the caller from waiting (a deadline, Ctrl-C): the robot would continue unattended.
-            _event(self._begin(handle.cancel_goal_async)).wait(0.1 if died() else 2.0)
+            halted = self._cancel(sent).wait(_HALT_S if there() and not died() else 0.1)
+            if not halted and isinstance(error, KeyboardInterrupt):
+                text = f"{name} was cancelled by Ctrl-C and has not ended within {_HALT_S:g} s"
+                raise OpenArmError(Code.TIMEOUT, f"{text}; the emergency stop is `openarm stop`") from error
             raise
         if answer.status == GoalStatus.STATUS_UNKNOWN:
             raise OpenArmError(Code.NOT_READY, f"{name} no longer knows the goal: its node was restarted")
         return answer.result
 
-    def _watch_service(self, service: str) -> Callable[[], str]:
-        """Return a function that says when a node has died that offers a service, as `Watch.begin`."""
-        watches: list[Watch] = []
+    def _cancel(self, sent: Future) -> threading.Event:
+        """Cancel a goal, also one that is still being accepted; the returned event is set when it has ended."""
+        ended = threading.Event()
+
+        async def cancel() -> None:
+            handle: Any = await sent
+            if not isinstance(handle, _Unsent) and handle.accepted:
+                await handle.cancel_goal_async()
+                await handle.get_result_async()
+            ended.set()
+
+        self._executor.create_task(cancel)
+        return ended
+
+    def servers(self, service: str) -> list[str]:
+        """Return the nodes that offer a service, as far as they are discovered: their fully qualified names."""
+        found: list[str] = []
         for name, namespace in self._node.get_node_names_and_namespaces():
             with suppress(NodeNameNonExistentError):  # it has gone meanwhile
                 if any(service == one for one, _ in self._node.get_service_names_and_types_by_node(name, namespace)):
-                    topic = alive_topic(f"{namespace.rstrip('/')}/{name}")
-                    with self._making:
-                        if topic not in self._watches:
-                            self._watches[topic] = Watch(self._node, Empty, topic, f"the node {name}")
-                    watches.append(self._watches[topic])
-        begun = [watch.begin() for watch in watches]
-        return lambda: next((who for died in begun if (who := died())), "")
+                    found.append(f"{namespace.rstrip('/')}/{name}")
+        return found
+
+    def _watch_service(self, service: str) -> Callable[[], str]:
+        """Return a function that says when a node has died that offers a service, as `Watch.begin`."""
+        begun: list[Callable[[], str]] = []
+
+        def died() -> str:
+            if not begun:  # a service may be discovered before the name of its node
+                begun.extend(self._watch_node(server).begin() for server in self.servers(service))
+            return next((who for one in begun if (who := one())), "")
+
+        died()
+        return died
+
+    def _watch_node(self, name: str) -> Watch:
+        topic = alive_topic(name)
+        with self._making:
+            if topic not in self._watches:
+                self._watches[topic] = Watch(self._node, Empty, topic, f"the node {name.rpartition('/')[2]}")
+            return self._watches[topic]
 
     def _client(self, name: str, make: Callable[[], Any]) -> Any:
         with self._making:

@@ -71,6 +71,8 @@ class HoldListener:
 
     def __init__(self, node: BaseNode[Any]) -> None:
         self._holds = ArmHolds()
+        #: First bytes of the last goal of each arm that was not refused.
+        self._served: dict[str, bytes] = {}
         node.create_subscription(DiagnosticStatus, TOPIC, self._on_hold, reliable(_DEPTH))
 
     @property
@@ -85,10 +87,14 @@ class HoldListener:
             OpenArmError: BUSY, naming the holder.
         """
         self._holds.check(arm, goal_id, time.monotonic())
+        self._served[arm] = goal_id[:KEY_BYTES]
 
     def goal_id(self, arm: str) -> UUID:
-        """A new id for a goal that serves the one that holds the arm."""
-        return _goal_id(self._holds.key_of(arm, time.monotonic()))
+        """A new id for a goal that serves the one that holds the arm, or whose goal was checked last.
+
+        The announcement of a hold may arrive later than a goal of its holder, and elsewhere earlier than here.
+        """
+        return _goal_id(self._holds.key_of(arm, time.monotonic()) or self._served.get(arm, b""))
 
     def _on_hold(self, message: DiagnosticStatus) -> None:
         try:

@@ -37,7 +37,7 @@ from openarm_common.config import AT_RUN_TIME, Config, validate
 from openarm_common.errors import OpenArmError
 from openarm_common.printable import brief
 from openarm_common.robot.description import RobotDescription
-from openarm_common.ros.actions import LEASE, alive_topic, latest
+from openarm_common.ros.actions import LEASE, alive_topic, latest, show_life
 from openarm_common.ros.log import PrintableLogger
 
 ConfigT = TypeVar("ConfigT", bound=Config)
@@ -113,7 +113,7 @@ class BaseNode(Node, Generic[ConfigT]):
         self.__logger: PrintableLogger | None = None
         super().__init__(name, **kwargs)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        data = _declare(self, model, "")
+        data = _declare(self, model, "", {})
         self.config: ConfigT = validate(model, data, f"parameters of {self.get_fully_qualified_name()}")
         self.__pool = ThreadPoolExecutor(max_workers=4, thread_name_prefix=name)
         self.__description: RobotDescription | None = None
@@ -123,6 +123,7 @@ class BaseNode(Node, Generic[ConfigT]):
         self.__diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", QOS_COMMAND)
         # While it is there, clients of services know that they will be answered.
         self.__alive = self.create_publisher(Empty, alive_topic(self.get_fully_qualified_name()), LEASE.offer(latest()))
+        show_life(self, alive_topic(self.get_fully_qualified_name()))
         self.create_timer(self.REPORT_PERIOD_S, self.__publish_diagnostics, clock=self.steady_clock)
 
     @property
@@ -276,12 +277,14 @@ def _refusing_unknown_types(callback: Callable[[Any, Any], Any]) -> Callable[[An
     return answer
 
 
-def _declare(node: Node, model: type[BaseModel], prefix: str) -> dict[str, Any]:
+def _declare(node: Node, model: type[BaseModel], prefix: str, defaults: Mapping[str, Any]) -> dict[str, Any]:
     data: dict[str, Any] = {}
     for key, field in model.model_fields.items():
         name = prefix + key
+        default: Any = defaults.get(key, field.get_default(call_default_factory=True))
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            data[key] = _declare(node, field.annotation, name + ".")
+            given: dict[str, Any] = default.model_dump() if isinstance(default, BaseModel) else default or {}
+            data[key] = _declare(node, field.annotation, name + ".", given)
             continue
         descriptor = ParameterDescriptor(
             description=field.description or "",
@@ -290,7 +293,6 @@ def _declare(node: Node, model: type[BaseModel], prefix: str) -> dict[str, Any]:
         )
         # Types are checked by the model, which says more (and takes 1 for 1.0) than rcl does.
         descriptor.dynamic_typing = True
-        default: Any = field.get_default(call_default_factory=True)
         value = node.declare_parameter(name, _to_ros(default), descriptor).value
         if value is not None:
             data[key] = list(value) if hasattr(value, "tolist") else value

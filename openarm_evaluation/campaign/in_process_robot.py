@@ -11,6 +11,7 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
+from openarm_control.gripper import GripperGoal, GripperOutcome
 from openarm_evaluation.campaign.robot import SimRobot
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.verdicts import Verdict
@@ -29,7 +30,6 @@ from openarm_motion.service.requests import (
     PlanApproachRequest,
 )
 from openarm_motion.timing.trajectory import Trajectory
-from openarm_sim_bridge.control.gripper import GripperGoal, GripperOutcome
 from openarm_sim_bridge.world.touch import pad_links
 
 T = TypeVar("T")

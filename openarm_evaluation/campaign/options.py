@@ -13,6 +13,7 @@ from cyclopts.validators import Number
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_perception.detection.kinds import DetectorKind
+from openarm_sim_bridge.config import FaceName, Profile
 
 Row = dict[str, Any]
 
@@ -61,6 +62,10 @@ class CampaignOptions:
         workers: Processes.
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.
+        profile: Motors of the arms: ideal, or openarm as owners have them.
+        dynamics_seeds: Motors, masses and joint zeros to go through with the profile openarm, such as 1-10.
+        controllers: Of the robot: suite, or openarm_ros2 with the profile openarm, through the graph alone.
+        identify: Whether the servos of each draw are identified first.
         use_effort: Whether the force of the fingers counts as evidence.
         detector: What finds objects: their colour, the network, both checking each other, a tag on them, or depth.
         parameters: A parameter of a node of the graph `sim`, as node.param=value; may be given several times.
@@ -72,6 +77,10 @@ class CampaignOptions:
     workers: Annotated[int, Parameter(validator=Number(gte=1))] = 1
     noise: bool = False
     mount_seeds: Seeds = ()
+    profile: Profile = "ideal"
+    controllers: FaceName = "suite"
+    dynamics_seeds: Seeds = (1,)
+    identify: Annotated[bool, Parameter(negative="--no-identify")] = True
     use_effort: Annotated[bool, Parameter(name="--effort", negative="--no-effort")] = True
     detector: DetectorKind = "color"
     parameters: Annotated[tuple[str, ...], Parameter(name="--set")] = ()
@@ -83,16 +92,25 @@ class CampaignOptions:
             "set": self.set_name,
             "noise": self.noise,
             "mount_seeds": list(self.mount_seeds),
+            **self._profile_settings(),
             "use_effort": self.use_effort,
             **({"detector": self.detector} if self.detector != "color" else {}),
             **({"parameters": list(self.parameters)} if self.parameters else {}),
         }
 
+    def _profile_settings(self) -> dict[str, Any]:
+        if self.profile == "ideal":
+            return {}
+        face = {"controllers": self.controllers} if self.controllers != "suite" else {}
+        seeds = list(self.dynamics_seeds)
+        return {"profile": self.profile, **face, "dynamics_seeds": seeds, "identify": self.identify}
+
     def graph_parameters(self) -> tuple[str, ...]:
         """Return the parameters of the graph that the options stand for, as `node.param=value`."""
         return (
             f"mujoco_bridge.depth_noise.enabled={str(self.noise).lower()}",
-            f"grasp.held.use_effort={str(self.use_effort).lower()}",
+            f"mujoco_bridge.profile={self.profile}",
+            f"grasp.held.use_effort={str(self.use_effort and self.controllers == 'suite').lower()}",
             *(f"{node}.detector={self.detector}" for node in ("detector", "wrist_detector")),
             *self.parameters,
         )
@@ -106,6 +124,10 @@ class CampaignOptions:
         ]
         parts.append("--noise" if self.noise else "")
         parts.append("--mount-seeds " + ",".join(map(str, self.mount_seeds)) if self.mount_seeds else "")
+        if self.profile != "ideal":
+            parts.append(f"--profile {self.profile} --dynamics-seeds " + ",".join(map(str, self.dynamics_seeds)))
+            parts.append("" if self.controllers == "suite" else f"--controllers {self.controllers}")
+            parts.append("" if self.identify else "--no-identify")
         parts.append("" if self.use_effort else "--no-effort")
         parts.append(f"--detector {self.detector}" if self.detector != "color" else "")
         parts += [f"--set {shlex.quote(item)}" for item in self.parameters]

@@ -25,11 +25,15 @@ from openarm_common.camera.depth_view import DepthView
 from openarm_common.config import Config, load_config
 from openarm_common.errors import OpenArmError
 from openarm_common.resources import config_dir
-from openarm_common.robot.description import RobotDescription
+from openarm_common.robot.description import RobotDescription, Side
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_common.robot.servos import ServoModel
 from openarm_common.scene.scene import Scene, Table
 from openarm_common.types import Array
+from openarm_control.arm import End, TrajectoryFollower, TrajectoryOutcome
+from openarm_control.trajectory import Trajectory as FollowedTrajectory
+from openarm_control.trajectory import TrajectoryError
 from openarm_evaluation.campaign.map_feed import SimulatedMap
 from openarm_evaluation.campaign.parameters import suite_config
 from openarm_evaluation.judging.judge import Sample
@@ -50,9 +54,6 @@ from openarm_perception.geometry.depth import DepthImage, DepthLimits, View
 from openarm_perception.geometry.watch import CameraWatch
 from openarm_sim_bridge.cameras.cameras import SimulatedCameras
 from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
-from openarm_sim_bridge.control.arm import End, TrajectoryFollower, TrajectoryOutcome
-from openarm_sim_bridge.control.trajectory import Trajectory as FollowedTrajectory
-from openarm_sim_bridge.control.trajectory import TrajectoryError
 from openarm_sim_bridge.faults.faults import Fault
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.stage import Stage
@@ -96,6 +97,8 @@ class SimRobot:
         senses: How well it sees.
         mount_seed: Of the true camera mounts; None mounts them where the configuration says.
         mounts: T_parent_link by camera as the suite believes; those left out are nominal.
+        dynamics_seed: Of motors, masses and joint zeros; None: that of the configuration.
+        servos: Of the arms as identified, by side; None: as the profile says.
         table: As the suite believes; None: as it is.
         seed: Of the noise.
         posture: Joints that start elsewhere than at home, rad by name.
@@ -108,6 +111,8 @@ class SimRobot:
         *,
         mount_seed: int | None = None,
         mounts: Mapping[str, Array] | None = None,
+        dynamics_seed: int | None = None,
+        servos: Mapping[Side, ServoModel] | None = None,
         table: Table | None = None,
         seed: int = 0,
         posture: Mapping[str, float] | None = None,
@@ -117,10 +122,11 @@ class SimRobot:
         self.cameras = load_cameras()
         self._latency_s, self._sets = senses.latency, senses.parameters()
         self.suite = suite = suite_config(self._sets)
-        stage = Stage(self.description, self.cameras, mount_seed, suite.bridge.physics)
+        hardware = suite.bridge.hardware.of_seed(dynamics_seed)
+        stage = Stage(self.description, self.cameras, mount_seed, suite.bridge.physics, hardware)
         stage.home |= posture or {}
         bridge = suite.bridge
-        self.simulated = SimulatedRobot.on(stage, scene, bridge.trajectory, bridge.gripper)
+        self.simulated = SimulatedRobot.on(stage, scene, bridge.trajectory, bridge.gripper, servos)
         self.world = self.simulated.world
         self.world_faults = self.simulated.faults
         self._rng = np.random.default_rng([seed, 77])

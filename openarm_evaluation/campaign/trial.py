@@ -16,8 +16,10 @@ import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Side
+from openarm_common.robot.servos import ServoModel
 from openarm_common.types import Array
 from openarm_evaluation.campaign import record
+from openarm_evaluation.campaign.dynamics import with_servos
 from openarm_evaluation.campaign.in_process_robot import InProcessRobot
 from openarm_evaluation.campaign.mounts import with_mounts
 from openarm_evaluation.campaign.options import CampaignOptions, Row
@@ -56,6 +58,7 @@ class Trials:
         senses: How well the robot sees.
         config: Parameters of the grasp.
         mounts: T_parent_link by camera as the suite believes.
+        servos: Of the arms as identified, by side; None: as the profile says.
         folder: Gets what is kept of a failure.
         again: The command that runs this task again, for the report.
     """
@@ -66,6 +69,7 @@ class Trials:
         senses: SimulatedSenses,
         config: GraspConfig,
         mounts: Mapping[str, Array] | None = None,
+        servos: Mapping[Side, ServoModel] | None = None,
         folder: Path | None = None,
         again: str = "",
     ) -> None:
@@ -74,7 +78,14 @@ class Trials:
         self._config = config
         senses = senses.model_copy(update={"sets": (*senses.sets, *task.sets)})
         self.robot = SimRobot(
-            task.scene, senses, mount_seed=task.mount_seed, mounts=mounts, seed=task.seed, posture=task.posture
+            task.scene,
+            senses,
+            mount_seed=task.mount_seed,
+            mounts=mounts,
+            dynamics_seed=task.dynamics_seed,
+            servos=servos,
+            seed=task.seed,
+            posture=task.posture,
         )
         self.link = InProcessRobot(self.robot, config)
         self.skills = Skills(self.link, config)
@@ -224,14 +235,18 @@ def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
     """Run one task in this process and return its row, whatever happens."""
     task, sets = make_task(options.set_name, seed), options.graph_parameters()
     mounts: Mapping[str, Array] = {}
+    servos: Mapping[Side, ServoModel] | None = None
     try:
         if options.mount_seeds:
             task, mounts = with_mounts(task, options.mount_seeds, folder / "mounts")
+        if options.profile != "ideal":
+            task, servos = with_servos(task, options, folder / "servos")
         trials = Trials(
             task,
             SimulatedSenses(sets=sets),
             suite_config(sets).grasp,
             mounts=mounts,
+            servos=servos,
             folder=folder / "failures" / str(seed),
             again=options.command(seed),
         )

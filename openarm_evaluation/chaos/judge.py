@@ -83,8 +83,17 @@ def fall_of(track: Sequence[Sample]) -> float:
     return greatest if greatest > FALL_HEIGHT else 0.0
 
 
-def unasked_speed(joints: Sequence[tuple[int, Mapping[str, float]]]) -> tuple[float, str]:
-    """Return the greatest speed of an arm's joint and its name, rad/s, over windows of a tenth of a second."""
+def unasked_speed(
+    joints: Sequence[tuple[int, Mapping[str, float]]], seen: int = 0, begin_ns: int = 0
+) -> tuple[float, str]:
+    """Return the greatest speed of an arm's joint and its name, rad/s, over windows of a tenth of a second.
+
+    Args:
+        joints: Simulated time and positions, as they came.
+        seen: So many of them came before the answer: of a simulation that ended, their times may be later.
+        begin_ns: Those of before do not count.
+    """
+    joints = [state for state in joints[seen:] if state[0] >= begin_ns]
     greatest, which, k = 0.0, "", 0
     for index, (t_ns, positions) in enumerate(joints):
         if joints[index - 1 if index else 0][0] > t_ns:  # the simulation was restarted

@@ -11,10 +11,10 @@ from collections.abc import Callable
 
 from openarm_bringup.calibration.run import CalibrationListeners, CalibrationOptions, run_calibration
 from openarm_calibration.handeye.refine import mount_error
-from openarm_calibration.store.records import default_folder
 from openarm_calibration.store.store import of_these_mounts, places
 from openarm_common.camera.cameras import load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.records import default_folder
 
 
 def uncalibrated(mount_seed: int) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -253,8 +253,14 @@ def _observed(
         x, y = (place or chosen)[:2]
         verdict = judge(observer.track(item.name), (x, y), claimed=result.success)
         steps = [step for step in observer.steps() if len(items) == 1 or step.label in (item.label, result.label)]
-        trials.append(Trial(scene, seed, item.name, result, verdict, steps, wall_s))
+        trials.append(Trial(scene, seed, item.name, result, verdict, _stamped(steps), wall_s))
     return trials
+
+
+def _stamped(steps: Sequence[Step]) -> list[Step]:
+    """Give steps from before the first joint state, whose stamp is 0, that of the first one after it."""
+    first_ns = next((step.t_ns for step in steps if step.t_ns), 0)
+    return [step if step.t_ns else replace(step, t_ns=first_ns) for step in steps]
 
 
 def _wait_rest(observer: Observer, name: str) -> None:

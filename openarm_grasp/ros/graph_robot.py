@@ -8,7 +8,6 @@ from copy import copy
 from typing import Any
 
 import numpy as np
-from control_msgs.action import GripperCommand, ParallelGripperCommand
 from openarm_interfaces.action import ExecuteTrajectory, MoveArm, PlanApproach
 from openarm_interfaces.srv import ComputeIK, GetScene
 from rclpy.client import Client
@@ -47,10 +46,8 @@ class GraphRobot:
         self._move = ActionClient(node, MoveArm, "/motion/move")
         self._ik = node.create_client(ComputeIK, "/motion/compute_ik")
         self._scene = node.create_client(GetScene, "/motion/get_scene")
-        gripper_action = ParallelGripperCommand if config.gripper_action == "parallel" else GripperCommand
-        self._grippers = {
-            arm: ActionClient(node, gripper_action, f"/{arm}_gripper_controller/gripper_cmd") for arm in ARMS
-        }
+        kind = messages.GRIPPER_ACTIONS[config.gripper_action]
+        self._grippers = {arm: ActionClient(node, kind, config.gripper.format(arm=arm)) for arm in ARMS}
         self.deadline_ns = 0
         #: Longest start delay of a motion until the other arm leaves clearance, s; 0: the arms never move at once.
         self.max_start_delay = 0.0
@@ -104,7 +101,7 @@ class GraphRobot:
         }
         if moves:
             for arm, client in self._grippers.items():
-                name = f"action /{arm}_gripper_controller/gripper_cmd (bridge or robot driver)"
+                name = f"action {self._config.gripper.format(arm=arm)} (bridge, arm_control or robot driver)"
                 needed[name] = client.server_is_ready()
         return [what for what, there in needed.items() if not there]
 
@@ -265,4 +262,4 @@ class GraphRobot:
         self._holder.hold(arm)
         limit, goal_id = self._config.limits.gripper_timeout, self._holder.goal_id()
         result = await self._nodes.goal(self._grippers[arm], goal, limit, what, self._watched(None), goal_id)
-        return bool(result.stalled or result.reached_goal)
+        return messages.gripped(result)

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from control_msgs.action import GripperCommand, ParallelGripperCommand
+from builtin_interfaces.msg import Duration
+from control_msgs.action import FollowJointTrajectory, GripperCommand, ParallelGripperCommand
 from geometry_msgs.msg import Point
 from openarm_interfaces.action import MoveArm, Pick, PickTwo, PlanApproach
 from openarm_interfaces.msg import ApproachTarget, CollisionBox, GraspOption, GraspStatus, PickRequest, PickResult
@@ -16,7 +17,7 @@ from openarm_interfaces.msg import StateTime as StateTimeMsg
 from openarm_interfaces.srv import ComputeIK, Grasp
 from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA, Header
-from trajectory_msgs.msg import JointTrajectory
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
@@ -24,6 +25,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, point, stamp_to_ns, vector, xyz
 from openarm_common.ros.node import BASE_FRAME
 from openarm_common.types import Array
+from openarm_grasp.config import GripperAction
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NoWayError, Option
@@ -36,6 +38,9 @@ _CHOSEN = ColorRGBA(r=0.1, g=0.8, b=0.2, a=1.0)
 _REFUSED = ColorRGBA(r=0.9, g=0.2, b=0.1, a=0.35)
 _WAITING = ColorRGBA(r=0.95, g=0.6, b=0.1, a=1.0)
 _OFFERED = ColorRGBA(r=0.4, g=0.5, b=0.9, a=0.35)
+
+#: Time in which a trajectory moves the fingers, ns: the whole way at the speed of the other actions.
+_GRIP_NS = 600_000_000
 
 #: What the namespaces of the parts of a plan that waits begin with.
 PLAN = "plan/"
@@ -266,19 +271,37 @@ def planned_from_msg(result: PlanApproach.Result, offered: int) -> Planned:
     )
 
 
-def gripper_goal(
-    action: Literal["parallel", "classic"], joint: str, position: float, effort: float = 0.0
-) -> ParallelGripperCommand.Goal | GripperCommand.Goal:
-    """Goal of either gripper action: the driving finger at a position, m, with at most an effort, N.
+#: Type of the action of a gripper by its name in the configuration.
+GRIPPER_ACTIONS: Mapping[GripperAction, type] = {
+    "parallel": ParallelGripperCommand,
+    "classic": GripperCommand,
+    "trajectory": FollowJointTrajectory,
+}
 
-    An effort of 0 leaves it to the controller.
+
+def gripper_goal(
+    action: GripperAction, joint: str, position: float, effort: float = 0.0
+) -> ParallelGripperCommand.Goal | GripperCommand.Goal | FollowJointTrajectory.Goal:
+    """Goal of a gripper action: the driving finger at a position, m, with at most an effort, N.
+
+    An effort of 0 leaves it to the controller, and a trajectory always does.
     """
+    if action == "trajectory":
+        point = JointTrajectoryPoint(positions=[position], time_from_start=Duration(nanosec=_GRIP_NS))
+        return FollowJointTrajectory.Goal(trajectory=JointTrajectory(joint_names=[joint], points=[point]))
     if action == "classic":
         goal = GripperCommand.Goal()
         goal.command.position, goal.command.max_effort = position, effort
         return goal
     command = JointState(name=[joint], position=[position], effort=[effort] if effort > 0.0 else [])
     return ParallelGripperCommand.Goal(command=command)
+
+
+def gripped(result: Any) -> bool:
+    """Whether a hand came to the end of its motion, at its goal or at an object, by the result of its action."""
+    if isinstance(result, FollowJointTrajectory.Result):  # which says nothing of the fingers: joint states do
+        return bool(result.error_code == FollowJointTrajectory.Result.SUCCESSFUL)
+    return bool(result.stalled or result.reached_goal)
 
 
 def reach_request(arm: str, T_base_tcp: Array) -> ComputeIK.Request:

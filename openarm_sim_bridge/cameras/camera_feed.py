@@ -13,9 +13,9 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 
+from openarm_control.pacing import RateDivider
 from openarm_sim_bridge.cameras.handover import CameraReport, CameraSetup, StateSender, pair
 from openarm_sim_bridge.faults.faults import Fault
-from openarm_sim_bridge.pacing import RateDivider
 from openarm_sim_bridge.world.world import Snapshot, World
 
 _MODULE = "openarm_sim_bridge.ros.camera_node"

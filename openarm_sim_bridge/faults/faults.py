@@ -125,9 +125,9 @@ class GripperWeak(OfSide):
 
 
 class JointSag(OfSide):
-    """Gravity compensation of an arm is reduced: it sags below its targets."""
+    """A part of an arm's weight is not carried, or more than is known where motors carry nothing: it sags."""
 
-    share: float = Field(default=0.0, ge=0.0, le=1.0, description="of the weight that is still compensated")
+    share: float = Field(default=0.0, ge=0.0, le=1.0, description="the rest of the weight is added, unknown to all")
 
 
 class JointLate(OfSide):

@@ -95,7 +95,7 @@ class WorldFaults:
         if (sag := self._of(JointSag)) is not None:
             for body in range(model.nbody):
                 if any(f"_{side}_" in model.body(body).name and sag.hits(side) for side in SIDES):
-                    model.body_gravcomp[body] *= sag.share
+                    model.body_gravcomp[body] -= 1.0 - sag.share
 
     def targets(self, wanted: Array) -> Array:
         """Return the actuator targets (n,) that take effect in place of the wanted ones."""

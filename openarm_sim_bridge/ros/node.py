@@ -13,38 +13,32 @@ import os
 import sys
 import traceback
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import mujoco
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
-from std_srvs.srv import Trigger
 
 from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.printable import brief
 from openarm_common.resources import config_dir
-from openarm_common.ros.holds import HoldListener
-from openarm_common.ros.node import QOS_COMMAND, BaseNode, reliable, run
+from openarm_common.ros.node import BaseNode, reliable, run
 from openarm_common.scene.scene import load_scene
+from openarm_control.joints import JointReadout
+from openarm_control.priority import use_fifo
 from openarm_sim_bridge.cameras.camera_feed import CameraFeed
 from openarm_sim_bridge.cameras.handover import CameraSetup
 from openarm_sim_bridge.config import BridgeConfig
 from openarm_sim_bridge.faults.faults import Fault
-from openarm_sim_bridge.priority import use_fifo
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.ros.camera_publisher import topic_names
+from openarm_sim_bridge.ros.faces import Face, OpenArmRos2Face, SuiteFace
 from openarm_sim_bridge.ros.fault_server import FaultServer
-from openarm_sim_bridge.ros.gripper_server import GripperServer
-from openarm_sim_bridge.ros.sensor_publisher import SensorPublisher
 from openarm_sim_bridge.ros.simulation_server import SimulationServer
 from openarm_sim_bridge.ros.state_publisher import StatePublisher, until_shutdown
-from openarm_sim_bridge.ros.trajectory_server import TrajectoryServer
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.world.stage import Stage
-from openarm_sim_bridge.world.world import JointReadout, Snapshot
+from openarm_sim_bridge.world.world import Snapshot
 
 WATCH_PERIOD_S = 0.2
 #: The simulation begins after this long at the latest, images or not, s.
@@ -56,8 +50,6 @@ LARGE_PROFILE = "OPENARM_LARGE_MESSAGES_PROFILE"
 REPORT_PERIOD_S = 1.0
 #: Slower than this share of the requested speed is reported as a fault.
 _SLOW = 0.9
-#: So many unknown joints of commands are named in the log.
-_NAMED = 20
 #: Joint states that are further apart than this (p99, ms) are reported as a fault.
 _LATE_MS = 15.0
 
@@ -74,34 +66,32 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         config = self.config
         cameras = load_cameras(Path(config.cameras) if config.cameras else None)
         scene = load_scene(config.scene, config.seed)
-        stage = Stage(self.description, cameras, config.mount_seed if config.mount_seed >= 0 else None, config.physics)
-        robot = SimulatedRobot.on(stage, scene, config.trajectory, config.gripper)
-        world, controller = robot.world, robot.controller
-        self._controller = controller
-        self._simulation = Simulation(robot, self._observe, speed=config.speed, crashed=self._on_crash)
+        mount_seed = config.mount_seed if config.mount_seed >= 0 else None
+        self._stage = stage = Stage(self.description, cameras, mount_seed, config.physics, config.hardware)
+        upstream = config.controllers == "openarm_ros2"
+        world = stage.world(scene, each_step=upstream)
+        self._face: Face = OpenArmRos2Face(self, stage, world) if upstream else SuiteFace(self, config, stage, world)
+        self._simulation = Simulation(
+            SimulatedRobot(world, self._face.controller),
+            self._observe,
+            speed=config.speed,
+            wall_stamps=self._face.wall_stamps,
+            crashed=self._on_crash,
+        )
         self._simulation.set_paused(config.paused)
 
         self._states = StatePublisher(
-            self, self.description, world.joint_names, config.tf_rate, config.ground_truth_rate
+            self,
+            self.description,
+            world.joint_names,
+            config.tf_rate,
+            config.ground_truth_rate,
+            clock=not self._face.wall_stamps,
         )
-        self._sensors = SensorPublisher(self)
         self._images = self._camera_feed(cameras, world.snapshot()) if config.images else None
         self._real_time_factor = self.create_publisher(Float64, "/sim/real_time_factor", reliable(5))
 
-        self.create_subscription(JointState, "/joint_commands", self._on_command, QOS_COMMAND)
-        self._holds = HoldListener(self)
-        self._arms = [
-            TrajectoryServer(self, side, arm, self._simulation, partial(self._holds.check, side))
-            for side, arm in controller.arms.items()
-        ]
-        self._grippers = [
-            GripperServer(
-                self, side, gripper, self._simulation, partial(self._holds.check, side), config.gripper_action
-            )
-            for side, gripper in controller.grippers.items()
-        ]
-        self.create_service(Trigger, "/stop", self._on_stop)
-        self.create_service(Trigger, "~/reset", self._on_reset)
+        self._face.serve(self._simulation)
         self._sim_services = SimulationServer(self, stage, scene, self._simulation)
 
         self._faults = FaultServer(
@@ -109,8 +99,6 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         )
 
         self._scheduling = ""
-        self._warned: set[str] = set()
-        self._commands = 0
         self._drawn = dict.fromkeys(cameras, 0)
         self.create_timer(REPORT_PERIOD_S, self._report, clock=self.steady_clock)
 
@@ -134,55 +122,17 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._simulation.stop()
         if self._images is not None:
             self._images.close()
-        for server in (*self._arms, *self._grippers):
-            server.destroy()
+        self._face.close()
         super().close()
 
     def _observe(self, state: JointReadout) -> None:
         """End of a tick, in the thread of the simulation."""
         with until_shutdown(self.context):
             joints = self._simulation.faults.publishes_joints(state.t_ns)
-            self._states.publish(state, self._simulation.world, joints=joints)
-            self._sensors.publish(self._simulation.world)
+            published = self._face.publish(state, self._simulation.world)
+            self._states.publish(published, self._simulation.world, joints=joints)
             if self._images is not None:
                 self._images.tick(self._simulation.world)
-
-    def _on_command(self, message: JointState) -> None:
-        """Follow position targets of some or all joints."""
-        self._commands += 1
-        logger = self.get_logger()
-        try:
-            self._simulation.check_able()
-            command = self._controller.check_command(message.name, message.position)
-            for side in self._controller.sides(command):
-                self._holds.check(side)
-        except OpenArmError as error:
-            logger.error(f"/joint_commands refused: {error}", throttle_duration_sec=1.0)
-            return
-        for name in sorted(set(command.unknown) - self._warned)[: _NAMED - len(self._warned)]:
-            self._warned.add(name)
-            known = ", ".join(self._simulation.world.joint_names)
-            logger.warning(f"/joint_commands: unknown joint {brief(name)} is ignored; joints: {known}")
-        busy = self._controller.busy(command)
-        if busy:
-            names = ", ".join(busy)
-            logger.warning(f"/joint_commands: {names} follow a goal; ignored until it ends", throttle_duration_sec=1.0)
-        self._simulation.call(lambda: self._controller.command(command))
-
-    async def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Emergency stop; the answer says that the joints hold."""
-        await self.awaitable(self._simulation.call(self._simulation.stop_motion))
-        response.success, response.message = True, "arms and hands hold; release them with /mujoco_bridge/reset"
-        self.get_logger().error(f"emergency stop: {response.message}")
-        return response
-
-    async def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Release the emergency stop."""
-        stopped = self._simulation.stopped
-        self._simulation.stopped = False
-        response.success, response.message = True, "the emergency stop is released" if stopped else "it was not latched"
-        self.get_logger().warning(response.message)
-        return response
 
     def _camera_feed(self, cameras: Mapping[str, CameraConfig], first: Snapshot) -> CameraFeed:
         topics = [name for camera in cameras.values() for name in topic_names(camera)]
@@ -229,8 +179,9 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         slow = not simulation.paused and config.speed > 0.0 and period.n > 100 and factor < _SLOW * config.speed
         if not fault and slow:
             fault = f"slower than requested: {factor:.2f} simulated seconds per second, expected {config.speed:g}"
-        commands, self._commands = self._commands, 0
+        values = self._face.values()
         if not fault and not simulation.paused and period.n > 100 and period.p99_ms > _LATE_MS:
+            commands = values.get("commands_per_s", 0)
             fault = (
                 f"late: one of a hundred joint states is {period.p99_ms:.0f} ms or more behind the one before, expected"
                 f" {_LATE_MS:.0f} at most; is the machine busy, or are {commands} commands a second too many?"
@@ -243,8 +194,8 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             joint_state_period_p99_ms=f"{period.p99_ms:.2f}",
             joint_state_period_max_ms=f"{period.max_ms:.2f}",
             scheduling=self._scheduling,
-            commands_per_s=commands,
-            refused_of_held_arms=self._holds.refused,
+            profile=config.profile,
+            **values,
             wall_time_skipped_s=f"{simulation.skipped_s:.2f}",
             faults_active=" ".join(self._faults.active),
             frames_dropped=images.dropped if images is not None else 0,

@@ -15,7 +15,7 @@ from openarm_common.robot.description import SIDES
 from openarm_common.ros.convert import ns_to_stamp, vector
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_common.types import Array
-from openarm_sim_bridge.pacing import RateDivider
+from openarm_control.pacing import RateDivider
 from openarm_sim_bridge.world.touch import hand_link, pad_links
 from openarm_sim_bridge.world.world import World
 

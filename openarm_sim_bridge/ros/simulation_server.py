@@ -21,6 +21,9 @@ from openarm_common.ros.convert import pose_to_matrix, xyz
 from openarm_common.ros.node import BaseNode
 from openarm_common.scene.scene import Scene, load_scene
 from openarm_common.types import Array
+from openarm_control.controller import PositionCommand
+from openarm_control.joints import arm_groups, gripper_groups
+from openarm_control.trajectory import limits_of
 from openarm_sim_bridge.ros.state_publisher import WORLD_FRAME
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.world.stage import Stage, with_object, without_object
@@ -85,6 +88,7 @@ class SimulationServer:
     ) -> None:
         self._node = node
         self._stage = stage
+        self._limits = limits_of(*arm_groups(node.description).values(), *gripper_groups(node.description).values())
         self._loaded = self._present = scene
         self._simulation = simulation
         self._changing = threading.Lock()
@@ -118,7 +122,7 @@ class SimulationServer:
         """Return joint positions and object poses of a request that differ from the start of the scene."""
         keyframe = request.keyframe
         joints = self._stage.posture(keyframe) if keyframe not in ("", "home") else dict[str, float]()
-        command = self._simulation.controller.check_command(request.joint_names, request.joint_positions)
+        command = PositionCommand.checked(request.joint_names, request.joint_positions, self._limits)
         if command.unknown:
             known = ", ".join(self._stage.joint_names)
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no joint {command.unknown[0]!r}; joints: {known}")

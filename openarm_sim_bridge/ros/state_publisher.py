@@ -23,9 +23,10 @@ from tf2_msgs.msg import TFMessage
 from openarm_common.robot.description import BASE_LINK, SIDES, RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, matrix_to_transform, ns_to_stamp, vector
 from openarm_common.ros.node import QOS_CLOCK, QOS_LATCHED, QOS_TF, reliable
-from openarm_sim_bridge.pacing import RateDivider
+from openarm_control.joints import JointReadout
+from openarm_control.pacing import RateDivider
 from openarm_sim_bridge.world.edges import MovingEdges
-from openarm_sim_bridge.world.world import JointReadout, ObjectReadout, World
+from openarm_sim_bridge.world.world import ObjectReadout, World
 
 WORLD_FRAME = "world"
 #: Longest period of joint states, paused or not: a subscriber that requests this deadline is notified of any gap.
@@ -51,6 +52,7 @@ class StatePublisher:
         joint_names: Order of the joint states.
         tf_rate: Of /tf, Hz.
         ground_truth_rate: Of the objects, Hz.
+        clock: Whether there is /clock.
     """
 
     def __init__(
@@ -60,8 +62,10 @@ class StatePublisher:
         joint_names: Sequence[str],
         tf_rate: float,
         ground_truth_rate: float,
+        *,
+        clock: bool = True,
     ) -> None:
-        self._clock = node.create_publisher(Clock, "/clock", QOS_CLOCK)
+        self._clock = node.create_publisher(Clock, "/clock", QOS_CLOCK) if clock else None
         qos = reliable(10)
         qos.deadline = JOINT_STATE_DEADLINE
         self._joint_states = node.create_publisher(JointState, "/joint_states", qos)
@@ -107,8 +111,9 @@ class StatePublisher:
             self._newest_ns = state.t_ns
             self._published_ns += world.period_ns
         stamp = ns_to_stamp(state.t_ns)
-        self._clock_message.clock = stamp
-        self._clock.publish(self._clock_message)
+        if self._clock is not None:
+            self._clock_message.clock = stamp
+            self._clock.publish(self._clock_message)
         self._joint_message.header.stamp = stamp
         self._position[:] = state.position
         self._velocity[:] = state.velocity

@@ -24,25 +24,24 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES, RobotDescription, Side
 from openarm_common.scene.scene import Scene
 from openarm_sim_bridge.world import scenery
+from openarm_sim_bridge.world.hardware import IDEAL, MOTOR_RANGE, Hardware, drawn
 from openarm_sim_bridge.world.touch import add_hand_sensors, hand_link
 from openarm_sim_bridge.world.world import compiled_model
 
-Positive = Annotated[float, Field(gt=0.0)]
-Seven = tuple[Positive, Positive, Positive, Positive, Positive, Positive, Positive]
 Friction = tuple[Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)]]
 
 #: Specular and shininess of the materials that are not matt.
 _GLOSS = {"silver": (0.45, 0.45), "steel": (0.35, 0.4), "finger_grey": (0.3, 0.4)}
 _MATT = (0.12, 0.15)
 _COLLISION_GROUP, _VISUAL_GROUP = 3, 2
+_NEARLY_NONE = 1e-9
 
 
 class PhysicsConfig(Config):
-    """Solver, contact and actuator settings with which grasps hold by friction alone.
+    """Solver, contact and finger settings with which grasps hold by friction alone.
 
-    Joint damping and dry friction come from the URDF, force limits of the arm from its efforts. `impratio` and a few
-    no-slip iterations keep a held object from creeping. The finger force is `finger_kp` times the remaining travel, up
-    to `finger_force`.
+    `impratio` and a few no-slip iterations keep a held object from creeping. The finger force is `finger_kp` times the
+    remaining travel, up to `finger_force`. The motors of the arms are `HardwareConfig`.
     """
 
     timestep: float = Field(
@@ -69,16 +68,10 @@ class PhysicsConfig(Config):
         default=(0.8, 0.005, 0.0001), description="objects, table: sliding, torsional, rolling"
     )
     object_condim: Literal[1, 3, 4, 6] = Field(default=4, description="contact dimensions of objects")
-    arm_kp: Seven = Field(default=(230, 230, 190, 190, 100, 100, 100), description="N m/rad, joints 1 to 7")
-    arm_kv: Seven = Field(default=(2.7, 2.7, 2.2, 2.2, 1.5, 1.5, 1.5), description="N m s/rad")
-    arm_armature: Seven = Field(default=(0.0081, 0.0081, 0.16, 0.16, 0.01, 0.01, 0.01), description="kg m2")
     finger_kp: float = Field(default=2000.0, gt=0.0, description="N/m")
     finger_kv: float = Field(default=40.0, ge=0.0, description="N s/m")
     finger_force: float = Field(default=30.0, gt=0.0, description="N; each pad presses with half of it")
     finger_armature: float = Field(default=0.05, ge=0.0, description="kg")
-    gravity_compensation: float = Field(
-        default=1.0, ge=0.0, le=1.0, description="share of the arms' weight that is compensated"
-    )
 
 
 def build_spec(
@@ -134,21 +127,36 @@ def compile_model(
     return compiled_model(build_spec(description, scene, cameras, mount_seed, physics))
 
 
-def robot_spec(description: RobotDescription, physics: PhysicsConfig) -> mujoco.MjSpec:
+def robot_spec(
+    description: RobotDescription, physics: PhysicsConfig, hardware: Hardware | None = None
+) -> mujoco.MjSpec:
     """Make the model of the robot alone, with actuators and contact settings.
+
+    Joint damping, and dry friction where the hardware has none of its own, come from the URDF, force limits of the arms
+    from its efforts.
+
+    Args:
+        description: The robot.
+        physics: Solver, contacts, fingers.
+        hardware: Motors and masses of the arms; None is the ideal ones.
 
     Raises:
         OpenArmError: CONFIG_INVALID, when MuJoCo does not read the URDF.
     """
+    hardware = hardware or drawn(IDEAL, description)
     spec = _import_urdf(description)
     _set_options(spec, physics)
     _sort_geoms(spec, description)
     for side in SIDES:
-        _actuate_arm(spec, description, side, physics)
+        _actuate_arm(spec, description, side, hardware)
         _actuate_gripper(spec, description, side, physics)
     for body in spec.bodies:
-        if body.name.startswith(tuple(f"openarm_{side}_" for side in SIDES)):
-            body.gravcomp = physics.gravity_compensation
+        if body.name in hardware.mass:
+            # MuJoCo looks at no body's compensation where all are 0 at first; faults change it later
+            body.gravcomp = max(hardware.gravity_compensation, _NEARLY_NONE)
+            body.mass *= hardware.mass[body.name]
+            body.inertia = np.asarray(body.inertia) * hardware.mass[body.name]
+            body.fullinertia = np.asarray(body.fullinertia) * hardware.mass[body.name]  # NaN where it is not in use
     for pair in sorted(sorted(pair) for pair in description.allowed_collisions):
         spec.add_exclude(name=" ".join(pair), bodyname1=pair[0], bodyname2=pair[1])
     return spec
@@ -199,16 +207,36 @@ def _sort_geoms(spec: mujoco.MjSpec, description: RobotDescription) -> None:
             geom.mass = 0.0  # masses are those of the URDF
 
 
-def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: Side, physics: PhysicsConfig) -> None:
-    for i, name in enumerate(description.arm_joints(side)):
-        effort = description.joints[name].effort
+def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: Side, hardware: Hardware) -> None:
+    for name in description.arm_joints(side):
         joint = spec.joint(name)
-        joint.armature = physics.arm_armature[i]
+        joint.armature = hardware.armature[name]
+        joint.damping = np.asarray(joint.damping) * hardware.gearbox[name]
+        joint.frictionloss = hardware.friction.get(name, joint.frictionloss)
         joint.actfrclimited = False  # one limit is enough: the actuator's
-        _add_servo(spec, description, name, physics.arm_kp[i], physics.arm_kv[i], effort)
+        actuator = _add_servo(
+            spec, name, hardware.stiffness[name], hardware.damping[name], description.joints[name].effort
+        )
+        actuator.ctrlrange = (-MOTOR_RANGE, MOTOR_RANGE)
     add_hand_sensors(spec, hand_link(side))
+    if hardware.tool_stiffness > 0.0:
+        _mount_softly(spec.body(hand_link(side)), hardware.tool_stiffness)
     tcp = description.tcp_link(side)
     spec.body(tcp).add_site(name=tcp, size=(0.004, 0.004, 0.004), group=4)
+
+
+def _mount_softly(hand: mujoco.MjsBody, stiffness: float) -> None:
+    """Let the hand bend on the wrist about its x and y axes, with half of the critical damping."""
+    inertia = 5e-3  # of the hand with an object, about the wrist, kg m2
+    for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)):
+        hand.add_joint(
+            name=f"{hand.name}_flexure_{'xy'[int(axis[1])]}",
+            type=mujoco.mjtJoint.mjJNT_HINGE,
+            axis=axis,
+            stiffness=stiffness,
+            damping=math.sqrt(stiffness * inertia),
+            armature=inertia,
+        )
 
 
 def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: Side, physics: PhysicsConfig) -> None:
@@ -225,7 +253,8 @@ def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: S
         pad.condim = physics.pad_condim
         pad.solref = physics.contact_solref
         pad.solimp = physics.contact_solimp
-    _add_servo(spec, description, leader, physics.finger_kp, physics.finger_kv, physics.finger_force)
+    servo = _add_servo(spec, leader, physics.finger_kp, physics.finger_kv, physics.finger_force)
+    servo.ctrlrange = (description.joints[leader].lower, description.joints[leader].upper)
     # The importer couples mimic joints too, but softly: the fingers would drift apart under load.
     for equality in list(spec.equalities):
         if follower in (equality.name1, equality.name2):
@@ -245,13 +274,10 @@ def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: S
     coupling.data = polynomial
 
 
-def _add_servo(
-    spec: mujoco.MjSpec, description: RobotDescription, name: str, kp: float, kv: float, force: float
-) -> None:
-    """Add a position actuator named like its joint, with the range of the joint."""
-    joint = description.joints[name]
+def _add_servo(spec: mujoco.MjSpec, name: str, kp: float, kv: float, force: float) -> mujoco.MjsActuator:
+    """Add a position actuator named like its joint."""
     actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     actuator.set_to_position(kp=kp, kv=kv)
-    actuator.ctrlrange = (joint.lower, joint.upper)
     if math.isfinite(force):
         actuator.forcerange = (-force, force)
+    return actuator

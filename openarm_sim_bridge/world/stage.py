@@ -3,19 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
 import mujoco
-import numpy as np
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import SIDES, RobotDescription, Side
+from openarm_common.robot.servos import ServoModel
 from openarm_common.scene.scene import Scene, SceneObject, parse_object
-from openarm_sim_bridge.control.trajectory import JointGroup
+from openarm_control.joints import arm_loads, joint_names
+from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig, drawn
 from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, robot_spec
-from openarm_sim_bridge.world.world import CompiledWorld, World
+from openarm_sim_bridge.world.world import PERIOD_NS, CompiledWorld, World
 
 
 class Stage:
@@ -25,7 +27,8 @@ class Stage:
         description: The robot.
         cameras: By name.
         mount_seed: Of the camera mounts' errors; None is the nominal mounts.
-        physics: Solver, contacts, actuators.
+        physics: Solver, contacts, fingers.
+        hardware: Motors of the arms, and how they differ from the description; None is ideal ones.
     """
 
     def __init__(
@@ -34,34 +37,50 @@ class Stage:
         cameras: Mapping[str, CameraConfig],
         mount_seed: int | None,
         physics: PhysicsConfig,
+        hardware: HardwareConfig | None = None,
     ) -> None:
-        self._description = description
+        self.description = description
         self._cameras = cameras
         self._mount_seed = mount_seed
         self._physics = physics
-        self._robot = robot_spec(description, physics)
-        self.joint_names = tuple(
-            name for side in SIDES for name in (*description.arm_joints(side), description.finger_joint(side))
-        )
+        self._hardware = hardware or IDEAL
+        made = drawn(self._hardware, description)
+        self._robot = robot_spec(description, physics, made)
+        self.joint_names = joint_names(description)
+        self.encoders = made.encoders(description, self.joint_names)
         self.home: dict[str, float] = {}
         for side in SIDES:
             self.home |= description.group_state(f"{side}_arm", "home") | {description.finger_joint(side): 0.0}
 
-    def arms(self) -> dict[str, JointGroup]:
-        """Return the joint group of each arm, by side."""
-        return {side: self._group(self._description.arm_joints(side)) for side in SIDES}
+    @cached_property
+    def servos(self) -> dict[Side, ServoModel]:
+        """What the profile says of the servos by side, as a client knows it that has not identified them."""
+        return {side: self._hardware.model(load) for side, load in arm_loads(self.description).items()}
 
-    def grippers(self) -> dict[str, JointGroup]:
-        """Return the joint group (the driving finger joint) of each gripper, by side."""
-        return {side: self._group((self._description.finger_joint(side),)) for side in SIDES}
-
-    def world(self, scene: Scene) -> World:
+    def world(
+        self, scene: Scene, add: Callable[[mujoco.MjSpec], None] = lambda _: None, *, each_step: bool = False
+    ) -> World:
         """Make a world with the robot in its home posture, grippers closed.
+
+        Args:
+            scene: Table and objects.
+            add: Adds what is no part of a scene.
+            each_step: A control tick is one physics step, else 10 ms.
 
         Raises:
             OpenArmError: CONFIG_INVALID, when the model can't be built.
         """
-        return World(self._spec(scene), joint_names=self.joint_names, home=self.home, objects=scene.objects)
+        spec = self._spec(scene)
+        add(spec)
+        period = round(spec.option.timestep * 1e9) if each_step else PERIOD_NS
+        return World(
+            spec,
+            joint_names=self.joint_names,
+            home=self.home,
+            objects=scene.objects,
+            period_ns=period,
+            encoders=self.encoders,
+        )
 
     def compile(self, world: World, scene: Scene) -> CompiledWorld:
         """Compile another scene for `World.exchange` or `World.extend`; slow, changes nothing.
@@ -77,7 +96,7 @@ class Stage:
         Raises:
             OpenArmError: INVALID_ARGUMENT, naming the keyframes there are.
         """
-        states = self._description.semantics.states
+        states = self.description.semantics.states
         groups = [f"{side}_arm" for side in SIDES]
         known = sorted({name for group, name in states if group in groups})
         if keyframe not in known:
@@ -86,12 +105,7 @@ class Stage:
         return self.home | {joint: position for state in found for joint, position in state.items()}
 
     def _spec(self, scene: Scene) -> mujoco.MjSpec:
-        return build_spec(self._description, scene, self._cameras, self._mount_seed, self._physics, robot=self._robot)
-
-    def _group(self, names: tuple[str, ...]) -> JointGroup:
-        lower, upper = self._description.limits(names)
-        speeds = np.array([self._description.joint(name).velocity for name in names])
-        return JointGroup(names, lower, upper, speeds)  # those of the motors, far above what a plan should use
+        return build_spec(self.description, scene, self._cameras, self._mount_seed, self._physics, robot=self._robot)
 
 
 def without_object(scene: Scene, name: str) -> Scene:

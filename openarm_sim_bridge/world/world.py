@@ -12,6 +12,7 @@ address is looked up by name, never assumed.
 
 from __future__ import annotations
 
+from bisect import insort
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,11 +25,15 @@ from numpy.typing import NDArray
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.scene.scene import SceneObject
-from openarm_common.types import Array
+from openarm_common.types import Array, Ints
+from openarm_control.joints import JointReadout
+from openarm_sim_bridge.world.hardware import Encoders
 from openarm_sim_bridge.world.touch import contact_wrench, imu, wrist_wrench
 
 Index = NDArray[np.intp]
 
+#: Length of a control tick, ns.
+PERIOD_NS = 10_000_000
 _DIVERGED = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -51,16 +56,6 @@ class CompiledWorld:
     effort_limit: Array  # (n,) N m or N, infinite where there is none
     start_qpos: Array  # (nq,) home posture, objects at their start
     objects: Mapping[str, SceneObject]  # by their names, which their free joints have too
-
-
-@dataclass(frozen=True)
-class JointReadout:
-    """State of the actuated joints at `t_ns`, arrays (n,)."""
-
-    t_ns: int
-    position: Array
-    velocity: Array
-    effort: Array
 
 
 @dataclass(frozen=True)
@@ -92,6 +87,7 @@ class World:
             equality couples to another follow it.
         objects: Free bodies to report, by the names of their free joints.
         period_ns: Length of a control tick.
+        encoders: What commands and joint states go through; None is the truth.
 
     Raises:
         OpenArmError: CONFIG_INVALID, as `compile`.
@@ -104,12 +100,18 @@ class World:
         joint_names: Sequence[str],
         home: Mapping[str, float],
         objects: Sequence[SceneObject] = (),
-        period_ns: int = 10_000_000,
+        period_ns: int = PERIOD_NS,
+        encoders: Encoders | None = None,
     ) -> None:
         self.joint_names = tuple(joint_names)
         self.period_ns = period_ns
         self.t_ns = 0
         self._home = dict(home)
+        self._encoders = encoders or Encoders.exact(len(self.joint_names))
+        delays: Ints = np.round(1e9 * self._encoders.latency_s).astype(np.int64)
+        self._latencies = [(int(ns), np.flatnonzero(delays == ns)) for ns in np.unique(delays)]
+        #: Targets that have not taken effect yet: when they do, of which joints, and what.
+        self._late: list[tuple[int, Index, Array]] = []
         self._use(self.compile(spec, objects))
         self.reset()
 
@@ -130,8 +132,11 @@ class World:
         Raises:
             OpenArmError: INTERNAL, when the physics diverged; the world must be reset then.
         """
-        mujoco.mj_step(self.model, self.data, nstep=steps)
-        self.t_ns += steps * self._compiled.timestep_ns
+        end_ns = self.t_ns + steps * self._compiled.timestep_ns
+        while self._late and self._late[0][0] < end_ns:
+            self._advance(self._late[0][0])
+            self._take_due(self.t_ns)
+        self._advance(end_ns)
         for warning in _DIVERGED:
             status = self.data.warning[warning]
             if status.number:
@@ -140,10 +145,33 @@ class World:
                     Code.INTERNAL, f"the physics diverged at {self.t_ns * 1e-9:.3f} s: {text} Reset the world."
                 )
 
+    def shift_time(self, ns: int) -> None:
+        """Let simulated time go on at another time, as that of a robot whose stamps are of the wall clock."""
+        self.t_ns += ns
+        self._late = [(due_ns + ns, joints, targets) for due_ns, joints, targets in self._late]
+
+    def _take_due(self, t_ns: int) -> None:
+        while self._late and self._late[0][0] <= t_ns:
+            _, joints, targets = self._late.pop(0)
+            self.data.ctrl[self._compiled.actuator[joints]] = targets
+
+    def _advance(self, t_ns: int) -> None:
+        steps = (t_ns - self.t_ns) // self._compiled.timestep_ns
+        if steps > 0:
+            mujoco.mj_step(self.model, self.data, nstep=steps)
+            self.t_ns += steps * self._compiled.timestep_ns
+
     # --- commands
     def set_targets(self, targets: Array) -> None:
-        """Set the position targets (n,) of all actuated joints; the actuators clamp them to their ranges."""
-        self.data.ctrl[self._compiled.actuator] = targets
+        """Set the position targets (n,) of all actuated joints; they take effect when the latency is over.
+
+        The actuators clamp them to their ranges.
+        """
+        true = _stepped(targets, self._encoders.position) - self._encoders.zero
+        for latency_ns, joints in self._latencies:
+            due_ns = self.t_ns + round(latency_ns / self.timestep_ns) * self.timestep_ns
+            insort(self._late, (due_ns, joints, true[joints]), key=_due)
+        self._take_due(self.t_ns)
 
     def set_effort_limits(self, limits: Array) -> None:
         """Limit the effort (n,) of the actuators, N m or N; the limit of the model is never exceeded."""
@@ -153,16 +181,14 @@ class World:
 
     # --- readings
     def read_joints(self) -> JointReadout:
-        """Return the positions, velocities and actuator efforts of the actuated joints."""
-        c, d = self._compiled, self.data
-        return JointReadout(self.t_ns, d.qpos[c.qpos], d.qvel[c.dof], d.actuator_force[c.actuator])
-
-    def target_lead_s(self) -> Array:
-        """Return the time (n,) by which each joint lags behind a moving target: damping over stiffness, s."""
-        c, m = self._compiled, self.model
-        kp = m.actuator_gainprm[c.actuator, 0]
-        damping = m.dof_damping[c.dof] - m.actuator_biasprm[c.actuator, 2]
-        return np.divide(damping, kp, out=np.zeros_like(kp), where=kp > 0.0)
+        """Return the positions, velocities and actuator efforts of the actuated joints, as their encoders have them."""
+        c, d, e = self._compiled, self.data, self._encoders
+        return JointReadout(
+            self.t_ns,
+            _stepped(d.qpos[c.qpos] + e.zero, e.position),
+            _stepped(d.qvel[c.dof], e.velocity),
+            _stepped(d.actuator_force[c.actuator], e.effort),
+        )
 
     def effort_limits(self) -> Array:
         """Return the effort limits (n,) of the actuators in the model, N m or N; infinite where there is none."""
@@ -348,6 +374,7 @@ class World:
 
     def _place(self, qpos: Array, qvel: Array, ctrl: Array) -> None:
         """Write a whole state; the only place where `qpos` is written: a running world moves by forces alone."""
+        self._late.clear()
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = qpos
         self.data.qvel[:] = qvel
@@ -369,6 +396,15 @@ class World:
         except OpenArmError:
             self._compiled, self.model, self.data = before
             raise
+
+
+def _due(late: tuple[int, Index, Array]) -> int:
+    return late[0]
+
+
+def _stepped(values: Array, steps: Array) -> Array:
+    """Round to whole steps; a step of 0 keeps the value."""
+    return np.where(steps > 0.0, np.round(values / np.where(steps > 0.0, steps, 1.0)) * steps, values)
 
 
 def compiled_model(spec: mujoco.MjSpec) -> mujoco.MjModel:

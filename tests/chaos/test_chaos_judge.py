@@ -60,6 +60,8 @@ def test_speed_is_measured_over_a_tenth_of_a_second() -> None:
     noisy = [(k * 10_000_000, {"joint4": 0.001 * (k % 2)}) for k in range(60)]
     assert unasked_speed(noisy)[0] < 0.05
     assert unasked_speed([(9_000_000_000, {"joint4": 1.0}), *noisy])[0] == 0.0
+    ended = [(t_ns + 60_000_000_000, positions) for t_ns, positions in moving]  # the bridge was killed as it moved
+    assert unasked_speed([*ended, *noisy], len(ended), 100_000_000)[0] < 0.05
 
 
 def test_an_answer_must_say_what_is_so() -> None:

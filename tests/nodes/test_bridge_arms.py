@@ -161,7 +161,7 @@ def test_position_commands_may_be_partial_and_unknown_names_are_ignored(bench) -
         10.0,
         "the joints to arrive",
     )
-    assert bench.node._warned == {"tail"}
+    assert bench.node._face._controllers._warned == {"tail"}
     velocities = [m.velocity[m.name.index("openarm_right_joint4")] for m in bench.joints]
     assert max(velocities) < 1.2 * bench.node.config.trajectory.command_velocity  # no jump
     assert bench.position("openarm_right_joint1") == pytest.approx(bench.HOME[0], abs=0.01)
@@ -183,18 +183,20 @@ def test_a_held_arm_and_its_hand_follow_their_holder_alone(bench) -> None:
     commands = bench.ros.node.create_publisher(JointState, "/joint_commands", QOS_COMMAND)
     bench.ros.spin_until(commands.get_subscription_count, 20.0, "the bridge")
 
+    holds = bench.node._face._controllers.holds._holds
+
     def ask(arm: str, goal_id: UUID | None = None) -> tuple[int, str]:
         holder.hold(arm)
-        bench.ros.spin_until(lambda: bench.node._holds._holds.key_of(arm, time.monotonic()), 20.0, "the hold")
+        bench.ros.spin_until(lambda: holds.key_of(arm, time.monotonic()), 20.0, "the hold")
         result = bench.ros.result(bench.follow(bench.goal((1.0, bench.NEAR_HOME)), goal_uuid=goal_id)[1], 20.0).result
         return result.error_code, result.error_string
 
     code, text = ask("right")
     assert code == Result.INVALID_GOAL
     assert text.startswith("BUSY: the right arm is held by the grasp node (a grasp of 'red')")
-    before, refused = bench.arm.copy(), bench.node._holds.refused
+    before, refused = bench.arm.copy(), bench.node._face._controllers.holds.refused
     commands.publish(JointState(name=[bench.ARM[3], bench.FINGER], position=[1.5, 0.02]))
-    bench.ros.spin_until(lambda: bench.node._holds.refused > refused, 20.0, "the command")
+    bench.ros.spin_until(lambda: bench.node._face._controllers.holds.refused > refused, 20.0, "the command")
     assert bench.grip(0.02).status == GoalStatus.STATUS_ABORTED
     bench.spin_sim(0.3)
     np.testing.assert_allclose(bench.arm, before, atol=0.005)
@@ -202,5 +204,5 @@ def test_a_held_arm_and_its_hand_follow_their_holder_alone(bench) -> None:
 
     assert ask("right", holder.goal_id())[0] == Result.SUCCESSFUL
     holder.release()
-    bench.ros.spin_until(lambda: not bench.node._holds._holds.key_of("right", time.monotonic()), 20.0, "the release")
+    bench.ros.spin_until(lambda: not holds.key_of("right", time.monotonic()), 20.0, "the release")
     assert bench.grip(0.02).status == GoalStatus.STATUS_SUCCEEDED

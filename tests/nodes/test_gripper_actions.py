@@ -59,6 +59,25 @@ def test_the_grasp_node_speaks_the_type_that_the_bridge_serves(bridge, action: s
 
 
 def test_a_wrong_type_is_refused_by_name(ros) -> None:
-    with pytest.raises(OpenArmError, match=r"gripper_action.*'parallel' or 'classic'") as caught:
+    with pytest.raises(OpenArmError, match=r"gripper_action.*'parallel', 'classic' or 'trajectory'") as caught:
         GraspNode(parameter_overrides=[Parameter("gripper_action", value="suction")])
     assert caught.value.code is Code.CONFIG_INVALID
+
+
+@pytest.mark.requirement("R-03")
+def test_a_gripper_behind_a_trajectory_controller_is_asked_for_a_position(bridge) -> None:
+    """As openarm_ros2 has it: the goal succeeds when its time is over, joint states say where the fingers are."""
+    bench = bridge(images=False, controllers="openarm_ros2")
+    ros, name = bench.ros, "/{arm}_gripper_controller/follow_joint_trajectory"
+    grasp = ros.add(
+        GraspNode(
+            parameter_overrides=[Parameter("gripper_action", value="trajectory"), Parameter("gripper", value=name)]
+        )
+    )
+
+    async def grip() -> bool:
+        await grasp._robot._nodes.begin(list)
+        return await grasp._robot.grip("right", bench.FINGER, 0.03, "open")
+
+    assert ros.result(ros.executor.create_task(grip), 20.0)
+    ros.spin_until(lambda: abs(bench.position(bench.FINGER) - 0.03) < 0.001, 20.0, "a joint state of it")

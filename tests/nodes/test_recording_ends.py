@@ -12,7 +12,8 @@ import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from sensor_msgs.msg import Image
 from openarm_bringup.bags.bag import open_bag
 from openarm_bringup.supervision.environment import PROFILE, write_profile
 from openarm_bringup.supervision.graph import NodeSpec
-from openarm_common.domain import release_domain, reserve_domain
+from openarm_bringup.supervision.shm import SHM, names_of
 from openarm_common.ros.convert import array_to_image
 from openarm_common.ros.node import QOS_COMMAND
 from tests.nodes import streams
@@ -76,16 +77,49 @@ def test_what_was_recorded_can_be_read(
         assert all(len(record.data) > noise.nbytes for record in bag.records())
 
 
+HEAR = """
+import rclpy
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node("hears")
+node.create_subscription(String, "words", lambda _: print(flush=True), 10)
+rclpy.spin(node)
+"""
+SAY = """
+import rclpy
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node("says")
+words = node.create_publisher(String, "words", 10)
+node.create_timer(0.01, lambda: words.publish(String()))
+rclpy.spin(node)
+"""
+
+
 @pytest.fixture
-def fresh_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A domain in which no process was killed: Fast DDS would go on with the port that it left, whatever its size."""
-    domain = reserve_domain()
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-    yield
-    release_domain(domain)
+def killed_subscribers(ros) -> None:
+    """Two that were killed, and whose publisher, before it was killed too, had opened their ports for 512 messages."""
+    domain = int(os.environ["ROS_DOMAIN_ID"])
+    with ExitStack() as stack:
+        processes: list[subprocess.Popen[bytes]] = []
+        for program in (HEAR, HEAR, SAY):
+            process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
+            processes.append(stack.enter_context(process))
+            stack.callback(process.kill)
+        *hear, _ = processes
+        for process in hear:
+            assert process.stdout is not None
+            assert process.stdout.readline(), "a word was heard"
+        for process in hear:
+            process.kill()
+
+        def opened_again() -> int:
+            return sum(not (SHM / f"{name}_el").exists() for name in names_of(domain))
+
+        ros.spin_until(lambda: opened_again() == 2, 60.0, "the publisher has opened their ports again")
 
 
-@pytest.mark.usefixtures("fresh_domain")
+@pytest.mark.usefixtures("killed_subscribers")
 def test_what_comes_while_the_recorder_is_held_up_is_not_lost(tmp_path: Path) -> None:
     """As on a busy machine: a second of a graph, twice what Fast DDS keeps for a process by itself."""
     command = [sys.executable, "-m", "openarm_bringup.cli", "record", "bag", "--topics", "/stream_.*", "--json"]

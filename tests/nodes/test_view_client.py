@@ -205,7 +205,7 @@ def test_no_request_ends_the_client(ros, looking: Looking) -> None:
         return response
 
     ros.node.create_service(ResetWorld, "/sim/reset_world", answered)
-    for name in ("/stop", "/mujoco_bridge/reset"):
+    for name in ("/stop", "~/reset"):
         ros.node.create_service(Trigger, name, answered)
     ros.node.create_service(CancelGoal, "/grasp/pick/_action/cancel_goal", lambda _, response: response)
     view = looking.view

@@ -20,6 +20,7 @@ from openarm_bringup.supervision.shm import (
     sweep,
     unborn,
     with_larger_segments,
+    without_reader,
 )
 
 
@@ -57,6 +58,14 @@ def test_ports_of_a_domain(tmp_path: Path) -> None:
         make(tmp_path, f"fastrtps_port{port}", lock=False)
     assert names_of(0, tmp_path) == {"fastrtps_port7400", "fastrtps_port7649"}
     assert names_of(67, tmp_path) == {"fastrtps_port24161"}
+
+
+def test_ports_that_no_process_reads_are_those_of_discovery_and_of_messages(tmp_path: Path) -> None:
+    for name in ("fastrtps_port7400", "fastrtps_port7411", "fastrtps_port7413", "fastrtps_port7415"):
+        make(tmp_path, name, lock=not name.endswith("3"))
+    with (tmp_path / "fastrtps_port7415_el").open("rb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert sorted(without_reader(0, tmp_path)) == [7410, 7411, 7412, 7413]
 
 
 def test_the_distance_field_of_a_killed_map_goes_and_that_of_a_living_one_stays(tmp_path: Path) -> None:

@@ -199,7 +199,8 @@ def test_names_and_limits_are_equal_in_table_urdf_mujoco_and_pinocchio(
             assert (joint.effort, joint.velocity) == row[4:]
             assert pin_model.upperEffortLimit[index] == row[4]
             assert tuple(model.actuator(name).forcerange) == (-row[4], row[4])
-            assert tuple(model.actuator(name).ctrlrange) == (low, high)
+            # targets of soft servos are beyond where joints can be; controllers refuse goals that are
+            assert tuple(model.actuator(name).ctrlrange) == (-12.5, 12.5)
         for number in (1, 2):
             finger = description.joint(f"openarm_{side}_finger_joint{number}")
             assert (finger.lower, finger.upper, finger.effort, finger.velocity) == (0.0, 0.044, 333.0, 10.0)

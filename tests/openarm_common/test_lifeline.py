@@ -10,7 +10,7 @@ import uuid
 
 import pytest
 
-from openarm_common.lifeline import Lifeline, watch
+from openarm_common.lifeline import Lifeline, lives, watch
 
 CHILD = "import sys; from openarm_common.lifeline import Lifeline; l = Lifeline(sys.argv[1]); print(); sys.stdin.read()"
 
@@ -30,7 +30,9 @@ def test_it_ends_when_the_process_is_killed() -> None:
 def test_it_ends_when_it_is_closed_and_is_known_only_meanwhile() -> None:
     name, ended = uuid.uuid4().hex, threading.Event()
     assert not watch(name, ended.set)
+    assert not lives(name)
     line = Lifeline(name)
+    assert lives(name)
     assert watch(name, ended.set)
     line.close()
     assert ended.wait(20.0)

@@ -163,6 +163,19 @@ def trials(task, tmp_path, **kwargs) -> trial.Trials:
     return trial.Trials(task, SimulatedSenses(depth_noise=False), GraspConfig(), folder=tmp_path, **kwargs)
 
 
+@pytest.mark.requirement("R-01")
+def test_heavy_soft_late_arms_with_wrong_zeros_are_identified_and_place_an_object(tmp_path) -> None:
+    options = CampaignOptions(seeds=(0,), noise=True, profile="openarm", dynamics_seeds=(41,))
+    (row,) = run_campaign(options, tmp_path).rows
+    assert (row["outcome"], row["attempts"]) == ("placed", 1)
+    assert row["place_error_mm"] < 6.0
+    assert sorted(path.name for path in (tmp_path / "servos" / "41" / "servos").glob("*.yaml")) == [
+        "left.yaml",
+        "right.yaml",
+    ]
+    assert "--profile openarm --dynamics-seeds 41" in row["again"]
+
+
 @pytest.mark.requirement("B-01", "B-70", "R-18")
 def test_two_objects_are_placed_one_after_the_other_without_a_reset(tmp_path) -> None:
     """Asked for by shape, and by colour and shape; each is judged as the object that the words mean."""

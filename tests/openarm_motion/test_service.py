@@ -12,6 +12,7 @@ import pytest
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.robot_state import RobotStateBuffer
+from openarm_control.trajectory import JointSpline
 from openarm_motion.collision.exact import CollisionScene
 from openarm_motion.collision.solids import Sphere
 from openarm_motion.config import MotionConfig
@@ -30,7 +31,6 @@ from openarm_motion.service.requests import (
 )
 from openarm_motion.service.robot import Outcome
 from openarm_motion.timing.trajectory import Motion
-from openarm_sim_bridge.control.trajectory import JointSpline
 
 TICK_NS = 10_000_000
 

@@ -18,6 +18,7 @@ from openarm_common.camera.cameras import CameraConfig, load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import SIDES, RobotDescription
 from openarm_common.scene.scene import Scene, load_scene
+from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig, drawn
 from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, compile_model, robot_spec
 
 GEOM, BODY = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY
@@ -206,7 +207,8 @@ def test_gravity_is_carried_and_without_compensation_the_arm_sags(
         return float(np.linalg.norm(data.site_xpos[tcp] - start))
 
     assert drop(model) < 2e-4
-    assert drop(compile_model(description, demo, cameras, None, PhysicsConfig(gravity_compensation=0.0))) > 3e-3
+    heavy = robot_spec(description, PhysicsConfig(), drawn(HardwareConfig(), description))
+    assert drop(build_spec(description, demo, cameras, robot=heavy).compile()) > 3e-2
 
 
 def test_objects_rest_where_the_scene_puts_them(
@@ -339,14 +341,14 @@ def test_physics_settings_arrive_in_the_model(description: RobotDescription) -> 
     for side in SIDES:
         for i, name in enumerate(description.arm_joints(side)):
             actuator, joint = default.actuator(name), default.joint(name)
-            assert actuator.gainprm[0] == PhysicsConfig().arm_kp[i]
-            assert actuator.biasprm[2] == -PhysicsConfig().arm_kv[i]
+            assert actuator.gainprm[0] == IDEAL.stiffness[i]
+            assert actuator.biasprm[2] == -IDEAL.damping[i]
             assert default.dof_damping[joint.dofadr[0]] == float(dynamics[name].damping)
             assert default.dof_frictionloss[joint.dofadr[0]] == float(dynamics[name].friction)
-            assert default.dof_armature[joint.dofadr[0]] == PhysicsConfig().arm_armature[i]
+            assert default.dof_armature[joint.dofadr[0]] == IDEAL.armature[i]
 
 
-@pytest.mark.parametrize("wrong", [{"timestep": 0.0}, {"cone": "round"}, {"arm_kp": (1.0,) * 6}, {"stiffness": 1.0}])
+@pytest.mark.parametrize("wrong", [{"timestep": 0.0}, {"cone": "round"}, {"stiffness": 1.0}])
 def test_impossible_physics_is_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(ValidationError):
         PhysicsConfig.model_validate(wrong)

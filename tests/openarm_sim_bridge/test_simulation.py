@@ -14,13 +14,16 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.control.arm import End, TrajectoryConfig, TrajectoryOutcome
-from openarm_sim_bridge.control.controller import RobotController
-from openarm_sim_bridge.control.gripper import GripperConfig
-from openarm_sim_bridge.control.trajectory import JointGroup, Trajectory
+from openarm_common.robot.servos import ServoModel
+from openarm_control.arm import End, TrajectoryConfig, TrajectoryOutcome
+from openarm_control.carrier import Carrier
+from openarm_control.controller import RobotController
+from openarm_control.gripper import GripperConfig
+from openarm_control.joints import JointReadout
+from openarm_control.trajectory import JointGroup, Trajectory
 from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.simulation import Simulation
-from openarm_sim_bridge.world.world import JointReadout, World
+from openarm_sim_bridge.world.world import World
 
 MODEL = """
 <mujoco><compiler angle="radian"/><option timestep="0.002" gravity="0 0 0" integrator="implicitfast"/><worldbody>
@@ -36,7 +39,16 @@ GRIPPER = JointGroup(("f1",), np.array([0.0]), np.array([0.044]), np.array([1.0]
 
 def make_controller() -> tuple[World, RobotController]:
     world = World(mujoco.MjSpec.from_string(MODEL), joint_names=("j1", "f1"), home={"f1": 0.01})
-    return world, RobotController({"right": ARM}, {"right": GRIPPER}, world, TrajectoryConfig(), GripperConfig())
+    return world, controllers_of(world, TrajectoryConfig(), GripperConfig())
+
+
+def controllers_of(world: World, config: TrajectoryConfig, gripper: GripperConfig) -> RobotController:
+    servos = ServoModel(np.array([200.0]), np.array([4.0]), np.zeros(1), np.zeros(1), np.zeros(1))
+    carriers = {"right": Carrier(servos, config.carrier)}
+    state, effort = world.read_joints(), {"right": 30.0}
+    return RobotController(
+        {"right": ARM}, {"right": GRIPPER}, world.joint_names, state, effort, config, gripper, carriers
+    )
 
 
 class Bench:
@@ -162,7 +174,7 @@ def test_a_diverged_world_stands_until_it_is_reset(
     bench.simulation.call(lambda: None).result(10.0)  # the tick has ended
     assert outcomes[0].end is End.ABORTED
     assert "diverged" in outcomes[0].text
-    with pytest.raises(OpenArmError, match=r"until the world is reset.*diverged") as caught:
+    with pytest.raises(OpenArmError, match=r"no command is taken: the physics diverged.*Reset the world") as caught:
         bench.simulation.check_able()
     assert caught.value.code is Code.NOT_READY
     (dump,) = tmp_path.glob("openarm_diverged_*.npz")
@@ -249,7 +261,7 @@ def test_stale_commands_hold() -> None:
     """Commands that cease leave the arm at rest soon after half a second, short of its target; a stream arrives."""
     world = World(mujoco.MjSpec.from_string(MODEL), joint_names=("j1", "f1"), home={"f1": 0.01})
     config = TrajectoryConfig(command_velocity=0.5)
-    controller = RobotController({"right": ARM}, {"right": GRIPPER}, world, config, GripperConfig(velocity=0.02))
+    controller = controllers_of(world, config, GripperConfig(velocity=0.02))
 
     def run(seconds: float, again: bool) -> list[float]:
         out: list[float] = []

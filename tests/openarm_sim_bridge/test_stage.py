@@ -15,11 +15,12 @@ from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene, SceneObject, load_scene
+from openarm_control.arm import TrajectoryConfig, TrajectoryOutcome
+from openarm_control.carrier import CarrierConfig
+from openarm_control.gripper import GripperGoal, GripperOutcome
+from openarm_control.trajectory import Trajectory, TrajectoryResult
 from openarm_sim_bridge.config import BridgeConfig
-from openarm_sim_bridge.control.arm import TrajectoryConfig, TrajectoryOutcome
-from openarm_sim_bridge.control.controller import RobotController
-from openarm_sim_bridge.control.gripper import GripperConfig, GripperGoal, GripperOutcome
-from openarm_sim_bridge.control.trajectory import Trajectory, TrajectoryResult
+from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.edges import MovingEdges
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage, with_object
@@ -46,11 +47,11 @@ def test_sixteen_joints_start_at_home_and_stay_there(stage: Stage, demo: Scene) 
     assert [o.object.name for o in world.objects()] == [o.name for o in demo.objects]
 
 
-@pytest.mark.parametrize("feed_forward", [True, False])
-def test_an_arm_tracks_a_brisk_motion_within_its_tolerance(stage: Stage, demo: Scene, feed_forward: bool) -> None:
+@pytest.mark.parametrize("lag", [True, False])
+def test_an_arm_tracks_a_brisk_motion_within_its_tolerance(stage: Stage, demo: Scene, lag: bool) -> None:
     world = stage.world(demo)
-    config = TrajectoryConfig(feed_forward=feed_forward, path_tolerance=0.2)
-    controller = RobotController(stage.arms(), stage.grippers(), world, config, GripperConfig())
+    config = TrajectoryConfig(carrier=CarrierConfig(lag=lag), path_tolerance=0.2)
+    controller = SimulatedRobot.controllers(stage, world, config)
     arm, columns = controller.arms["right"], slice(8, 15)
     start = world.read_joints().position[columns]
     # A quintic of 0.9 s from rest to rest that peaks near 2 rad/s.
@@ -65,7 +66,7 @@ def test_an_arm_tracks_a_brisk_motion_within_its_tolerance(stage: Stage, demo: S
         if arm.busy and arm.state is not None:
             worst = max(worst, float(np.abs(arm.state.desired - arm.state.actual).max()))
     assert outcomes[0].result is TrajectoryResult.SUCCESSFUL, outcomes[0].text
-    assert worst < (0.03 if feed_forward else 0.08)
+    assert worst < (0.03 if lag else 0.08)
     np.testing.assert_allclose(world.read_joints().position[columns], end, atol=0.005)
 
 
@@ -74,9 +75,7 @@ class Hand:
 
     def __init__(self, stage: Stage, scene: Scene) -> None:
         self.world = stage.world(scene)
-        self.controller = RobotController(
-            stage.arms(), stage.grippers(), self.world, TrajectoryConfig(), GripperConfig()
-        )
+        self.controller = SimulatedRobot.controllers(stage, self.world, TrajectoryConfig())
         self.description = RobotDescription.load()
         self.arm = self.controller.arms["right"]
         self.q = self.world.read_joints().position[8:15]

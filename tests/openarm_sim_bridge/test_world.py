@@ -141,10 +141,6 @@ def test_effort_is_what_the_actuator_pushes() -> None:
     assert abs(world.read_joints().effort[2]) <= 30.0 + 1e-9  # never more than the model allows
 
 
-def test_lead_is_all_damping_over_stiffness() -> None:
-    np.testing.assert_allclose(make().target_lead_s(), [4.0 / 200, 2.5 / 100, 40.0 / 2000])
-
-
 def test_coupled_joint_starts_with_its_leader() -> None:
     world = make()
     assert world.data.joint("mimic").qpos[0] == pytest.approx(0.02)

@@ -20,6 +20,8 @@ from openarm_bringup.bags.bag import BagWriter, Message, Topic, check_room
 from openarm_bringup.bags.ros.listener import Listener
 from openarm_bringup.supervision.discovery import PROFILE
 from openarm_bringup.supervision.environment import profiled
+from openarm_bringup.supervision.ports import held
+from openarm_bringup.supervision.shm import without_reader
 from openarm_common.errors import OpenArmError
 from openarm_common.resources import config_dir
 from openarm_common.ros.client import ContextNode
@@ -71,7 +73,8 @@ class Recorder(ContextNode):
         self, domain: int, path: Path, patterns: tuple[str, ...], custom: Mapping[str, str], image_rate: float = 0.0
     ) -> None:
         profile = os.environ.get(PROFILE) or config_dir() / "fastdds_recorder.xml"  # a user's own comes first
-        with profiled(Path(profile)):
+        # What a publisher has opened in place of a process that was killed holds 512 messages, whoever reads it next.
+        with profiled(Path(profile)), held(without_reader(domain)):
             super().__init__("openarm_recorder", domain=domain)
         # Only the writing thread touches the bag: topics reach it through the queue as messages do.
         self._queue: queue.SimpleQueue[Topic | Message | None] = queue.SimpleQueue()

@@ -24,13 +24,13 @@ from openarm_bringup.bags.definitions import full_definition
 from openarm_bringup.messages import interface
 from openarm_bringup.view.guard import LOOPBACK, Guard
 from openarm_bringup.view.proxy import Proxy, hidden_address
-from openarm_bringup.view.ros.layers import Polled, Source
 from openarm_bringup.view.viz import TOKEN_VARIABLE
 from openarm_common.config import Config
 from openarm_common.errors import OpenArmError
 from openarm_common.ros.client import BackgroundNode
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.node import BaseNode, offered_qos, run
+from openarm_common.ros.polled import Polled, Source
 
 _ENCODING, _SCHEMA = "cdr", "ros2msg"
 

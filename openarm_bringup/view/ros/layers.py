@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -44,70 +44,14 @@ from openarm_common.ros.convert import (
     transform_to_matrix,
     xyz,
 )
-from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, QOS_NEWEST, QOS_STATIC_TF
+from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, QOS_STATIC_TF
+from openarm_common.ros.polled import Polled, Source
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
 #: A key (the newest payload of each is kept for a page) and what goes to the page.
 Items = Iterator[tuple[str, str | bytes]]
 #: A node that was silent for so long is shown so, s.
 _SILENT_S = 4.0
-
-
-class Source(NamedTuple):
-    """A topic.
-
-    Attributes:
-        kind: Type of the messages.
-        topic: Absolute name.
-        qos: Quality of service.
-        silence: It is a fault when nothing has come for longer than this, s; 0: it may be silent.
-    """
-
-    kind: Any
-    topic: str
-    qos: QoSProfile = QOS_NEWEST
-    silence: float = 0.0
-
-
-class Polled:
-    """A subscription that is polled; its node is not spun.
-
-    Args:
-        node: Owns it.
-        source: What is subscribed to.
-    """
-
-    def __init__(self, node: Node, source: Source) -> None:
-        self._node, self._source = node, source
-        # The callback is never called.
-        self._subscription: Any = node.create_subscription(source.kind, source.topic, lambda _: None, source.qos)
-        self._received_at = time.monotonic()
-
-    def take(self) -> list[Any]:
-        """All messages that wait."""
-        taken: list[Any] = []
-        handle, kind = self._subscription.handle, self._subscription.msg_type
-        with handle:
-            while (one := handle.take_message(kind, False)) is not None:
-                taken.append(one[0])
-        if taken:
-            self._received_at = time.monotonic()
-        return taken
-
-    def newest(self) -> Any | None:
-        """The newest message that waits, or None when nothing has come."""
-        taken = self.take()
-        return taken[-1] if taken else None
-
-    @property
-    def fault(self) -> str:
-        """Says so when the source has been silent for too long, else empty."""
-        silent, limit = time.monotonic() - self._received_at, self._source.silence
-        return f"nothing on {self._source.topic} for {silent:.0f} s" if limit and silent > limit else ""
-
-    def close(self) -> None:
-        """Unsubscribe."""
-        self._node.destroy_subscription(self._subscription)
 
 
 #: Given the messages that have come from each source since the last time, yields what is new.

@@ -12,8 +12,8 @@ from typing import Any
 from action_msgs.srv import CancelGoal
 from openarm_interfaces.action import Pick
 from openarm_interfaces.srv import ConfirmPlan, ResetWorld
-from std_srvs.srv import Trigger
 
+from openarm_bringup.ros.stop_client import latch, release
 from openarm_bringup.view.ros.layers import Layer, makers
 from openarm_bringup.view.server import Confirmation, Item, Order, Reset
 from openarm_common.camera.cameras import load_cameras
@@ -116,7 +116,7 @@ class GraphView(ContextNode):
         Raises:
             OpenArmError: NOT_READY, when no node offers it; TIMEOUT.
         """
-        return _said(self._urgent.call(Trigger, "/stop", Trigger.Request(), _URGENT_S))
+        return latch(self._urgent)
 
     def release(self) -> tuple[bool, str]:
         """Release the emergency stop.
@@ -124,7 +124,7 @@ class GraphView(ContextNode):
         Raises:
             OpenArmError: NOT_READY, when no node offers it; TIMEOUT.
         """
-        return _said(self._urgent.call(Trigger, "/mujoco_bridge/reset", Trigger.Request(), _URGENT_S))
+        return release(self._urgent)
 
     def reset(self, order: Reset) -> tuple[bool, str]:
         """Put the simulation back to its start.

@@ -17,6 +17,7 @@ from openarm_bringup.supervision.graph import load_graph
 from openarm_bringup.supervision.session import running_graph, work_until_stopped
 from openarm_common.domain import reserve_domain
 from openarm_common.errors import Code, OpenArmError
+from openarm_evaluation.campaign.dynamics import with_servos
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.record import write_reason
 from openarm_evaluation.campaign.tasks.suites import make_task
@@ -48,11 +49,13 @@ def rows_of_graph(options: CampaignOptions, seeds: Sequence[int], folder: Path, 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for what only the campaign in one process can do; whatever ends the graph.
     """
-    if options.set_name not in GRAPH_SETS or len(options.mount_seeds) > 1 or options.workers != 1:
+    several = len(options.mount_seeds) > 1 or (options.profile != "ideal" and len(options.dynamics_seeds) != 1)
+    if options.set_name not in GRAPH_SETS or several or options.workers != 1:
         raise OpenArmError(
             Code.INVALID_ARGUMENT,
             f"a campaign through the graph runs the sets {', '.join(GRAPH_SETS)} with one worker and at most one mount"
-            f" seed; asked for {options.set_name!r}, {options.workers} workers, mount seeds {options.mount_seeds}",
+            f" seed and one dynamics seed; asked for {options.set_name!r}, {options.workers} workers, mount seeds"
+            f" {options.mount_seeds}, dynamics seeds {options.dynamics_seeds}",
         )
     if seeds:
         asyncio.run(_run(options, seeds, folder, keep))
@@ -62,7 +65,8 @@ async def _run(options: CampaignOptions, seeds: Sequence[int], folder: Path, kee
     overrides: dict[str, Any] = {"domain": reserve_domain(), "scene": "random", "seed": seeds[0]}
     if options.mount_seeds:
         overrides["mount_seed"] = options.mount_seeds[0]
-    graph = load_graph("sim", overrides=overrides, sets=options.graph_parameters())
+    name = "sim" if options.controllers == "suite" else "openarm_ros2_sim"
+    graph = load_graph(name, overrides=overrides, sets=(*options.graph_parameters(), *_robot(options, folder)))
     for name in ("logs", "params", "scenes"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     async with running_graph(graph, folder) as supervisor:
@@ -81,6 +85,20 @@ async def _run(options: CampaignOptions, seeds: Sequence[int], folder: Path, kee
                     keep(row)
 
             await work_until_stopped(supervisor, work, client.cancel)
+
+
+def _robot(options: CampaignOptions, folder: Path) -> tuple[str, ...]:
+    """Return the parameters of the robot of the dynamics seed, whose servos are identified first."""
+    if options.profile == "ideal":
+        return ()
+    servos = folder / "servos"
+    task, _ = with_servos(make_task(options.set_name, options.seeds[0]), options, servos)
+    seed = task.dynamics_seed
+    known = (servos / str(seed)).absolute()
+    carrying = (f"mujoco_bridge.calibrations={known}",)
+    if options.controllers != "suite":
+        carrying = (f"arm_control.calibrations={known}", f"arm_control.dynamics_seed={seed}")
+    return (f"mujoco_bridge.openarm.dynamics_seed={seed}", f"mujoco_bridge.openarm.zero_seed={seed}", *carrying)
 
 
 def keep_recording(client: GraspClient, row: Row, folder: Path, timeout: float = _WRITTEN_S) -> None:

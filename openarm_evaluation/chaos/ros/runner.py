@@ -325,7 +325,7 @@ class _Work:
 
     def _watch_rest(self, answered: float) -> list[Violation]:
         """Watch the arms for a while in which nobody asks for anything."""
-        truth = self._observer.truth()
+        truth, seen = self._observer.truth(), len(self._observer.joints())
         begin = (truth.t_ns if truth else 0) + int(_SETTLE_S * 1e9)
 
         def watched() -> bool:
@@ -334,7 +334,7 @@ class _Work:
 
         with suppress(OpenArmError):
             self._observer.wait(watched, _WALL_S, "simulated time")
-        speed, joint = judge.unasked_speed([(t, states) for t, states in self._observer.joints() if t >= begin])
+        speed, joint = judge.unasked_speed(self._observer.joints(), seen, begin)
         if speed > judge.REST_SPEED:
             return [Violation("no arm moves without a request", f"{joint} at {speed:.2f} rad/s after the answer")]
         return []

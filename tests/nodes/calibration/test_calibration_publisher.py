@@ -10,11 +10,11 @@ from sensor_msgs.msg import CameraInfo
 from tf2_msgs.msg import TFMessage
 
 from openarm_calibration.ros.publisher import PublisherNode
-from openarm_calibration.store.records import default_folder
 from openarm_calibration.store.store import CalibrationStore, StoredCalibration
 from openarm_common import se3
 from openarm_common.camera.cameras import Intrinsics, load_cameras, true_mount
 from openarm_common.errors import OpenArmError
+from openarm_common.records import default_folder
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import intrinsics_from_info, transform_to_matrix

@@ -15,12 +15,12 @@ from tf2_msgs.msg import TFMessage
 from openarm_bringup.commands.calibrate_live import table
 from openarm_bringup.outcome import Outcome
 from openarm_calibration.ros.publisher import PublisherNode
-from openarm_calibration.store.records import default_folder
 from openarm_calibration.store.store import CalibrationStore, StoredCalibration
 from openarm_calibration.store.table import TABLE, TableStore
 from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.errors import Code
+from openarm_common.records import default_folder
 from openarm_common.ros.node import BASE_FRAME, QOS_STATIC_TF
 from openarm_common.ros.tf import table_height
 from openarm_perception.ros.detector_node import DetectNode

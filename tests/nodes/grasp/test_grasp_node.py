@@ -12,8 +12,12 @@ from openarm_interfaces.action import Pick
 from openarm_interfaces.srv import Grasp
 from rclpy.parameter import Parameter
 from rclpy.task import Future
+from tf2_msgs.msg import TFMessage
 
+from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.convert import matrix_to_transform
+from openarm_common.ros.node import QOS_LATCHED
 from openarm_grasp.ros.node import GraspNode
 from tests.nodes.grasp.conftest import FakeGraph
 
@@ -164,6 +168,18 @@ def test_a_dry_run_moves_nothing(bench):
 
 
 @pytest.mark.requirement("P-01", "P-21")
+@pytest.mark.requirement("B-63")
+def test_an_object_is_put_down_on_the_table_as_it_was_measured(bench):
+    edge = matrix_to_transform("world", "table", se3.make(None, (0.0, 0.0, 0.415)), 0)
+    bench.world.create_publisher(TFMessage, "/tf_static", QOS_LATCHED).publish(TFMessage(transforms=[edge]))
+    bench.until(lambda: bench.node._session.context.table.top_z == pytest.approx(0.415), 20.0, "another table")
+    for position in bench.world.objects.values():
+        position[2] += 0.015
+    answer = bench.ask(dry_run=True)
+    assert answer.success, answer.message
+    assert answer.place_position.z == pytest.approx(0.415, abs=1e-3)
+
+
 def test_a_cancel_stops_the_arm_and_keeps_the_hand_closed(bench):
     never = Future()
     bench.world.during = lambda what: never if bench.world.held else None

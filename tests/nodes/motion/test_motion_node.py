@@ -13,6 +13,7 @@ from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, Plan
 from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox
 from openarm_interfaces.srv import ComputeIK
 from rclpy.parameter import Parameter
+from unique_identifier_msgs.msg import UUID
 
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
@@ -291,6 +292,13 @@ def test_a_search_ends_with_the_node(bench) -> None:
     begin = time.monotonic()
     bench.node.close()
     assert time.monotonic() - begin < 1.0
+
+
+def test_the_controller_sees_whose_goal_it_is_before_the_hold_is_announced(bench) -> None:
+    """It may have heard the announcement that the motion node has not: goals and topics keep no common order."""
+    mine = UUID(uuid=list(range(16)))
+    assert bench.run(bench.move_client, bench.named("right", "home"), goal_uuid=mine).success
+    assert bench.robot.goal_ids[-1][:8] == bytes(range(8))
 
 
 @pytest.mark.requirement("P-21")

@@ -60,6 +60,15 @@ class JointGroup:
     max_velocity: Array
 
 
+def limits_of(*groups: JointGroup) -> dict[str, tuple[float, float]]:
+    """Return the lower and upper limit of each joint of groups."""
+    return {
+        name: (float(lower), float(upper))
+        for group in groups
+        for name, lower, upper in zip(group.names, group.lower, group.upper, strict=True)
+    }
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Points to pass, and how closely: tolerances by joint, rad or m; 0 is the controller's default, below 0 no bound.

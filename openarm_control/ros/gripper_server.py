@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from control_msgs.action import GripperCommand, ParallelGripperCommand
 from rclpy.action import GoalResponse
@@ -19,12 +19,10 @@ from sensor_msgs.msg import JointState
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.node import BaseNode
-from openarm_sim_bridge.control.arm import End
-from openarm_sim_bridge.control.gripper import GripperFollower, GripperGoal, GripperOutcome
-from openarm_sim_bridge.ros.controller_server import ControllerServer
-from openarm_sim_bridge.simulation import Simulation
-
-GripperAction = Literal["parallel", "classic"]
+from openarm_control.arm import End
+from openarm_control.gripper import GripperAction, GripperFollower, GripperGoal, GripperOutcome
+from openarm_control.loop import ControlLoop
+from openarm_control.ros.controller_server import ControllerServer
 
 
 @dataclass(frozen=True)
@@ -41,9 +39,10 @@ class GripperServer(ControllerServer[GripperOutcome]):
 
     Args:
         node: Owner.
+        prefix: Of its name.
         side: left or right.
         gripper: Its controller.
-        simulation: Whose thread runs the controller.
+        loop: Whose thread runs the controller.
         check: Refuses a goal, by its id, while another client holds the arm.
         action: parallel (ParallelGripperCommand) or classic (GripperCommand).
     """
@@ -51,22 +50,22 @@ class GripperServer(ControllerServer[GripperOutcome]):
     def __init__(
         self,
         node: BaseNode[Any],
+        prefix: str,
         side: str,
         gripper: GripperFollower,
-        simulation: Simulation,
+        loop: ControlLoop,
         check: Callable[[bytes], None],
         action: GripperAction,
     ) -> None:
         self._gripper = gripper
         self._type = _TYPES[action]
         self._joint = gripper.group.names[0]
-        self._column = simulation.world.joint_names.index(self._joint)
-        name = f"/{side}_gripper_controller/gripper_cmd"
-        super().__init__(node, simulation, check, f"{side} gripper", self._type.action, name, gripper.cancel)
+        name = f"{prefix}/{side}_gripper_controller/gripper_cmd"
+        super().__init__(node, loop, check, f"{side} gripper", self._type.action, name, gripper.cancel)
 
     def _on_goal(self, request: Any) -> GoalResponse:
         try:
-            self._simulation.check_able()
+            self._loop.check_able()
             self._gripper.check(self._type.goal_of(request, self._joint))
         except OpenArmError as error:
             self._node.get_logger().error(f"{self._label} goal rejected: {error}")
@@ -84,9 +83,9 @@ class GripperServer(ControllerServer[GripperOutcome]):
         return self._type.result_of(outcome, self._joint)
 
     def _start(self, goal: GripperGoal, done: Callable[[GripperOutcome], None]) -> None:
-        self._simulation.check_able()
-        state = self._simulation.world.read_joints()
-        self._gripper.start(goal, float(state.position[self._column]), float(state.effort[self._column]), done)
+        self._loop.check_able()
+        state = self._loop.read_joints(self._gripper.group)
+        self._gripper.start(goal, float(state.position[0]), float(state.effort[0]), done)
 
 
 def _parallel_goal(request: ParallelGripperCommand.Goal, joint: str) -> GripperGoal:

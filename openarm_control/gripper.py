@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,8 +19,14 @@ from pydantic import Field
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_sim_bridge.control.follower import End, Follower, Tracker
-from openarm_sim_bridge.control.trajectory import LIMIT_SLACK, JointGroup
+from openarm_control.follower import End, Follower, Tracker
+from openarm_control.trajectory import LIMIT_SLACK, JointGroup
+
+#: Type of the action of a gripper: ParallelGripperCommand, or the older GripperCommand.
+GripperAction = Literal["parallel", "classic"]
+
+#: Fingers that are this much further open than commanded press on something, m.
+_PRESSING = 0.002
 
 
 class GripperConfig(Config):
@@ -79,6 +86,8 @@ class GripperFollower(Follower):
         self._still_ns = 0
         self._arrived_ns: int | None = None
         self._max_effort = max_effort
+        #: Whether the fingers are closed on something: they stay open further than commanded.
+        self.pressing = False
         #: Effort that the actuator may use, N.
         self.effort_limit = max_effort
 
@@ -109,6 +118,10 @@ class GripperFollower(Follower):
         """See `Follower.reset`; the effort limit is the gripper's again."""
         super().reset(position)
         self.effort_limit = self._max_effort
+
+    def begin(self, targets: Array) -> None:
+        """See `Follower.begin`: what is held stays held."""
+        self._hold(targets)
 
     def abort(self, why: str) -> None:
         """See `Follower.abort`."""
@@ -143,6 +156,7 @@ class GripperFollower(Follower):
 
     def update(self, t_ns: int, dt_ns: int, position: Array, velocity: Array, effort: Array) -> Array:
         """See `Follower.update`."""
+        self.pressing = float(position[0] - self._command.position[0]) > _PRESSING
         if self._done is not None:
             self._judge(t_ns, dt_ns, float(position[0]), float(velocity[0]), float(effort[0]))
         if self._command.position[0] != self._target[0]:

@@ -8,16 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import Side
 from openarm_common.types import Array, Ints
-from openarm_sim_bridge.control.arm import TrajectoryConfig, TrajectoryFollower
-from openarm_sim_bridge.control.follower import Follower
-from openarm_sim_bridge.control.gripper import GripperConfig, GripperFollower
-from openarm_sim_bridge.control.trajectory import LIMIT_SLACK, JointGroup
-from openarm_sim_bridge.world.world import JointReadout, World
+from openarm_control.arm import TrajectoryConfig, TrajectoryFollower
+from openarm_control.carrier import Carrier
+from openarm_control.follower import Follower
+from openarm_control.gripper import GripperConfig, GripperFollower
+from openarm_control.joints import JointReadout
+from openarm_control.trajectory import LIMIT_SLACK, JointGroup, limits_of
 
 
 @dataclass(frozen=True)
@@ -27,55 +30,11 @@ class PositionCommand:
     positions: Mapping[str, float]
     unknown: tuple[str, ...]
 
-
-class RobotController:
-    """Followers of all joint groups.
-
-    Args:
-        arms: Joint group of each arm by side.
-        grippers: Joint group (one finger joint) of each gripper by side.
-        world: Where the joints are; its joint order is that of the targets.
-        trajectory: How arms follow.
-        gripper: How grippers move.
-    """
-
-    def __init__(
-        self,
-        arms: Mapping[str, JointGroup],
-        grippers: Mapping[str, JointGroup],
-        world: World,
-        trajectory: TrajectoryConfig,
-        gripper: GripperConfig,
-    ) -> None:
-        self._names = world.joint_names
-        self._timeout_ns = round(trajectory.command_timeout * 1e9)
-        self._commanded_ns: dict[Follower, int] = {}
-        self._now_ns = world.t_ns
-        self._targets = world.read_joints().position
-        lead, limits = world.target_lead_s(), world.effort_limits()
-        at = {
-            group: np.array([self._names.index(name) for name in group.names])
-            for group in (*arms.values(), *grippers.values())
-        }
-        self.arms = {
-            side: TrajectoryFollower(group, trajectory, lead[at[group]], self._targets[at[group]])
-            for side, group in arms.items()
-        }
-        self.grippers = {
-            side: GripperFollower(group, gripper, self._targets[at[group]], float(limits[at[group]][0]))
-            for side, group in grippers.items()
-        }
-        self._followers: list[tuple[Follower, Ints]] = [
-            (follower, at[follower.group]) for follower in (*self.arms.values(), *self.grippers.values())
-        ]
-        self._limits = {
-            name: (float(lower), float(upper))
-            for group in (*arms.values(), *grippers.values())
-            for name, lower, upper in zip(group.names, group.lower, group.upper, strict=True)
-        }
-
-    def check_command(self, names: Sequence[str], positions: Sequence[float]) -> PositionCommand:
-        """Check a position command; names may be a part of the joints, in any order. May run in any thread.
+    @classmethod
+    def checked(
+        cls, names: Sequence[str], positions: Sequence[float], limits: Mapping[str, tuple[float, float]]
+    ) -> PositionCommand:
+        """Check positions against the limits of the joints that are known.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT or LIMITS for the whole command, naming joint and value.
@@ -87,9 +46,9 @@ class RobotController:
             )
         known: dict[str, float] = {}
         for name, position in zip(names, positions, strict=True):
-            if name not in self._limits:
+            if name not in limits:
                 continue
-            lower, upper = self._limits[name]
+            lower, upper = limits[name]
             if not np.isfinite(position):
                 raise OpenArmError(
                     Code.INVALID_ARGUMENT, f"commanded position of {name} is {position}, expected a finite number"
@@ -100,7 +59,89 @@ class RobotController:
                     f"commanded position of {name} is {position:.4f}, out of its limits {lower:.4f} to {upper:.4f}",
                 )
             known[name] = float(position)
-        return PositionCommand(known, tuple(name for name in names if name not in self._limits))
+        return cls(known, tuple(name for name in names if name not in limits))
+
+
+class JointController(Protocol):
+    """Makes the servo targets of all joints of a robot, one control tick at a time; in one thread."""
+
+    joint_names: tuple[str, ...]
+
+    def update(self, state: JointReadout, dt_ns: int) -> Array:
+        """Return the targets (n,) of a tick of `dt_ns` that begins at `state`; valid until the next call."""
+        ...
+
+    def effort_limits(self) -> Array:
+        """Return the effort limits (n,) of the joints, N m or N; infinite where there is none."""
+        ...
+
+    def reset(self, state: JointReadout) -> None:
+        """Hold where the robot is, because it was put elsewhere; goals that run are aborted."""
+        ...
+
+    def stop(self, why: str) -> None:
+        """Hold all joints at once."""
+        ...
+
+    def abort(self, why: str) -> None:
+        """Give up all goals."""
+        ...
+
+
+class RobotController(JointController):
+    """Followers of all joint groups.
+
+    Args:
+        arms: Joint group of each arm by side.
+        grippers: Joint group (one finger joint) of each gripper by side.
+        joint_names: Order of the joints, of states and of targets.
+        state: Where they are.
+        gripper_effort: Limit of each gripper, N, by side.
+        trajectory: How arms follow.
+        gripper: How grippers move.
+        carriers: Make servo targets of the command of each arm, by side.
+    """
+
+    def __init__(
+        self,
+        arms: Mapping[Side, JointGroup],
+        grippers: Mapping[Side, JointGroup],
+        joint_names: tuple[str, ...],
+        state: JointReadout,
+        gripper_effort: Mapping[Side, float],
+        trajectory: TrajectoryConfig,
+        gripper: GripperConfig,
+        carriers: Mapping[Side, Carrier],
+    ) -> None:
+        self.joint_names = joint_names
+        self._timeout_ns = round(trajectory.command_timeout * 1e9)
+        self._commanded_ns: dict[Follower, int] = {}
+        self._now_ns = state.t_ns
+        self._targets = state.position.copy()
+        at = {
+            group: np.array([joint_names.index(name) for name in group.names])
+            for group in (*arms.values(), *grippers.values())
+        }
+        self.arms = {
+            side: TrajectoryFollower(group, trajectory, carriers[side], self._targets[at[group]])
+            for side, group in arms.items()
+        }
+        self.grippers = {
+            side: GripperFollower(group, gripper, self._targets[at[group]], gripper_effort[side])
+            for side, group in grippers.items()
+        }
+        self._followers: list[tuple[Follower, Ints]] = [
+            (follower, at[follower.group]) for follower in (*self.arms.values(), *self.grippers.values())
+        ]
+        self._limits = limits_of(*arms.values(), *grippers.values())
+
+    def check_command(self, names: Sequence[str], positions: Sequence[float]) -> PositionCommand:
+        """Check a position command; names may be a part of the joints, in any order. May run in any thread.
+
+        Raises:
+            OpenArmError: As `PositionCommand.checked`.
+        """
+        return PositionCommand.checked(names, positions, self._limits)
 
     def sides(self, command: PositionCommand) -> tuple[str, ...]:
         """Return the sides whose arm or gripper a command moves."""
@@ -126,6 +167,12 @@ class RobotController:
         for follower, at in self._followers:
             follower.reset(state.position[at])
 
+    def begin(self, targets: Array) -> None:
+        """Begin where servos have targets (n,) already, NaN where they are not known; after `reset`."""
+        for follower, at in self._followers:
+            if not np.isnan(targets[at]).any():
+                follower.begin(targets[at])
+
     def stop(self, why: str) -> None:
         """Hold all joints at once; hands keep what they hold, goals that run are aborted."""
         self._commanded_ns.clear()
@@ -145,11 +192,18 @@ class RobotController:
             self._targets[at] = follower.update(
                 state.t_ns, dt_ns, state.position[at], state.velocity[at], state.effort[at]
             )
+        for side, gripper in self.grippers.items():
+            self.arms[side].carrier.hold(gripper.pressing)
         return self._targets
+
+    def carry_by(self, carriers: Mapping[Side, Carrier]) -> None:
+        """Let other carriers make the targets of the arms, because more is known of the servos."""
+        for side, carrier in carriers.items():
+            self.arms[side].carry_by(carrier)
 
     def effort_limits(self) -> Array:
         """Return the effort limits (n,) of the joints, N; infinite but for those of the grippers."""
-        limits = np.full(len(self._names), np.inf)
+        limits = np.full(len(self.joint_names), np.inf)
         for follower, at in self._followers:
             if isinstance(follower, GripperFollower):
                 limits[at] = follower.effort_limit

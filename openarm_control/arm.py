@@ -17,8 +17,9 @@ from pydantic import Field
 from openarm_common.config import Config
 from openarm_common.errors import Code
 from openarm_common.types import Array
-from openarm_sim_bridge.control.follower import End, Follower, Tracker
-from openarm_sim_bridge.control.trajectory import (
+from openarm_control.carrier import Carrier, CarrierConfig
+from openarm_control.follower import End, Follower, Tracker
+from openarm_control.trajectory import (
     JointGroup,
     JointSpline,
     Trajectory,
@@ -45,7 +46,7 @@ class TrajectoryConfig(Config):
     new_goal: Literal["replace", "refuse"] = Field(
         default="replace", description="what a goal does that comes while the arm follows another"
     )
-    feed_forward: bool = Field(default=True, description="lead moving targets by the lag of the actuators")
+    carrier: CarrierConfig = CarrierConfig()
     command_timeout: float = Field(
         default=0.5, gt=0.0, le=60.0, description="arm and gripper hold when no /joint_commands came for so long, s"
     )
@@ -66,13 +67,14 @@ class TrajectoryOutcome:
 
 @dataclass(frozen=True)
 class FollowerState:
-    """What a follower was doing at `t_ns`: desired and measured position and velocity (k,)."""
+    """What a follower was doing at `t_ns`: desired and measured position and velocity (k,), and the servos' targets."""
 
     t_ns: int
     desired: Array
     desired_velocity: Array
     actual: Array
     actual_velocity: Array
+    target: Array
 
 
 @dataclass
@@ -89,6 +91,7 @@ class _Goal:
     tau_s: float  # time along the trajectory, to which the command was last moved
     rate: float = 1.0  # of that time; falls to 0 when cancelled
     cancelled: bool = False
+    settled: bool = False  # what the carrier can work off at the end is worked off
 
 
 class TrajectoryFollower(Follower):
@@ -97,16 +100,16 @@ class TrajectoryFollower(Follower):
     Args:
         group: The joints.
         config: Tolerances and limits.
-        lead_s: (k,) lag of the actuators behind a moving target, s.
+        carrier: Makes servo targets of the command.
         position: (k,) where the command starts.
     """
 
-    def __init__(self, group: JointGroup, config: TrajectoryConfig, lead_s: ArrayLike, position: ArrayLike) -> None:
+    def __init__(self, group: JointGroup, config: TrajectoryConfig, carrier: Carrier, position: Array) -> None:
         k = len(group.names)
         command = Tracker(position, np.full(k, config.command_velocity), np.full(k, config.command_acceleration))
         super().__init__(group, command)
         self._config = config
-        self._lead_s = np.asarray(lead_s, dtype=np.float64) * (1.0 if config.feed_forward else 0.0)
+        self._carrier = carrier
         self._goal: _Goal | None = None
         self.state: FollowerState | None = None
 
@@ -119,7 +122,7 @@ class TrajectoryFollower(Follower):
         """Return the trajectory in the order of the joints.
 
         Raises:
-            TrajectoryError: As `openarm_sim_bridge.control.trajectory.checked`.
+            TrajectoryError: As `openarm_control.trajectory.checked`.
         """
         return checked(trajectory, self.group)
 
@@ -165,17 +168,39 @@ class TrajectoryFollower(Follower):
 
     def update(self, t_ns: int, dt_ns: int, position: Array, velocity: Array, effort: Array) -> Array:
         """See `Follower.update`."""
-        desired = self._command
-        self.state = FollowerState(t_ns, desired.position, desired.velocity, position, velocity)
+        desired, desired_velocity, dt = self._command.position, self._command.velocity, dt_ns * 1e-9
+        error = desired - position
         if self._goal is not None:
-            self._judge(self._goal, t_ns, position, velocity)
+            self._judge(self._goal, t_ns, dt, position, velocity)
         if self._goal is not None:
             self._advance(self._goal, t_ns, dt_ns)
         elif not np.array_equal(self._target, self._command.position):
-            self._command.step(self._target, dt_ns * 1e-9)
-        return self._command.position + self._lead_s * self._command.velocity
+            self._command.step(self._target, dt)
+        slip = desired_velocity - velocity
+        target = self._carrier.target(self._command.position, self._command.velocity, error, slip, dt)
+        self.state = FollowerState(t_ns, desired, desired_velocity, position, velocity, target)
+        return target
 
-    def _judge(self, goal: _Goal, t_ns: int, position: Array, velocity: Array) -> None:
+    @property
+    def carrier(self) -> Carrier:
+        """What makes the targets."""
+        return self._carrier
+
+    def carry_by(self, carrier: Carrier) -> None:
+        """Let another carrier make the targets, because more is known of the servos; for an arm at rest or moving."""
+        carrier.succeed(self._carrier)
+        self._carrier = carrier
+
+    def reset(self, position: ArrayLike) -> None:
+        """See `Follower.reset`."""
+        super().reset(position)
+        self._carrier.reset()
+
+    def begin(self, targets: Array) -> None:
+        """See `Follower.begin`."""
+        self._carrier.begin(targets - self._command.position)
+
+    def _judge(self, goal: _Goal, t_ns: int, dt: float, position: Array, velocity: Array) -> None:
         """End the goal if it is reached, or the arm is not where it should be."""
         tau = (t_ns - goal.start_ns) * 1e-9
         error = self._command.position - position
@@ -193,6 +218,8 @@ class TrajectoryFollower(Follower):
                     f"{names[j]} is {abs(error[j]):.3f} rad off its path at {tau:.2f} s of {goal.spline.end_s:.2f},"
                     f" tolerance {goal.path_tolerance[j]:.3f}; the arm holds where it is. Is something blocking it?",
                 )
+        elif self._settles(goal, tau - goal.spline.end_s, error, dt):
+            pass
         elif np.all(np.abs(error) <= goal.goal_tolerance) and np.all(np.abs(velocity) <= config.stopped_velocity):
             self._finish(End.SUCCEEDED, TrajectoryResult.SUCCESSFUL, "goal reached")
         elif tau > goal.spline.end_s + goal.goal_time_s:
@@ -204,6 +231,18 @@ class TrajectoryFollower(Follower):
                 f" {goal.goal_time_s:.2f} s after the end; expected within {goal.goal_tolerance[j]:.3f} rad and"
                 f" {config.stopped_velocity:.3f} rad/s",
             )
+
+    def _settles(self, goal: _Goal, over_s: float, error: Array, dt: float) -> bool:
+        """Let the carrier work off what is left at the end of a motion; whether it still does."""
+        config = self._carrier.config
+        if not self._carrier.settles or goal.settled:
+            return False
+        goal.settled = over_s > config.settle_time or self._carrier.settled(self._command.position, error)
+        if goal.settled:
+            self._carrier.weigh(self._command.position, error)
+        else:
+            self._carrier.settle(error, dt)
+        return not goal.settled
 
     def _advance(self, goal: _Goal, t_ns: int, dt_ns: int) -> None:
         """Move the command to where the trajectory is at the end of the coming tick."""

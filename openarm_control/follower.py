@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from openarm_common.types import Array
-from openarm_sim_bridge.control.trajectory import JointGroup
+from openarm_control.trajectory import JointGroup
 
 _NEAR = 1e-9  # rad or m; closer than this has arrived
 
@@ -114,9 +114,13 @@ class Follower(ABC):
         self.abort(why)
         self._hold(self._command.position)
 
+    @abstractmethod
+    def begin(self, targets: Array) -> None:
+        """Begin, after a reset, where the servos have targets (k,) already."""
+
     def reset(self, position: ArrayLike) -> None:
-        """Hold another position, because the world was reset; a running goal is aborted."""
-        self.abort("the simulated world was reset")
+        """Hold another position, because the robot was put elsewhere; a running goal is aborted."""
+        self.abort("the robot was put elsewhere, or its simulated world was reset")
         self._hold(position)
 
     def set_target(self, target: Array) -> None:

@@ -9,11 +9,11 @@ import sys
 
 import pytest
 
-from openarm_sim_bridge.priority import use_fifo
+from openarm_control.priority import use_fifo
 
 PROBE = """
 import os, subprocess, sys, threading
-from openarm_sim_bridge.priority import use_fifo
+from openarm_control.priority import use_fifo
 stop = threading.Event()
 thread = threading.Thread(target=stop.wait); thread.start()
 said = use_fifo(7)

@@ -9,9 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_common.errors import Code
-from openarm_sim_bridge.control.arm import End, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
-from openarm_sim_bridge.control.follower import Tracker
-from openarm_sim_bridge.control.trajectory import (
+from openarm_common.robot.servos import ServoModel
+from openarm_control.arm import End, TrajectoryConfig, TrajectoryFollower, TrajectoryOutcome
+from openarm_control.carrier import Carrier, CarrierConfig
+from openarm_control.follower import Tracker
+from openarm_control.trajectory import (
     JointGroup,
     Trajectory,
     TrajectoryError,
@@ -28,7 +30,8 @@ class Arm:
     """A follower and the joints it moves; `plant` maps (position, target) to the position a tick later."""
 
     def __init__(self, plant=lambda q, target: target, config: TrajectoryConfig = CONFIG, lead: float = 0.0) -> None:
-        self.follower = TrajectoryFollower(GROUP, config, np.full(2, lead), np.zeros(2))
+        servos = ServoModel(np.ones(2), np.full(2, lead), np.zeros(2), np.zeros(2), np.zeros(2))
+        self.follower = TrajectoryFollower(GROUP, config, Carrier(servos, config.carrier), np.zeros(2))
         self.plant = plant
         self.q, self.v = np.zeros(2), np.zeros(2)
         self.t_ns = START
@@ -109,14 +112,12 @@ def test_a_first_point_that_cannot_be_reached_in_time_is_refused() -> None:
         Arm().start(t=np.array([0.01]))
 
 
-def test_feed_forward_leads_by_lag_times_velocity() -> None:
-    for feed_forward in (True, False):
-        arm = Arm(config=TrajectoryConfig(feed_forward=feed_forward), lead=0.02)
+def test_targets_lead_by_lag_times_velocity() -> None:
+    for lag in (True, False):
+        arm = Arm(config=TrajectoryConfig(carrier=CarrierConfig(lag=lag)), lead=0.02)
         arm.start(t=np.array([0.0, 1.0]), q=np.array([[0.0, 0.0], [0.5, -0.5]]))
         arm.tick(50)
-        np.testing.assert_allclose(
-            arm.history[49], np.array([0.25, -0.25]) + (0.02 * np.array([0.5, -0.5])) * feed_forward
-        )
+        np.testing.assert_allclose(arm.history[49], np.array([0.25, -0.25]) + (0.02 * np.array([0.5, -0.5])) * lag)
 
 
 def test_a_stamp_in_the_future_delays_the_start() -> None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openarm_common.errors import Code
-from openarm_sim_bridge.control.trajectory import (
+from openarm_control.trajectory import (
     JointGroup,
     JointSpline,
     Trajectory,

@@ -26,13 +26,12 @@ from openarm_common.ros.actions import LEASE, latest, owner_topic
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_from_msg
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_common.types import Array
-from openarm_sim_bridge.control.arm import End, FollowerState, TrajectoryFollower, TrajectoryOutcome
-from openarm_sim_bridge.control.trajectory import Trajectory, TrajectoryError, TrajectoryResult
-from openarm_sim_bridge.ros.controller_server import ControllerServer
-from openarm_sim_bridge.simulation import Simulation
+from openarm_control.arm import End, FollowerState, TrajectoryFollower, TrajectoryOutcome
+from openarm_control.loop import ControlLoop
+from openarm_control.ros.controller_server import ControllerServer
+from openarm_control.trajectory import Trajectory, TrajectoryError, TrajectoryResult
 
 FEEDBACK_PERIOD_S = 0.05
-STATE_PERIOD_S = 0.05
 
 
 class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
@@ -40,30 +39,31 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
 
     Args:
         node: Owner.
+        prefix: Of its names.
         side: left or right.
         arm: Its controller.
-        simulation: Whose thread runs the controller.
+        loop: Whose thread runs the controller.
         check: Refuses a goal, by its id, while another client holds the arm.
     """
 
     def __init__(
         self,
         node: BaseNode[Any],
+        prefix: str,
         side: str,
         arm: TrajectoryFollower,
-        simulation: Simulation,
+        loop: ControlLoop,
         check: Callable[[bytes], None],
     ) -> None:
         self._arm = arm
         self._running: ServerGoalHandle | None = None
-        self._columns = [simulation.world.joint_names.index(name) for name in arm.group.names]
-        controller = f"/{side}_joint_trajectory_controller"
+        controller = f"{prefix}/{side}_joint_trajectory_controller"
         self._feedback_timer = node.create_timer(
             FEEDBACK_PERIOD_S, self._publish_feedback, clock=node.steady_clock, autostart=False
         )
         super().__init__(
             node,
-            simulation,
+            loop,
             check,
             f"{side} arm",
             FollowJointTrajectory,
@@ -71,7 +71,6 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
             arm.cancel,
         )
         self._states = node.create_publisher(JointTrajectoryControllerState, f"{controller}/controller_state", 10)
-        node.create_timer(STATE_PERIOD_S, self._publish_state, clock=node.steady_clock)
         on_trajectory: Any = self._on_trajectory  # rclpy awaits coroutines; its type hints do not allow them
         node.create_subscription(JointTrajectory, f"{controller}/joint_trajectory", on_trajectory, QOS_COMMAND)
         self._owned = b""
@@ -99,14 +98,14 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         """Hold: nothing watches the motion any more."""
         running = self._running
         if running is not None and bytes(running.goal_id.uuid) == goal:
-            self._simulation.call(lambda: self._arm.hold(f"{why}; the arm holds where it is"))
+            self._loop.call(lambda: self._arm.hold(f"{why}; the arm holds where it is"))
 
     async def _on_trajectory(self, message: JointTrajectory) -> None:
         """Follow a trajectory that comes as a message; a refusal goes to the log."""
         try:
             self._check(b"")
-            trajectory = self._arm.check(_trajectory_of(FollowJointTrajectory.Goal(trajectory=message)))
-            await self._node.awaitable(self._simulation.call(lambda: self._start(trajectory, self._on_end)))
+            trajectory = self._arm.check(trajectory_of(FollowJointTrajectory.Goal(trajectory=message)))
+            await self._node.awaitable(self._loop.call(lambda: self._start(trajectory, self._on_end)))
         except OpenArmError as error:
             self._node.get_logger().error(f"{self._label}: joint_trajectory refused: {error}")
 
@@ -116,7 +115,7 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
 
     async def _execute(self, handle: ServerGoalHandle) -> FollowJointTrajectory.Result:
         try:
-            trajectory = self._arm.check(_trajectory_of(handle.request))
+            trajectory = self._arm.check(trajectory_of(handle.request))
             self._running = handle
             self._feedback_timer.reset()
             outcome = await self._follow(handle, lambda done: self._start(trajectory, done))
@@ -132,18 +131,19 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
         return FollowJointTrajectory.Result(error_code=int(outcome.result), error_string=outcome.text)
 
     def _start(self, trajectory: Trajectory, done: Callable[[TrajectoryOutcome], None]) -> None:
-        self._simulation.check_able()
-        state = self._simulation.world.read_joints()
-        self._arm.start(trajectory, state.t_ns, state.position[self._columns], done)
+        self._loop.check_able()
+        state = self._loop.read_joints(self._arm.group)
+        self._arm.start(trajectory, state.t_ns, state.position, done)
 
-    def _publish_state(self) -> None:
+    def publish_state(self) -> None:
+        """Publish controller_state at the end of a tick, in the thread of the loop, to its subscribers."""
         state = self._arm.state
         if state is None or not self._states.get_subscription_count():
             return
         part = _feedback(self._arm.group.names, state)
         message = JointTrajectoryControllerState(joint_names=part.joint_names, header=part.header)
         message.reference, message.feedback, message.error = part.desired, part.actual, part.error
-        message.output = part.desired
+        message.output = JointTrajectoryPoint(positions=state.target.tolist())
         self._states.publish(message)
 
     def _publish_feedback(self) -> None:
@@ -152,7 +152,8 @@ class TrajectoryServer(ControllerServer[TrajectoryOutcome]):
             self._running.publish_feedback(_feedback(self._arm.group.names, state))
 
 
-def _trajectory_of(goal: FollowJointTrajectory.Goal) -> Trajectory:
+def trajectory_of(goal: FollowJointTrajectory.Goal) -> Trajectory:
+    """Return the trajectory of a goal."""
     names, t, q, v, a = trajectory_from_msg(goal.trajectory)
     return Trajectory(
         names=tuple(names),

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_sim_bridge.control.arm import End
-from openarm_sim_bridge.control.gripper import GripperConfig, GripperFollower, GripperGoal, GripperOutcome
-from openarm_sim_bridge.control.trajectory import JointGroup
+from openarm_control.arm import End
+from openarm_control.gripper import GripperConfig, GripperFollower, GripperGoal, GripperOutcome
+from openarm_control.trajectory import JointGroup
 
 MS = 1_000_000
 FINGER = JointGroup(("finger",), np.array([0.0]), np.array([0.044]), np.array([10.0]))
@@ -74,8 +74,12 @@ def test_closing_takes_six_tenths_of_a_second() -> None:
 
 def test_an_object_stalls_the_finger_and_is_pressed_on() -> None:
     finger = Finger(stop=0.025)
+    finger.tick()
+    assert not finger.follower.pressing
     finger.start(0.0)
     outcome = finger.run()
+    finger.tick()
+    assert finger.follower.pressing
     assert (outcome.end, outcome.reached_goal, outcome.stalled) == (End.SUCCEEDED, False, True)
     assert outcome.position == 0.025
     assert outcome.effort == -30.0

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scheduling of the process that keeps time, as ros2_control does it: real-time where the system allows it.
 
-Physics takes 1.5 ms of every 10 ms, but on a machine with two busy cores an ordinary thread that wakes up may wait
-several milliseconds for its turn. Under SCHED_FIFO it does not wait.
+Control and simulated physics take 1 to 2 ms of every 10 ms, but on a machine with two busy cores an ordinary thread
+that wakes up may wait several milliseconds for its turn. Under SCHED_FIFO it does not wait.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ from rclpy.action.server import ServerGoalHandle
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.node import BaseNode
-from openarm_sim_bridge.control.arm import End
-from openarm_sim_bridge.simulation import Simulation
+from openarm_control.arm import End
+from openarm_control.loop import ControlLoop
 
 OutcomeT = TypeVar("OutcomeT")
 
@@ -25,7 +25,7 @@ class ControllerServer(ABC, Generic[OutcomeT]):
 
     Args:
         node: Owner.
-        simulation: Whose thread runs the controller.
+        loop: Whose thread runs the controller.
         check: Refuses a goal, by its id, while another client holds the arm.
         label: Names arm or gripper in the log.
         kind: Type of the action.
@@ -36,7 +36,7 @@ class ControllerServer(ABC, Generic[OutcomeT]):
     def __init__(
         self,
         node: BaseNode[Any],
-        simulation: Simulation,
+        loop: ControlLoop,
         check: Callable[[bytes], None],
         label: str,
         kind: type,
@@ -44,7 +44,7 @@ class ControllerServer(ABC, Generic[OutcomeT]):
         cancel: Callable[[], None],
     ) -> None:
         self._node = node
-        self._simulation = simulation
+        self._loop = loop
         self._check = check
         self._label = label
         self._cancel = cancel
@@ -64,7 +64,7 @@ class ControllerServer(ABC, Generic[OutcomeT]):
         return GoalResponse.ACCEPT
 
     def _on_cancel(self, _handle: ServerGoalHandle) -> CancelResponse:
-        self._simulation.call(self._cancel)
+        self._loop.call(self._cancel)
         return CancelResponse.ACCEPT
 
     async def _follow(self, handle: ServerGoalHandle, start: Callable[[Callable[[OutcomeT], None]], None]) -> OutcomeT:
@@ -75,17 +75,17 @@ class ControllerServer(ABC, Generic[OutcomeT]):
             start: Starts it; is given the function that takes the outcome.
 
         Raises:
-            OpenArmError: BUSY, when another client holds the arm; what `start` raised; CANCELLED, when the simulation
-                shuts down.
+            OpenArmError: BUSY, when another client holds the arm; what `start` raised; CANCELLED, when the
+                controllers shut down.
         """
         self._check(bytes(handle.goal_id.uuid))
         ended: ThreadFuture[OutcomeT] = ThreadFuture()
-        started = self._simulation.call(lambda: start(ended.set_result))
+        started = self._loop.call(lambda: start(ended.set_result))
         if handle.is_cancel_requested:
-            self._simulation.call(self._cancel)
+            self._loop.call(self._cancel)
         await self._node.awaitable(started)
         if started.cancelled():
-            raise OpenArmError(Code.CANCELLED, "the simulation is shutting down")
+            raise OpenArmError(Code.CANCELLED, "the controllers are shutting down")
         outcome: OutcomeT = await self._node.awaitable(ended)
         return outcome
 

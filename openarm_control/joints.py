@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joints that are controlled, and what carries them: of the robot's description."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from openarm_common.robot.description import SIDES, RobotDescription, Side
+from openarm_common.robot.servos import ArmLoad, ServoModel
+from openarm_common.types import Array
+from openarm_control.carrier import Carrier, CarrierConfig
+from openarm_control.loop_gains import safe_gains
+from openarm_control.trajectory import JointGroup
+
+#: Mass that a hand may hold while errors are corrected, kg.
+_HELD_MASS = 0.5
+#: Delay of a correction on top of the latency, s: a control tick, and half of one for which a target is kept.
+_DELAY_S = 0.015
+
+
+@dataclass(frozen=True)
+class JointReadout:
+    """State of the controlled joints at `t_ns`, arrays (n,): rad, rad/s, N m; of fingers m, m/s, N."""
+
+    t_ns: int
+    position: Array
+    velocity: Array
+    effort: Array
+
+
+def joint_names(description: RobotDescription) -> tuple[str, ...]:
+    """Return the controlled joints: of each side those of the arm, then the driving finger joint."""
+    return tuple(name for side in SIDES for name in (*description.arm_joints(side), description.finger_joint(side)))
+
+
+def arm_groups(description: RobotDescription) -> dict[Side, JointGroup]:
+    """Return the joint group of each arm, by side."""
+    return {side: _group(description, description.arm_joints(side)) for side in SIDES}
+
+
+def gripper_groups(description: RobotDescription) -> dict[Side, JointGroup]:
+    """Return the joint group (the driving finger joint) of each gripper, by side."""
+    return {side: _group(description, (description.finger_joint(side),)) for side in SIDES}
+
+
+def arm_loads(description: RobotDescription) -> dict[Side, ArmLoad]:
+    """Return what motions of each arm take, by side."""
+    return {side: ArmLoad(description, description.arm_joints(side), description.tcp_link(side)) for side in SIDES}
+
+
+def carriers(
+    description: RobotDescription, config: CarrierConfig, servos: Mapping[Side, ServoModel]
+) -> dict[Side, Carrier]:
+    """Return what makes servo targets of commands, by side.
+
+    Args:
+        description: The robot.
+        config: How it carries.
+        servos: What is known of them, by side.
+    """
+    soft = any(one.soft for one in servos.values())
+    loads = arm_loads(description) if soft else {}
+    found = dict[Side, Carrier]()
+    for side, one in servos.items():
+        if not one.soft:
+            found[side] = Carrier(one, config)
+            continue
+        limits = description.limits(description.arm_joints(side))
+        inertia = loads[side].inertia(*limits, _HELD_MASS) + one.armature
+        gains = safe_gains(one.stiffness, one.damping, inertia, one.latency_s + _DELAY_S)
+        found[side] = Carrier(one, config, loads[side], gains)
+    return found
+
+
+def _group(description: RobotDescription, names: Sequence[str]) -> JointGroup:
+    lower, upper = description.limits(names)
+    speeds = np.array([description.joint(name).velocity for name in names])
+    return JointGroup(tuple(names), lower, upper, speeds)  # those of the motors, far above what a plan should use

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The controllers with which the simulated robot is met: those of this suite, or those of openarm_ros2."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+from openarm_common.ros.node import BaseNode
+from openarm_control.controller import JointController
+from openarm_control.joints import JointReadout, carriers
+from openarm_control.ros.controllers import Controllers
+from openarm_control.servos import KnownServos
+from openarm_sim_bridge.config import BridgeConfig
+from openarm_sim_bridge.openarm_ros2 import OpenArmRos2, activate
+from openarm_sim_bridge.robot import SimulatedRobot
+from openarm_sim_bridge.ros.openarm_ros2_server import PositionControllerServer
+from openarm_sim_bridge.ros.sensor_publisher import SensorPublisher
+from openarm_sim_bridge.simulation import Simulation
+from openarm_sim_bridge.world.stage import Stage
+from openarm_sim_bridge.world.world import World
+
+#: Identified servos that are stored are in use after this long, s.
+STORE_PERIOD_S = 1.0
+
+
+class Face(ABC):
+    """Controllers of a world, and how they are met.
+
+    Attributes:
+        controller: Of all joints.
+        wall_stamps: Stamps are of the wall clock, and there is no /clock.
+    """
+
+    controller: JointController
+    wall_stamps = False
+
+    @abstractmethod
+    def serve(self, simulation: Simulation) -> None:
+        """Offer actions and topics."""
+
+    @abstractmethod
+    def publish(self, state: JointReadout, world: World) -> JointReadout:
+        """Publish the end of a tick, in the thread of the simulation; return the joint states as they are published."""
+
+    @abstractmethod
+    def values(self) -> Mapping[str, object]:
+        """Return what /diagnostics says of it; once a second."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Take actions and topics away."""
+
+
+class SuiteFace(Face):
+    """Controllers that carry the arms, follow trajectories and watch tolerances; with sensors at the hands.
+
+    Args:
+        node: Owner.
+        config: Parameters.
+        stage: Of the world.
+        world: The world.
+    """
+
+    def __init__(self, node: BaseNode[Any], config: BridgeConfig, stage: Stage, world: World) -> None:
+        self._node, self._config = node, config
+        seed = config.hardware.dynamics_seed
+        self._servos = KnownServos(stage.servos, config.calibrations, seed, node.get_logger().warning)
+        self._robot = SimulatedRobot.controllers(stage, world, config.trajectory, config.gripper, self._servos.models)
+        self.controller = self._robot
+        self._commands = 0
+
+    def serve(self, simulation: Simulation) -> None:
+        """See `Face.serve`."""
+        node = self._node
+        self._simulation = simulation
+        self._sensors = SensorPublisher(node)
+        self._controllers = Controllers(node, simulation, self._robot, self._config.gripper_action)
+        node.create_timer(STORE_PERIOD_S, self._update_servos, clock=node.steady_clock)
+        node.get_logger().info(f"servos: {self._servos}")
+
+    def publish(self, state: JointReadout, world: World) -> JointReadout:
+        """See `Face.publish`."""
+        self._sensors.publish(world)
+        self._controllers.publish_states()
+        return state
+
+    def values(self) -> Mapping[str, object]:
+        """See `Face.values`."""
+        commands, self._commands = self._controllers.commands - self._commands, self._controllers.commands
+        return {
+            **{f"servos_{side}": text for side, text in self._servos.sources.items()},
+            "commands_per_s": commands,
+            "refused_of_held_arms": self._controllers.holds.refused,
+        }
+
+    def close(self) -> None:
+        """See `Face.close`."""
+        self._controllers.destroy()
+
+    def _update_servos(self) -> None:
+        """Carry the arms by servos that were identified meanwhile."""
+        if not self._servos.update():
+            return
+        found = carriers(self._node.description, self._config.trajectory.carrier, self._servos.models)
+        self._simulation.call(lambda: self._robot.carry_by(found))
+        self._node.get_logger().info(f"servos: {self._servos}")
+
+
+class OpenArmRos2Face(Face):
+    """The controllers of openarm_ros2, after its hardware interface was activated.
+
+    Args:
+        node: Owner.
+        stage: Of the world.
+        world: The world.
+
+    Raises:
+        OpenArmError: INTERNAL, when the physics diverged.
+    """
+
+    wall_stamps = True
+
+    def __init__(self, node: BaseNode[Any], stage: Stage, world: World) -> None:
+        self._node = node
+        world.reset(stage.posture("zero"))  # arms without power hang
+        activate(world)
+        self.controller = self._robot = OpenArmRos2(node.description, world.joint_names, world.read_joints())
+
+    def serve(self, simulation: Simulation) -> None:
+        """See `Face.serve`."""
+        self._servers = [
+            PositionControllerServer(self._node, name, controller, simulation)
+            for name, controller in self._robot.controllers.items()
+        ]
+
+    def publish(self, state: JointReadout, world: World) -> JointReadout:
+        """See `Face.publish`."""
+        for server in self._servers:
+            server.publish_state(state.t_ns)
+        return self._robot.reported(state)
+
+    def values(self) -> Mapping[str, object]:
+        """See `Face.values`."""
+        return {}
+
+    def close(self) -> None:
+        """See `Face.close`."""
+        for server in self._servers:
+            server.destroy()

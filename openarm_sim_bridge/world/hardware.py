@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motors of the arms and how a robot differs from its description: gains, friction, latency, encoders, masses.
+
+A profile says what is possible, `drawn` makes one robot of it by seeds. Arrays (n,) are in the order of `joints`: the
+arm joints of both sides. N m, rad, s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import Field
+
+from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.types import Array
+from openarm_control.servos import ServoConfig
+
+Share = Annotated[float, Field(ge=0.0, le=0.5)]
+
+#: Position range of the Damiao motors, +-rad, which 16 bits divide; of velocity (rad/s) and torque (N m) by motor of
+#: joints 1 to 7 (DM8009, DM4340, DM4310), which 12 bits divide. Source: the maker's MIT frames.
+MOTOR_RANGE = 12.5
+_VELOCITY_RANGE = np.array([45.0, 45.0, 10.0, 10.0, 30.0, 30.0, 30.0])
+_TORQUE_RANGE = np.array([54.0, 54.0, 28.0, 28.0, 10.0, 10.0, 10.0])
+
+
+class HardwareConfig(ServoConfig):
+    """Motors of the arms, and by how much a robot differs from its description; by default as owners have them."""
+
+    gain_error: Share = Field(default=0.0, description="gains and damping differ by this share, up or down")
+    mass_error: Share = Field(default=0.05, description="masses of links differ by this share, up or down")
+    # what a zero calibration leaves
+    zero_rms: float = Field(default=0.1, ge=0.0, le=10.0, description="error of the joint zeros, deg rms")
+    quantized: bool = Field(
+        default=True, description="position of 16 bits in +-12.5 rad, velocity and torque of 12 bits, as on the bus"
+    )
+    tool_stiffness: float = Field(
+        default=300.0, ge=0.0, description="of the hand on the wrist about its x and y axes, N m/rad; 0: rigid"
+    )
+    dynamics_seed: int = Field(default=1, ge=0, description="of friction, latency, gains and masses")
+    zero_seed: int = Field(default=1, ge=0, description="of the joint zeros")
+
+    def of_seed(self, seed: int | None) -> Self:
+        """Return it with one seed of all draws; None is those of the configuration."""
+        return self if seed is None else self.model_copy(update={"dynamics_seed": seed, "zero_seed": seed})
+
+
+#: Stiff servos that carry the arms and know where they are.
+IDEAL = HardwareConfig(
+    stiffness=(230, 230, 190, 190, 100, 100, 100),
+    damping=(2.7, 2.7, 2.2, 2.2, 1.5, 1.5, 1.5),
+    gravity_compensation=1.0,
+    friction=(0.0, 0.0),
+    latency=(0.0, 0.0),
+    mass_error=0.0,
+    zero_rms=0.0,
+    quantized=False,
+    tool_stiffness=0.0,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Encoders:
+    """How commands and states of joints differ from the truth; arrays (n,), in the order of the joints.
+
+    Attributes:
+        zero: What is added to true positions, rad.
+        position, velocity, effort: Steps of the numbers on the bus; 0: exact.
+        latency_s: Until a command takes effect.
+    """
+
+    zero: Array
+    position: Array
+    velocity: Array
+    effort: Array
+    latency_s: Array
+
+    @classmethod
+    def exact(cls, n: int) -> Encoders:
+        """Return those that say and take what is."""
+        return cls(*np.zeros((5, n)))
+
+
+@dataclass(frozen=True, eq=False)
+class Hardware:
+    """One robot as it is; arrays by arm joint name."""
+
+    stiffness: Mapping[str, float]
+    damping: Mapping[str, float]
+    armature: Mapping[str, float]
+    #: By which the damping of the description is multiplied.
+    gearbox: Mapping[str, float]
+    #: N m; where there is none, that of the description.
+    friction: Mapping[str, float]
+    zero: Mapping[str, float]
+    latency_s: Mapping[str, float]
+    #: Scale of mass and inertia, by link.
+    mass: Mapping[str, float]
+    gravity_compensation: float
+    tool_stiffness: float
+    quantized: bool
+
+    def encoders(self, description: RobotDescription, joint_names: tuple[str, ...]) -> Encoders:
+        """Return what commands and states of joints go through; fingers are exact but for their latency."""
+        steps = dict.fromkeys(joint_names, (0.0, 0.0, 0.0))
+        if self.quantized:
+            for side in SIDES:
+                for i, name in enumerate(description.arm_joints(side)):
+                    steps[name] = (
+                        2.0 * MOTOR_RANGE / (2.0**16 - 1.0),
+                        2.0 * float(_VELOCITY_RANGE[i]) / (2.0**12 - 1.0),
+                        2.0 * float(_TORQUE_RANGE[i]) / (2.0**12 - 1.0),
+                    )
+        position, velocity, effort = np.array([steps[name] for name in joint_names]).T
+        arm_latency = {
+            name: self.latency_s[description.arm_joints(side)[0]]
+            for side in SIDES
+            for name in (*description.arm_joints(side), description.finger_joint(side))
+        }
+        return Encoders(
+            zero=np.array([self.zero.get(name, 0.0) for name in joint_names]),
+            position=position,
+            velocity=velocity,
+            effort=effort,
+            latency_s=np.array([arm_latency.get(name, 0.0) for name in joint_names]),
+        )
+
+
+def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
+    """Return the robot of the seeds of a profile.
+
+    Args:
+        config: What is possible.
+        description: The robot.
+    """
+    joints = tuple(name for side in SIDES for name in description.arm_joints(side))
+    rng = np.random.default_rng([config.dynamics_seed, 901])
+    zeros = np.random.default_rng([config.zero_seed, 902])
+
+    def either(share: float, n: int) -> Array:
+        return 1.0 + share * rng.choice((-1.0, 1.0), n)
+
+    def named(values: Array) -> dict[str, float]:
+        return dict(zip(joints, np.asarray(values, dtype=np.float64).tolist(), strict=True))
+
+    n = len(joints)
+    stiffness, damping, gearbox = (either(config.gain_error, n) for _ in range(3))
+    friction = rng.uniform(*config.friction, n)
+    latency = np.repeat(rng.uniform(*config.latency, len(SIDES)), n // len(SIDES))
+    links = [link for link in description.links if link.startswith(tuple(f"openarm_{side}_" for side in SIDES))]
+    mass = dict(zip(links, either(config.mass_error, len(links)).tolist(), strict=True))
+    return Hardware(
+        stiffness=named(np.tile(config.stiffness, len(SIDES)) * stiffness),
+        damping=named(np.tile(config.damping, len(SIDES)) * damping),
+        armature=named(np.tile(config.armature, len(SIDES))),
+        gearbox=named(gearbox),
+        friction=named(friction) if config.friction[1] > 0.0 else {},
+        zero=named(np.radians(config.zero_rms) * zeros.standard_normal(n)),
+        latency_s=named(latency),
+        mass=mass,
+        gravity_compensation=config.gravity_compensation,
+        tool_stiffness=config.tool_stiffness,
+        quantized=config.quantized,
+    )

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`openarm calibrate dynamics`: servos are identified and stored, and the bridge carries the arms by them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from control_msgs.msg import JointTrajectoryControllerState
+
+from openarm_bringup.calibration.ros.dynamics import pieces
+from openarm_bringup.commands.calibrate_live import dynamics
+from openarm_bringup.outcome import Outcome
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.records import default_folder
+from openarm_common.robot.servo_store import ServoStore
+from openarm_common.ros.convert import ns_to_stamp
+from openarm_sim_bridge.world.hardware import HardwareConfig, drawn
+
+NAMES = ("a", "b")
+
+
+@pytest.fixture(autouse=True)
+def _own_store(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("OPENARM_CALIBRATIONS", str(tmp_path / "store"))
+
+
+def identify(bench, **options) -> Outcome:
+    """As typed next to the running graph."""
+    with ThreadPoolExecutor(1) as worker:
+        done = worker.submit(dynamics, domain=int(os.environ["ROS_DOMAIN_ID"]), **options)
+        bench.ros.spin_until(done.done, 120.0, "the command to end")
+        return done.result()
+
+
+def test_servos_are_identified_stored_and_used(ros, bridge) -> None:
+    bench = bridge(images=False, profile="openarm", openarm__dynamics_seed=7)
+    # signs of life are not exchanged within a process
+    motion = subprocess.Popen([sys.executable, "-m", "openarm_motion.ros.node"])
+    try:
+        done = identify(bench, arm="right", postures=2)
+    finally:
+        motion.terminate()
+        motion.wait()
+    assert done.success, done.message
+    assert "joint  gain, N m/rad" in done.text
+    stored = ServoStore(default_folder()).load("right")
+    assert stored.dynamics_seed == 7
+    made, names = drawn(HardwareConfig(dynamics_seed=7), bench.node.description), bench.ARM
+    np.testing.assert_allclose(stored.stiffness, [made.stiffness[name] for name in names], rtol=0.15)
+    np.testing.assert_allclose(stored.friction, [made.friction[name] for name in names], atol=0.25)
+    ros.spin_until(
+        lambda: bench.node._face._servos.sources["right"] == f"identified {stored.digest()[:12]}",
+        10.0,
+        "the bridge to use them",
+    )
+    assert bench.node._face._servos.sources["left"] == "as configured"
+
+
+def test_ideal_servos_are_not_identified(bench) -> None:
+    bench.ros.spin_until(lambda: bench.joints, 10.0, "joint states")
+    with pytest.raises(OpenArmError, match="the servos of the profile `ideal` are known") as caught:
+        identify(bench, arm="right")
+    assert caught.value.code is Code.INVALID_ARGUMENT
+
+
+@pytest.mark.parametrize("wrong", [{"arm": "middle"}, {"postures": 1}])
+def test_choices_are_listed(wrong: dict[str, object]) -> None:
+    with pytest.raises(OpenArmError, match=r"expected (left, right or both|2 to 100)"):
+        dynamics(domain=int(os.environ.get("ROS_DOMAIN_ID", "0")), **wrong)
+
+
+def state(t_ms: int, output: bool = True) -> JointTrajectoryControllerState:
+    message = JointTrajectoryControllerState(joint_names=["b", "a"])
+    message.header.stamp = ns_to_stamp(t_ms * 1_000_000)
+    message.feedback.positions = [2.0, 1.0]
+    message.output.positions = [4.0, 3.0] if output else []
+    return message
+
+
+def test_logs_end_at_gaps_and_have_the_joints_in_order() -> None:
+    first, second = pieces(NAMES, [state(t) for t in (0, 10, 20, 50, 60, 70, 80)])
+    assert (len(first.target), len(second.target)) == (3, 4)
+    assert first.period_s == 0.01
+    np.testing.assert_array_equal(first.position[0], [1.0, 2.0])
+    np.testing.assert_array_equal(first.target[0], [3.0, 4.0])
+
+
+def test_a_controller_that_does_not_say_what_it_commands_is_refused() -> None:
+    with pytest.raises(OpenArmError, match="0 of 5 messages on controller_state have the output of all joints"):
+        pieces(NAMES, [state(t, output=False) for t in range(0, 50, 10)])

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`arm_control` before the controllers of openarm_ros2: arms as owners have them go where they should."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from control_msgs.action import FollowJointTrajectory, ParallelGripperCommand
+from control_msgs.msg import JointTrajectoryControllerState
+from rclpy.action import ActionClient
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from openarm_common.ros.convert import stamp_to_ns
+from openarm_common.ros.node import QOS_COMMAND
+from openarm_control.ros.node import ArmControl
+from tests.nodes.conftest import Bench
+
+pytestmark = pytest.mark.alone
+
+
+@pytest.fixture
+def robot(bridge) -> Bench:
+    """The bridge as openarm_ros2."""
+    return bridge(images=False, scene="empty", profile="openarm", controllers="openarm_ros2")
+
+
+@pytest.fixture
+def bench(robot: Bench) -> Bench:
+    """And the node before it."""
+    robot.ros.add(ArmControl(parameter_overrides=[Parameter("dynamics_seed", value=1)]))
+    robot.passed_on = robot.collect(JointState, "/arm_control/joint_states", QOS_COMMAND)
+    name = "/arm_control/right_joint_trajectory_controller/controller_state"
+    robot.states = robot.collect(JointTrajectoryControllerState, name, QOS_COMMAND)
+    robot.ros.spin_until(lambda: robot.states, 20.0, "the state of a controller")
+    return robot
+
+
+def move(bench: Bench, prefix: str, offset: float, seconds: float) -> FollowJointTrajectory.Result:
+    """Move the arm sideways from near zero, where activation leaves it."""
+    start = [0.05, 0.05, 0.0, 0.05, 0.0, 0.0, 0.0]
+    goal = bench.goal((0.5, start), (seconds, [q + offset * (i == 1) for i, q in enumerate(start)]))
+    client = ActionClient(
+        bench.ros.node, FollowJointTrajectory, f"{prefix}/right_joint_trajectory_controller/follow_joint_trajectory"
+    )
+    _, result = bench.ros.send_goal(client, goal)
+    return bench.ros.result(result, 20.0).result
+
+
+def errors(bench: Bench, since: int) -> np.ndarray:
+    return np.abs([state.error.positions for state in bench.states[since:]])
+
+
+@pytest.mark.requirement("R-03", "A-25")
+def test_a_soft_arm_follows_a_motion_and_arrives(bench: Bench) -> None:
+    since = len(bench.states)
+    result = move(bench, "/arm_control", 0.6, 2.0)
+    assert result.error_code == 0, result.error_string
+    assert errors(bench, since).max() < 0.1
+    since = len(bench.states)
+    bench.spin_sim(0.5)
+    assert errors(bench, since).max() < 0.02
+    at = dict(zip(bench.joints[-1].name, bench.joints[-1].position, strict=True))
+    assert at["openarm_right_joint2"] == pytest.approx(bench.states[-1].reference.positions[1], abs=0.02)
+
+
+@pytest.mark.requirement("R-03")
+def test_the_same_motion_sent_to_the_robot_itself_is_a_blow(robot: Bench) -> None:
+    """Two points, which such controllers do not join."""
+    bench, before = robot, robot.position("openarm_right_joint2")
+    result = move(bench, "", 0.6, 2.0)
+    assert result.error_code == 0
+    assert bench.position("openarm_right_joint2") - before > 0.4
+    shoulder = bench.joints[-1].name.index("openarm_right_joint2")
+    fastest = max(abs(message.velocity[shoulder]) for message in bench.joints)
+    assert fastest > 2.0  # 0.6 rad in 2 s would be 0.45 rad/s at most
+
+
+@pytest.mark.requirement("R-03")
+def test_joint_states_come_at_each_physics_step_and_are_passed_on_at_the_rate_of_control(bench: Bench) -> None:
+    clocks = bench.collect(Clock, "/clock", qos_profile_sensor_data)
+    had, since = len(bench.joints), len(bench.passed_on)
+    bench.spin_sim(1.0)
+    steps = np.diff([stamp_to_ns(message.header.stamp) for message in bench.joints[had:]])
+    assert np.median(steps) == 2_000_000
+    assert 80 <= len(bench.passed_on) - since <= 110
+    assert clocks == []
+    finger = bench.joints[-1].name.index(bench.FINGER)
+    assert all(message.velocity[finger] == message.effort[finger] == 0.0 for message in bench.joints)
+
+
+@pytest.mark.requirement("R-03", "P-22")
+def test_a_hand_opens_and_closes(bench: Bench) -> None:
+    name = "/arm_control/right_gripper_controller/gripper_cmd"
+    client = ActionClient(bench.ros.node, ParallelGripperCommand, name)
+    for position in (0.03, 0.0):
+        goal = ParallelGripperCommand.Goal(command=JointState(name=[bench.FINGER], position=[position]))
+        _, result = bench.ros.send_goal(client, goal)
+        answer = bench.ros.result(result, 20.0).result
+        assert (answer.reached_goal, answer.stalled) == (True, False)
+        assert bench.position(bench.FINGER) == pytest.approx(position, abs=0.002)
+
+
+@pytest.mark.requirement("R-03")
+def test_the_emergency_stop_is_of_this_node(bench: Bench) -> None:
+    start = [0.05, 0.05, 0.0, 0.05, 0.0, 0.0, 0.0]
+    name = "/arm_control/right_joint_trajectory_controller/follow_joint_trajectory"
+    client = ActionClient(bench.ros.node, FollowJointTrajectory, name)
+    goal = bench.goal((0.5, start), (4.0, [q + 0.8 * (i == 1) for i, q in enumerate(start)]))
+    _, result = bench.ros.send_goal(client, goal)
+    bench.spin_sim(1.0)
+    assert bench.call(Trigger, "/stop").success
+    assert bench.ros.result(result, 5.0).result.error_string.startswith("the emergency stop is latched")
+    assert bench.call(Trigger, "/arm_control/reset").success
+    assert move(bench, "/arm_control", 0.1, 1.0).error_code == 0
