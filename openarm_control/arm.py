@@ -67,9 +67,13 @@ class TrajectoryOutcome:
 
 @dataclass(frozen=True)
 class FollowerState:
-    """What a follower was doing at `t_ns`: desired and measured position and velocity (k,), and the servos' targets."""
+    """What a follower was doing at `t_ns`: desired and measured position and velocity (k,), and the servos' targets.
+
+    `time_from_start` is how long it had followed its trajectory then, s; 0 without one and before its start.
+    """
 
     t_ns: int
+    time_from_start: float
     desired: Array
     desired_velocity: Array
     actual: Array
@@ -170,6 +174,7 @@ class TrajectoryFollower(Follower):
         """See `Follower.update`."""
         desired, desired_velocity, dt = self._command.position, self._command.velocity, dt_ns * 1e-9
         error = desired - position
+        elapsed = 0.0 if self._goal is None else max(0.0, self._goal.tau_s)
         if self._goal is not None:
             self._judge(self._goal, t_ns, dt, position, velocity)
         if self._goal is not None:
@@ -178,7 +183,7 @@ class TrajectoryFollower(Follower):
             self._command.step(self._target, dt)
         slip = desired_velocity - velocity
         target = self._carrier.target(self._command.position, self._command.velocity, error, slip, dt)
-        self.state = FollowerState(t_ns, desired, desired_velocity, position, velocity, target)
+        self.state = FollowerState(t_ns, elapsed, desired, desired_velocity, position, velocity, target)
         return target
 
     @property

@@ -17,6 +17,7 @@ from action_msgs.msg import GoalInfo
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
 from rclpy.action.server import ServerGoalHandle
+from rclpy.duration import Duration as RclDuration
 from rclpy.event_handler import QoSLivelinessChangedInfo, SubscriptionEventCallbacks
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -172,6 +173,7 @@ def _feedback(names: tuple[str, ...], state: FollowerState) -> FollowJointTrajec
     feedback = FollowJointTrajectory.Feedback(joint_names=list(names))
     feedback.header.stamp = ns_to_stamp(state.t_ns)
     feedback.desired = _point(state.desired, state.desired_velocity)
+    feedback.desired.time_from_start = RclDuration(seconds=state.time_from_start).to_msg()
     feedback.actual = _point(state.actual, state.actual_velocity)
     feedback.error = _point(state.desired - state.actual, state.desired_velocity - state.actual_velocity)
     return feedback

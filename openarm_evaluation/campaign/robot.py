@@ -387,7 +387,7 @@ class _ArmController:
         return True
 
     def start(self, motion: Motion, begin_ns: int) -> _Goal:
-        robot, goal = self._robot, _Goal(self._follower)
+        robot, goal = self._robot, _Goal(self._follower, begin_ns or self._robot.t_ns)
         measured = robot.world.read_joints().position[robot.columns(motion.names)]
         points = FollowedTrajectory(motion.names, motion.t, motion.q, motion.v, motion.a, begin_ns)
         try:
@@ -402,8 +402,8 @@ class _Goal:
 
     accepted = True
 
-    def __init__(self, follower: TrajectoryFollower) -> None:
-        self._follower = follower
+    def __init__(self, follower: TrajectoryFollower, since_ns: int) -> None:
+        self._follower, self.since_ns = follower, since_ns
         self.outcome: Outcome | None = None
 
     def end(self, outcome: TrajectoryOutcome) -> None:

@@ -18,7 +18,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.lifeline import Lifeline
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.actions import LEASE, latest, owner_topic
-from openarm_common.ros.convert import ns_to_stamp, trajectory_to_msg
+from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_to_msg
 from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
@@ -133,22 +133,29 @@ class Controller:
         lifeline = Lifeline(bytes(info.goal_id.uuid).hex())
         self._owner.publish(info)
         goal = FollowJointTrajectory.Goal(trajectory=message)
-        return _Goal(self._client.send_goal_async(goal, goal_uuid=info.goal_id), lifeline)
+        sent = _Goal(lifeline)
+        answer = self._client.send_goal_async(goal, feedback_callback=sent.on_feedback, goal_uuid=info.goal_id)
+        answer.add_done_callback(sent.on_answer)
+        return sent
 
 
 class _Goal:
     """A goal that was sent; one that is withdrawn before it is accepted is cancelled when it is."""
 
-    def __init__(self, sent: Future, lifeline: Lifeline) -> None:
+    def __init__(self, lifeline: Lifeline) -> None:
         self._lifeline = lifeline
         self._handle: Any = None
         self._ended: Future | None = None
         self._withdrawn = False
-        sent.add_done_callback(self._on_answer)
+        self._since_ns = 0
 
     @property
     def accepted(self) -> bool | None:
         return None if self._handle is None else bool(self._handle.accepted)
+
+    @property
+    def since_ns(self) -> int:
+        return self._since_ns
 
     @property
     def outcome(self) -> Outcome | None:
@@ -166,7 +173,14 @@ class _Goal:
         if self.accepted:
             self._handle.cancel_goal_async()
 
-    def _on_answer(self, sent: Future) -> None:
+    def on_feedback(self, message: Any) -> None:
+        """Take note of the beginning, from a controller that says how far along the trajectory it is."""
+        elapsed_ns = stamp_to_ns(message.feedback.desired.time_from_start)
+        if not self._since_ns and elapsed_ns > 0:
+            self._since_ns = stamp_to_ns(message.feedback.header.stamp) - elapsed_ns
+
+    def on_answer(self, sent: Future) -> None:
+        """Await the result of an accepted goal."""
         self._handle = sent.result()
         if self.accepted:
             self._ended = ended = self._handle.get_result_async()

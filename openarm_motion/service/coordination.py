@@ -76,7 +76,7 @@ class ArmCoordination:
         """
         if not 0.0 <= max_delay < float("inf"):
             raise OpenArmError(Code.INVALID_ARGUMENT, f"max_start_delay is {max_delay:g} s, expected 0 or more")
-        while self._starting:
+        while self._starting or not self._certain(arm):
             await self._robot.pause()
         self._starting = True
         try:
@@ -143,6 +143,8 @@ class ArmCoordination:
         """
         if not self.under_way(arm):
             return 0.0
+        while not self._certain(arm):
+            await self._robot.pause()
         now_ns, state = self._robot.states.latest()
         opened = self._hands_open(state)
         others, mine = self._others(arm, now_ns, opened), ActiveMotion(arm, motion, held)
@@ -151,6 +153,10 @@ class ArmCoordination:
     def under_way(self, arm: Arm) -> bool:
         """Whether another arm is under way."""
         return any(f.active is not None for name, f in self.followers.items() if name != arm.name)
+
+    def _certain(self, arm: Arm) -> bool:
+        """Whether it is known when each of the other arms under way began."""
+        return all(f.active is None or f.active.certain for name, f in self.followers.items() if name != arm.name)
 
     def ends(self, arms: Sequence[Arm]) -> dict[str, float]:
         """Return where the joints of the other arms under way will end."""

@@ -7,7 +7,7 @@ Robot time is the stamp of the joint states, so a slow or paused simulation does
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,14 +25,17 @@ _ANSWER = 2.0
 _GONE = 1.0
 #: A controller has this long to appear before a motion, s.
 _READY = 1.0
+#: A controller has this long after it accepted to say when it began, s; else that is when it accepted.
+_TOLD = 0.2
 
 
 @dataclass(frozen=True)
 class MotionInProgress:
-    """A motion under way, and the robot time at which it began."""
+    """A motion under way, the robot time at which it began, and whether that is certain or a guess."""
 
     motion: Motion
     since_ns: int
+    certain: bool
 
     def rest(self, now_ns: int) -> Motion:
         """Return what is left of it, beginning now."""
@@ -65,8 +68,8 @@ class TrajectoryFollower:
         self.active: MotionInProgress | None = None
 
     def begin(self, motion: Motion, begin_ns: int = 0) -> None:
-        """Count as under way from a robot time on; 0 is now."""
-        self.active = MotionInProgress(motion, begin_ns or self._robot.states.latest()[0])
+        """Count as under way from a robot time on; 0 is about now."""
+        self.active = MotionInProgress(motion, begin_ns or self._robot.states.latest()[0], bool(begin_ns))
 
     async def follow(
         self, motion: Motion, begin_ns: int, cancelled: Callable[[], bool], progress: Callable[[float], None]
@@ -104,7 +107,7 @@ class TrajectoryFollower:
             if not goal.accepted:
                 raise OpenArmError(Code.EXECUTION_FAILED, f"{name} rejected the trajectory")
             if not run.begin_ns:
-                self.begin(run.motion)  # it begins when it is accepted
+                self.begin(run.motion, goal.since_ns)  # it begins when it is accepted
             stopping = await self._watch_goal(run, goal)
         except OpenArmError:
             goal.cancel()
@@ -122,11 +125,16 @@ class TrajectoryFollower:
         """Wait for the end of an accepted goal; return whether it was cancelled here."""
         name, duration = self._controller.name, run.motion.duration
         since: float | None = None
+        accepted = self._robot.now()
 
         def check() -> None:
             nonlocal since
             self._check(run)
-            elapsed = (self._robot.states.latest()[0] - self.active.since_ns) * 1e-9 if self.active else 0.0
+            active = self.active
+            if active is not None and not active.certain:
+                told = goal.since_ns or self._robot.now() - accepted > _TOLD
+                active = self.active = replace(active, since_ns=goal.since_ns or active.since_ns, certain=bool(told))
+            elapsed = (self._robot.states.latest()[0] - active.since_ns) * 1e-9 if active else 0.0
             run.progress(min(1.0, max(0.0, elapsed / max(duration, 1e-3))))
             if elapsed > duration + self._config.overtime:
                 text = f"{name} has not ended {elapsed:.1f} s after a start of {duration:.1f} s"

@@ -46,6 +46,11 @@ class TrajectoryGoal(Protocol):
         ...
 
     @property
+    def since_ns(self) -> int:
+        """Robot time at which it began, as the controller says; 0 while that has not said so."""
+        ...
+
+    @property
     def outcome(self) -> Outcome | None:
         """How it ended; None before."""
         ...

@@ -36,10 +36,17 @@ TICK_NS = 10_000_000
 
 
 class Goal:
-    def __init__(self, motion: Motion, begin_ns: int) -> None:
-        self.motion, self.begin_ns = motion, begin_ns
-        self.accepted: bool | None = True
+    def __init__(self, robot: Robot, motion: Motion, begin_ns: int) -> None:
+        self.robot, self.motion, self.begin_ns = robot, motion, begin_ns
         self.outcome: Outcome | None = None
+
+    @property
+    def accepted(self) -> bool | None:
+        return True if self.robot.t_ns >= self.begin_ns else None
+
+    @property
+    def since_ns(self) -> int:
+        return self.begin_ns if self.robot.tells and self.robot.t_ns > self.begin_ns + 3 * TICK_NS else 0
 
     def cancel(self) -> None:
         self.outcome = self.outcome or Outcome(False, "cancelled")
@@ -57,7 +64,7 @@ class Controller:
         return self.there
 
     def start(self, motion: Motion, begin_ns: int) -> Goal:
-        self.goals.append(Goal(motion, begin_ns or self.robot.t_ns))
+        self.goals.append(Goal(self.robot, motion, begin_ns or self.robot.t_ns + self.robot.latency_ns))
         return self.goals[-1]
 
     def tick(self) -> None:
@@ -78,6 +85,8 @@ class Robot:
         self.states, self.state = RobotStateBuffer(description), dict(home)
         self.t_ns = self.heard_ns = 10**9
         self.silent, self.stuck = False, set[str]()
+        #: Until a controller accepts and begins; whether it then says when it began.
+        self.latency_ns, self.tells = 0, True
         self.controllers = {arm: Controller(self, arm) for arm in ("left", "right")}
         self.tick()
 
@@ -231,6 +240,28 @@ def test_a_robot_that_vanishes_ends_a_motion(bench, lose, text) -> None:
     assert text in answer.message
     assert bench.robot.controllers["right"].goals[0].outcome is not None  # it was withdrawn
     assert bench.robot.now() < 4.0
+
+
+@pytest.mark.requirement("N-12")
+@pytest.mark.parametrize("tells", [True, False])
+def test_the_rest_before_a_start_is_searched_when_the_start_of_the_other_arm_is_known(bench, tells: bool) -> None:
+    plans = bench.run(bench.move("left", plan_only=True), bench.move(plan_only=True))
+    bench.robot.latency_ns, bench.robot.tells = 20 * TICK_NS, tells
+    known: list[tuple[int, int]] = []
+    both = (ExecuteRequest(arm, plan.trajectory, 5.0) for arm, plan in zip(("left", "right"), plans, strict=True))
+
+    def each() -> None:
+        left, right = (bench.robot.controllers[arm].goals for arm in ("left", "right"))
+        active = bench.service.coordination.followers["left"].active
+        if right and not known:
+            assert active is not None
+            known.append((active.since_ns - left[0].begin_ns, bench.robot.t_ns - left[0].begin_ns))
+
+    answers = bench.run(*(bench.service.execute(request) for request in both), each=each)
+    assert [answer.code for answer in answers] == [Code.OK, Code.OK]
+    ((error_ns, after_ns),) = known
+    assert abs(error_ns) <= (0 if tells else 2 * TICK_NS)
+    assert after_ns >= (3 * TICK_NS if tells else 200_000_000)
 
 
 def test_a_dual_arm_motion_moves_both_arms_from_the_same_moment(bench) -> None:

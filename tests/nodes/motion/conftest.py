@@ -14,6 +14,7 @@ from openarm_interfaces.action import ExecuteTrajectory, MoveArm, MoveArms, Plan
 from openarm_interfaces.srv import ApplyScene, ComputeIK, GetScene
 from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
 from rclpy.action.client import ClientGoalHandle
+from rclpy.duration import Duration
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
@@ -55,6 +56,8 @@ class FakeRobot:
         self.ignore_regions: set[str] = set()
         #: Sides whose controller gives up after so many seconds of a motion.
         self.fail_after: dict[str, float] = {}
+        #: Whether feedback says how far along its trajectory an arm is.
+        self.tells = True
         self.active: dict[str, tuple[int, list[str], np.ndarray, np.ndarray]] = {}
         self._wake = Future()
         self.goal_ids: list[bytes] = []
@@ -90,6 +93,12 @@ class FakeRobot:
         wake, self._wake = self._wake, Future()
         wake.set_result(None)
 
+    def _progress(self, elapsed_ns: int) -> FollowJointTrajectory.Feedback:
+        feedback = FollowJointTrajectory.Feedback()
+        feedback.header.stamp = ns_to_stamp(self.t_ns)
+        feedback.desired.time_from_start = Duration(nanoseconds=elapsed_ns).to_msg()
+        return feedback
+
     async def _execute(self, side: str, handle) -> FollowJointTrajectory.Result:
         self.goal_ids.append(bytes(handle.goal_id.uuid))
         names, t, q, _, _ = trajectory_from_msg(handle.request.trajectory)
@@ -98,8 +107,12 @@ class FakeRobot:
         result = FollowJointTrajectory.Result(error_code=Result.SUCCESSFUL)
         end_ns = begin_ns + int(t[-1] * 1e9)
         fail_ns = begin_ns + int(self.fail_after.get(side, 1e6) * 1e9)
+        told = False
         while self.t_ns < min(end_ns, fail_ns) and side not in self.ignore_regions and not handle.is_cancel_requested:
             await self._wake
+            if self.tells and not told and self.t_ns > begin_ns:
+                told = True
+                handle.publish_feedback(self._progress(self.t_ns - begin_ns))
         self.active.pop(side)
         if side in self.ignore_regions:
             return result
@@ -176,9 +189,9 @@ class Bench:
         """A goal to a posture at full speed."""
         return MoveArm.Goal(arm=arm, kind=MoveArm.Goal.NAMED, named=posture, velocity_scale=1.0, **kwargs)
 
-    def slow_plan(self) -> JointTrajectory:
+    def slow_plan(self, side: str = "right") -> JointTrajectory:
         """A motion that takes long enough to be disturbed: 40 s of the robot's time, 10 of the wall clock."""
-        goal = self.named(plan_only=True)
+        goal = self.named(side, plan_only=True)
         goal.velocity_scale = 0.02
         return self.run(self.move_client, goal).trajectory
 

@@ -11,6 +11,7 @@ from openarm_interfaces.msg import ApproachTarget, ArmTarget, CollisionBox
 from openarm_common import se3
 from openarm_common.ros.convert import matrix_to_pose
 from openarm_motion.planning.dual_arm import DualArm
+from tests.nodes.motion.conftest import FASTER
 
 MIDDLE = (0.28, 0.0, 0.60)
 
@@ -68,6 +69,19 @@ def test_an_arm_rests_until_the_one_under_way_leaves_room(bench) -> None:
     assert gap >= 0.020
     tip = bench.node.service.arms["right"].kinematics.fk(bench.q("right"))[:3, 3]
     np.testing.assert_allclose(tip, MIDDLE, atol=2e-3)
+
+
+@pytest.mark.requirement("N-12")
+@pytest.mark.parametrize("tells", [True, False])
+def test_an_arm_began_when_its_controller_says(bench, tells: bool) -> None:
+    bench.robot.tells = tells
+    handle, left = bench.begin("left", bench.slow_plan("left"))
+    follower = bench.node.service.coordination.followers["left"]
+    bench.ros.spin_until(lambda: follower.active is not None and follower.active.certain, 5.0, "the start is known")
+    error = abs(follower.active.since_ns - bench.robot.active["left"][0]) * 1e-9
+    assert error == 0.0 if tells else error <= FASTER * 0.5
+    handle.cancel_goal_async()
+    assert bench.ros.result(left).result.code == "CANCELLED"
 
 
 @pytest.mark.requirement("N-12")
