@@ -28,7 +28,8 @@ class BridgeConfig(Config):
         default=-1, ge=-1, description="of the errors of the simulated camera mounts; -1 or none: nominal mounts"
     )
     profile: Profile = Field(
-        default="ideal", description="motors of the arms: stiff servos that carry their weight, or as owners have them"
+        default="openarm",
+        description="motors of the arms: as owners have them; ideal: stiff servos that carry their weight",
     )
     controllers: FaceName = Field(
         default="suite",

@@ -40,7 +40,7 @@ class SimulatedRobot(Generic[ControllerT]):
     def __init__(self, world: World, controller: ControllerT) -> None:
         self.world = world
         self.controller = controller
-        self.faults = WorldFaults(world.joint_names, world.period_ns)
+        self.faults = WorldFaults(world.joint_names)
         self.state: JointReadout = world.read_joints()
         self.targets: Array = self.state.position
 

@@ -19,9 +19,9 @@ from openarm_common.errors import Code, OpenArmError
 #: Folders of tests that mostly wait, for messages and processes: they run while those of the others compute.
 WAITING = ("graph", "nodes")
 
-#: Number of processes that share the tests, file by file, and of processors that they keep busy; tests marked `alone`
-#: run by themselves.
-WORKERS, PROCESSORS = 3, 2
+#: Number of processes that share the tests, file by file, and of processors that they need; tests marked `alone` run by
+#: themselves.
+WORKERS = 2
 #: What pytest can't do, or shows less of, when tests run in other processes.
 NEEDS_ONE_PROCESS = ("-s", "--capture=no", "--pdb", "--trace", "--collect-only", "--co", "no:xdist")
 
@@ -32,7 +32,7 @@ def test(*args: Rest) -> Outcome:
     """Run the tests of cores, nodes and whole graphs.
 
     Args:
-        args: Passed to pytest; without a path, all tests run, in three processes (-n 0: in one).
+        args: Passed to pytest; without a path, all tests run, in two processes (-n 0: in one).
     """
     root = _checkout()
     given_paths = [arg for arg in args if not arg.startswith("-") and (root / arg.partition("::")[0]).exists()]
@@ -108,7 +108,7 @@ def _in_order(tests: Path) -> list[str]:
 
 def _shared_out() -> list[str]:
     """Return options that run tests in several processes, where there are processors for them."""
-    if len(os.sched_getaffinity(0)) < PROCESSORS:
+    if len(os.sched_getaffinity(0)) < WORKERS:
         return []
     return ["-n", str(WORKERS), "--dist", "loadfile", "--no-loadscope-reorder"]
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -15,12 +16,16 @@ from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import QOS_COMMAND, BaseNode
 from openarm_control.controller import RobotController
 from openarm_control.gripper import GripperAction
+from openarm_control.joints import carriers
 from openarm_control.loop import ControlLoop
 from openarm_control.ros.gripper_server import GripperServer
 from openarm_control.ros.trajectory_server import TrajectoryServer
+from openarm_control.servos import KnownServos
 
 #: So many unknown joints of commands are named in the log.
 _NAMED = 20
+#: Identified servos that are stored are in use after this long, s.
+_STORE_PERIOD_S = 1.0
 
 
 class Controllers:
@@ -30,6 +35,7 @@ class Controllers:
         node: Owner.
         loop: Whose thread runs them.
         controller: Of all joints.
+        servos: By which it carries the arms.
         gripper_action: Type of `gripper_cmd`.
         prefix: Of the names of the actions and topics of arms and grippers.
     """
@@ -39,10 +45,11 @@ class Controllers:
         node: BaseNode[Any],
         loop: ControlLoop,
         controller: RobotController,
+        servos: KnownServos,
         gripper_action: GripperAction,
         prefix: str = "",
     ) -> None:
-        self._node, self._loop, self._controller = node, loop, controller
+        self._node, self._loop, self._controller, self._servos = node, loop, controller, servos
         node.create_subscription(JointState, "/joint_commands", self._on_command, QOS_COMMAND)
         self.holds = HoldListener(node)
         self._arms = [
@@ -55,9 +62,10 @@ class Controllers:
         ]
         node.create_service(Trigger, "/stop", self._on_stop)
         node.create_service(Trigger, "~/reset", self._on_reset)
+        node.create_timer(_STORE_PERIOD_S, self._update_servos, clock=node.steady_clock)
+        node.get_logger().info(f"servos: {servos}")
         self._warned: set[str] = set()
-        #: Messages of /joint_commands so far.
-        self.commands = 0
+        self._commands = 0  # since the last report
 
     def destroy(self) -> None:
         """Take the actions away."""
@@ -69,9 +77,27 @@ class Controllers:
         for arm in self._arms:
             arm.publish_state()
 
+    def values(self) -> Mapping[str, object]:
+        """Return what /diagnostics says of them; once a second."""
+        commands, self._commands = self._commands, 0
+        return {
+            **{f"servos_{side}": text for side, text in self._servos.sources.items()},
+            **{f"payload_{side}_kg": f"{arm.carrier.payload:.2f}" for side, arm in self._controller.arms.items()},
+            "commands_per_s": commands,
+            "refused_of_held_arms": self.holds.refused,
+        }
+
+    def _update_servos(self) -> None:
+        """Carry the arms by servos that were identified meanwhile."""
+        if self._servos.update():
+            config = next(iter(self._controller.arms.values())).carrier.config
+            found = carriers(self._node.description, config, self._servos.models)
+            self._loop.call(lambda: self._controller.carry_by(found))
+            self._node.get_logger().info(f"servos: {self._servos}")
+
     def _on_command(self, message: JointState) -> None:
         """Follow position targets of some or all joints."""
-        self.commands += 1
+        self._commands += 1
         controller, logger = self._controller, self._node.get_logger()
         try:
             self._loop.check_able()

@@ -7,31 +7,26 @@ streams positions to the driver that make up for weight, friction, damping and l
 
 from __future__ import annotations
 
-import gc
-import sys
-import traceback
 from typing import Any
 
 import numpy as np
 
 from openarm_common.robot.description import SIDES, Side
 from openarm_common.robot.servos import ServoModel
-from openarm_common.ros.node import BaseNode, run
+from openarm_common.ros.node import run
 from openarm_control.config import ArmControlConfig
 from openarm_control.controller import RobotController
 from openarm_control.joints import JointReadout, arm_groups, arm_loads, carriers, gripper_groups, joint_names
-from openarm_control.priority import use_fifo
 from openarm_control.ros.controllers import Controllers
 from openarm_control.ros.position_driver import PositionDriver
+from openarm_control.ros.process import ControlNode, timely
 from openarm_control.servos import KnownServos
 from openarm_control.streamed import StreamedRobot
 
 PREFIX = "/arm_control"
-#: Identified servos that are stored are in use after this long, s.
-STORE_PERIOD_S = 1.0
 
 
-class ArmControl(BaseNode[ArmControlConfig]):
+class ArmControl(ControlNode[ArmControlConfig]):
     """Carries the arms of a robot behind openarm_ros2."""
 
     def __init__(self, **kwargs: Any) -> None:
@@ -41,7 +36,7 @@ class ArmControl(BaseNode[ArmControlConfig]):
             side: config.servos.model(load) for side, load in arm_loads(description).items()
         }
         seed = None if config.dynamics_seed < 0 else config.dynamics_seed
-        self._servos = KnownServos(known, config.calibrations, seed, self.get_logger().warning)
+        servos = KnownServos(known, config.calibrations, seed, self.get_logger().warning)
         names, effort = joint_names(description), dict[Side, float].fromkeys(SIDES, np.inf)
         controller = RobotController(
             arm_groups(description),
@@ -51,22 +46,19 @@ class ArmControl(BaseNode[ArmControlConfig]):
             effort,
             config.trajectory,
             config.gripper,
-            carriers(description, config.trajectory.carrier, self._servos.models),
+            carriers(description, config.trajectory.carrier, servos.models),
         )
         self._driver = PositionDriver(self, controller, config.topics.arm, config.topics.gripper, PREFIX)
-        self._loop = StreamedRobot(controller, self._driver, config.stale_after, self._observe, self._on_crash)
-        self._controllers = Controllers(self, self._loop, controller, config.gripper_action, PREFIX)
+        self._loop = StreamedRobot(controller, self._driver, config.stale_after, self._observe, self.on_crash)
+        self._controllers = Controllers(self, self._loop, controller, servos, config.gripper_action, PREFIX)
         self._controller = controller
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
-        self.create_timer(STORE_PERIOD_S, self._update_servos, clock=self.steady_clock)
-        self.get_logger().info(f"servos: {self._servos}")
-        self._scheduling = ""
         self._loop.start()
 
-    def use_real_time_priority(self) -> None:
-        """Request real-time scheduling of this process."""
-        self._scheduling = use_fifo(self.config.thread_priority)
-        self.get_logger().info(f"scheduled as {self._scheduling}")
+    @property
+    def priority(self) -> int:
+        """See `ControlNode.priority`."""
+        return self.config.thread_priority
 
     async def hold(self) -> None:
         """End all motions; the arms hold where they are."""
@@ -82,18 +74,6 @@ class ArmControl(BaseNode[ArmControlConfig]):
     def _observe(self, _: JointReadout) -> None:
         self._controllers.publish_states()
 
-    def _update_servos(self) -> None:
-        """Carry the arms by servos that were identified meanwhile."""
-        if self._servos.update():
-            found = carriers(self.description, self.config.trajectory.carrier, self._servos.models)
-            self._loop.call(lambda: self._controller.carry_by(found))
-            self.get_logger().info(f"servos: {self._servos}")
-
-    def _on_crash(self, error: Exception) -> None:
-        """End the process after an unexpected error of the loop, so that it is restarted."""
-        self.get_logger().fatal(f"the control thread ended: {error!r}\n{''.join(traceback.format_exception(error))}")
-        self.context.try_shutdown()
-
     def _report(self) -> None:
         stopped = "the emergency stop is latched" if self._loop.stopped else ""
         fault, period = self._driver.refused or self._loop.fault or stopped, self._loop.periods.figures()
@@ -102,20 +82,14 @@ class ArmControl(BaseNode[ArmControlConfig]):
             fault or "running",
             period_p50_ms=f"{period.p50_ms:.2f}",
             period_p99_ms=f"{period.p99_ms:.2f}",
-            scheduling=self._scheduling,
-            **{f"servos_{side}": text for side, text in self._servos.sources.items()},
-            **{f"payload_{side}_kg": f"{arm.carrier.payload:.2f}" for side, arm in self._controller.arms.items()},
+            scheduling=self.scheduling,
+            **self._controllers.values(),
         )
 
 
 def make() -> ArmControl:
     """Make the node for a process of its own."""
-    sys.setswitchinterval(0.0005)  # the control thread must not wait 5 ms, the default, for another one
-    node = ArmControl()
-    node.use_real_time_priority()
-    gc.collect()
-    gc.freeze()  # what is there now stays; later collections are short
-    return node
+    return timely(ArmControl)
 
 
 def main() -> None:

@@ -62,7 +62,7 @@ class CampaignOptions:
         workers: Processes.
         noise: Depth as noisy as a D435's.
         mount_seeds: True camera mounts to go through, such as 1-10; each is calibrated first. Nominal when not given.
-        profile: Motors of the arms: ideal, or openarm as owners have them.
+        profile: Motors of the arms: openarm as owners have them, or ideal.
         dynamics_seeds: Motors, masses and joint zeros to go through with the profile openarm, such as 1-10.
         controllers: Of the robot: suite, or openarm_ros2 with the profile openarm, through the graph alone.
         identify: Whether the servos of each draw are identified first.
@@ -77,7 +77,7 @@ class CampaignOptions:
     workers: Annotated[int, Parameter(validator=Number(gte=1))] = 1
     noise: bool = False
     mount_seeds: Seeds = ()
-    profile: Profile = "ideal"
+    profile: Profile = "openarm"
     controllers: FaceName = "suite"
     dynamics_seeds: Seeds = (1,)
     identify: Annotated[bool, Parameter(negative="--no-identify")] = True
@@ -124,8 +124,10 @@ class CampaignOptions:
         ]
         parts.append("--noise" if self.noise else "")
         parts.append("--mount-seeds " + ",".join(map(str, self.mount_seeds)) if self.mount_seeds else "")
-        if self.profile != "ideal":
-            parts.append(f"--profile {self.profile} --dynamics-seeds " + ",".join(map(str, self.dynamics_seeds)))
+        if self.profile == "ideal":
+            parts.append("--profile ideal")
+        else:
+            parts.append("--dynamics-seeds " + ",".join(map(str, self.dynamics_seeds)))
             parts.append("" if self.controllers == "suite" else f"--controllers {self.controllers}")
             parts.append("" if self.identify else "--no-identify")
         parts.append("" if self.use_effort else "--no-effort")

@@ -46,7 +46,7 @@ def campaign(
     if detectors and against is not None:
         raise OpenArmError(Code.INVALID_ARGUMENT, "--against compares one campaign with another; leave --detectors out")
     if options.controllers != "suite" and not (graph and options.profile == "openarm"):
-        text = f"--controllers {options.controllers} needs --graph and --profile openarm"
+        text = f"--controllers {options.controllers} needs --graph and the profile openarm"
         raise OpenArmError(Code.INVALID_ARGUMENT, f"{text}: it is of the robot as owners have it, over DDS")
     folder = (out or runs.new_run_dir()).resolve()
     others = rows_of(against) if against is not None else []

@@ -7,7 +7,6 @@ Targets (n,) and joint columns are in the order of the world's joints; times are
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import mujoco
 import numpy as np
@@ -35,19 +34,16 @@ class WorldFaults:
 
     Args:
         joint_names: Order of the targets; the name says the side (`left`, `right`) and whether it is a finger.
-        period_ns: Length of a control tick.
     """
 
-    def __init__(self, joint_names: tuple[str, ...], period_ns: int) -> None:
+    def __init__(self, joint_names: tuple[str, ...]) -> None:
         self._names = joint_names
-        self._period_ns = period_ns
         self._faults: dict[str, Fault] = {}
         self._model: mujoco.MjModel | None = None
         self._friction: Array = np.zeros(0)
         self._gravcomp: Array = np.zeros(0)
         self._changed = False
         self._stuck: dict[int, float] = {}
-        self._late: deque[Array] = deque()
 
     @property
     def active(self) -> tuple[str, ...]:
@@ -75,7 +71,6 @@ class WorldFaults:
     def _renew(self) -> None:
         self._changed = True
         self._stuck.clear()
-        self._late.clear()
 
     def prepare(self, world: World) -> None:
         """Put the faults into the model, once after each change of faults or model; before a tick."""
@@ -83,10 +78,13 @@ class WorldFaults:
             self._model = world.model
             self._friction = world.model.geom_friction.copy()
             self._gravcomp = world.model.body_gravcomp.copy()
-            self._changed = bool(self._faults)
+            self._changed |= bool(self._faults)
         if not self._changed:
             return
         self._changed = False
+        late = self._of(JointLate)
+        delays = [late.ms * 1e-3 if late is not None and late.hits(_side(name)) else 0.0 for name in self._names]
+        world.delay_commands(np.array(delays))
         model = world.model
         model.geom_friction[:] = self._friction
         model.body_gravcomp[:] = self._gravcomp
@@ -102,12 +100,6 @@ class WorldFaults:
         if not self._faults:
             return wanted
         out = wanted.copy()
-        if (late := self._of(JointLate)) is not None:
-            self._late.append(wanted.copy())
-            ticks = round(late.ms * 1e6 / self._period_ns)
-            before = self._late.popleft() if len(self._late) > ticks else self._late[0]
-            hit = [i for i, name in enumerate(self._names) if late.hits(_side(name))]
-            out[hit] = before[hit]
         if (stuck := self._of(GripperStuck)) is not None:
             for i, name in enumerate(self._names):
                 if "finger" in name and stuck.hits(_side(name)):

@@ -9,7 +9,7 @@ from typing import Any
 
 from openarm_common.ros.node import BaseNode
 from openarm_control.controller import JointController
-from openarm_control.joints import JointReadout, carriers
+from openarm_control.joints import JointReadout
 from openarm_control.ros.controllers import Controllers
 from openarm_control.servos import KnownServos
 from openarm_sim_bridge.config import BridgeConfig
@@ -20,9 +20,6 @@ from openarm_sim_bridge.ros.sensor_publisher import SensorPublisher
 from openarm_sim_bridge.simulation import Simulation
 from openarm_sim_bridge.world.stage import Stage
 from openarm_sim_bridge.world.world import World
-
-#: Identified servos that are stored are in use after this long, s.
-STORE_PERIOD_S = 1.0
 
 
 class Face(ABC):
@@ -69,16 +66,11 @@ class SuiteFace(Face):
         self._servos = KnownServos(stage.servos, config.calibrations, seed, node.get_logger().warning)
         self._robot = SimulatedRobot.controllers(stage, world, config.trajectory, config.gripper, self._servos.models)
         self.controller = self._robot
-        self._commands = 0
 
     def serve(self, simulation: Simulation) -> None:
         """See `Face.serve`."""
-        node = self._node
-        self._simulation = simulation
-        self._sensors = SensorPublisher(node)
-        self._controllers = Controllers(node, simulation, self._robot, self._config.gripper_action)
-        node.create_timer(STORE_PERIOD_S, self._update_servos, clock=node.steady_clock)
-        node.get_logger().info(f"servos: {self._servos}")
+        self._sensors = SensorPublisher(self._node)
+        self._controllers = Controllers(self._node, simulation, self._robot, self._servos, self._config.gripper_action)
 
     def publish(self, state: JointReadout, world: World) -> JointReadout:
         """See `Face.publish`."""
@@ -88,24 +80,11 @@ class SuiteFace(Face):
 
     def values(self) -> Mapping[str, object]:
         """See `Face.values`."""
-        commands, self._commands = self._controllers.commands - self._commands, self._controllers.commands
-        return {
-            **{f"servos_{side}": text for side, text in self._servos.sources.items()},
-            "commands_per_s": commands,
-            "refused_of_held_arms": self._controllers.holds.refused,
-        }
+        return self._controllers.values()
 
     def close(self) -> None:
         """See `Face.close`."""
         self._controllers.destroy()
-
-    def _update_servos(self) -> None:
-        """Carry the arms by servos that were identified meanwhile."""
-        if not self._servos.update():
-            return
-        found = carriers(self._node.description, self._config.trajectory.carrier, self._servos.models)
-        self._simulation.call(lambda: self._robot.carry_by(found))
-        self._node.get_logger().info(f"servos: {self._servos}")
 
 
 class OpenArmRos2Face(Face):

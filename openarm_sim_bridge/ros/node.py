@@ -8,10 +8,7 @@ share data only through `Simulation.call`. The cameras are drawn and published b
 
 from __future__ import annotations
 
-import gc
 import os
-import sys
-import traceback
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,10 +19,10 @@ from std_msgs.msg import Float64
 from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.resources import config_dir
-from openarm_common.ros.node import BaseNode, reliable, run
+from openarm_common.ros.node import reliable, run
 from openarm_common.scene.scene import load_scene
 from openarm_control.joints import JointReadout
-from openarm_control.priority import use_fifo
+from openarm_control.ros.process import ControlNode, timely
 from openarm_sim_bridge.cameras.camera_feed import CameraFeed
 from openarm_sim_bridge.cameras.handover import CameraSetup
 from openarm_sim_bridge.config import BridgeConfig
@@ -54,7 +51,7 @@ _SLOW = 0.9
 _LATE_MS = 15.0
 
 
-class MujocoBridge(BaseNode[BridgeConfig]):
+class MujocoBridge(ControlNode[BridgeConfig]):
     """The simulation with its topics, services and actions.
 
     Raises:
@@ -76,7 +73,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             self._observe,
             speed=config.speed,
             wall_stamps=self._face.wall_stamps,
-            crashed=self._on_crash,
+            crashed=self.on_crash,
         )
         self._simulation.set_paused(config.paused)
 
@@ -98,7 +95,6 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             self, self._simulation, cameras if self._images is not None else (), self._set_camera_faults
         )
 
-        self._scheduling = ""
         self._drawn = dict.fromkeys(cameras, 0)
         self.create_timer(REPORT_PERIOD_S, self._report, clock=self.steady_clock)
 
@@ -110,12 +106,10 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         self._simulation.start()
         self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation is running")
 
-    def use_real_time_priority(self) -> None:
-        """Request real-time scheduling of this process, where the simulation waits for the wall clock."""
-        # As fast as it can, it would take a core from everything else.
-        if 0.0 < self.config.speed <= 1.0:
-            self._scheduling = use_fifo(self.config.thread_priority)
-            self.get_logger().info(f"scheduled as {self._scheduling}")
+    @property
+    def priority(self) -> int:
+        """See `ControlNode.priority`; a simulation as fast as it can would take a core from everything else."""
+        return self.config.thread_priority if 0.0 < self.config.speed <= 1.0 else 0
 
     def close(self) -> None:
         """Stop physics and drawing, then the node."""
@@ -161,11 +155,6 @@ class MujocoBridge(BaseNode[BridgeConfig]):
         elif faults:
             raise OpenArmError(Code.NOT_READY, "there are no cameras: the parameter images is false")
 
-    def _on_crash(self, error: Exception) -> None:
-        """End the process after an unexpected error of the physics, so that it is restarted."""
-        self.get_logger().fatal(f"the physics thread ended: {error!r}\n{''.join(traceback.format_exception(error))}")
-        self.context.try_shutdown()
-
     def _report(self) -> None:
         """Report once per second how well the simulation keeps time."""
         simulation, config = self._simulation, self.config
@@ -193,7 +182,7 @@ class MujocoBridge(BaseNode[BridgeConfig]):
             joint_state_period_p50_ms=f"{period.p50_ms:.2f}",
             joint_state_period_p99_ms=f"{period.p99_ms:.2f}",
             joint_state_period_max_ms=f"{period.max_ms:.2f}",
-            scheduling=self._scheduling,
+            scheduling=self.scheduling,
             profile=config.profile,
             **values,
             wall_time_skipped_s=f"{simulation.skipped_s:.2f}",
@@ -207,16 +196,11 @@ class MujocoBridge(BaseNode[BridgeConfig]):
 
 def make() -> MujocoBridge:
     """Make the node for a process of its own."""
-    # The physics thread must not wait 5 ms (the default) for another thread to let go of the interpreter.
-    sys.setswitchinterval(0.0005)
     if PROFILE in os.environ:
         os.environ[LARGE_PROFILE] = os.environ[PROFILE]
         os.environ[PROFILE] = str(config_dir() / "fastdds_small.xml")
-    node = MujocoBridge()
+    node = timely(MujocoBridge)
     mujoco.set_mju_user_warning(lambda text: node.get_logger().warning(f"MuJoCo: {text}"))  # not into a file
-    node.use_real_time_priority()
-    gc.collect()
-    gc.freeze()  # what is there now stays; later collections are short
     return node
 
 

@@ -108,10 +108,9 @@ class World:
         self.t_ns = 0
         self._home = dict(home)
         self._encoders = encoders or Encoders.exact(len(self.joint_names))
-        delays: Ints = np.round(1e9 * self._encoders.latency_s).astype(np.int64)
-        self._latencies = [(int(ns), np.flatnonzero(delays == ns)) for ns in np.unique(delays)]
         #: Targets that have not taken effect yet: when they do, of which joints, and what.
         self._late: list[tuple[int, Index, Array]] = []
+        self.delay_commands(np.zeros(len(self.joint_names)))
         self._use(self.compile(spec, objects))
         self.reset()
 
@@ -172,6 +171,12 @@ class World:
             due_ns = self.t_ns + round(latency_ns / self.timestep_ns) * self.timestep_ns
             insort(self._late, (due_ns, joints, true[joints]), key=_due)
         self._take_due(self.t_ns)
+
+    def delay_commands(self, seconds: Array) -> None:
+        """Let targets take effect so much (n,) later than the robot's latency; those under way are forgotten."""
+        delays: Ints = np.round(1e9 * (self._encoders.latency_s + seconds)).astype(np.int64)
+        self._latencies = [(int(ns), np.flatnonzero(delays == ns)) for ns in np.unique(delays)]
+        self._late.clear()
 
     def set_effort_limits(self, limits: Array) -> None:
         """Limit the effort (n,) of the actuators, N m or N; the limit of the model is never exceeded."""

@@ -22,7 +22,10 @@ def frequent_reports(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Bench:
-    """A bridge, and what has been heard from it. Joint values of the right arm, rad."""
+    """A bridge, whose arms are ideal where nothing else is asked for, and what has been heard from it.
+
+    Joint values of the right arm, rad.
+    """
 
     ARM = tuple(f"openarm_{SIDE}_joint{i}" for i in range(1, 8))
     FINGER = f"openarm_{SIDE}_finger_joint1"
@@ -39,6 +42,7 @@ class Bench:
         from openarm_sim_bridge.ros.node import MujocoBridge
 
         self.ros = ros
+        parameters = {"profile": "ideal", **parameters}
         overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
         self.node = ros.add(MujocoBridge(parameter_overrides=overrides))
         self.joints: list[JointState] = []

@@ -31,7 +31,9 @@ def robot(bridge) -> Bench:
 @pytest.fixture
 def bench(robot: Bench) -> Bench:
     """And the node before it."""
-    robot.ros.add(ArmControl(parameter_overrides=[Parameter("dynamics_seed", value=1)]))
+    # in one process with the robot and this test, neither of them in real time
+    patient = Parameter("stale_after", value=2.0)
+    robot.ros.add(ArmControl(parameter_overrides=[Parameter("dynamics_seed", value=1), patient]))
     robot.passed_on = robot.collect(JointState, "/arm_control/joint_states", QOS_COMMAND)
     name = "/arm_control/right_joint_trajectory_controller/controller_state"
     robot.states = robot.collect(JointTrajectoryControllerState, name, QOS_COMMAND)

@@ -173,7 +173,7 @@ def test_heavy_soft_late_arms_with_wrong_zeros_are_identified_and_place_an_objec
         "left.yaml",
         "right.yaml",
     ]
-    assert "--profile openarm --dynamics-seeds 41" in row["again"]
+    assert "--dynamics-seeds 41" in row["again"]
 
 
 @pytest.mark.requirement("B-01", "B-70", "R-18")

@@ -48,4 +48,4 @@ def test_without_calibration_the_grasp_fails_and_says_so() -> None:
 def test_without_the_map_the_arm_runs_into_the_screen() -> None:
     row, pushed = grasp("motion.map.use=off")
     assert not row["placed"]
-    assert pushed > 0.02
+    assert pushed > 0.01

@@ -70,8 +70,8 @@ class DynamicsClient(MotionClient):
         if profile.string_value == "ideal":
             raise OpenArmError(
                 Code.INVALID_ARGUMENT,
-                "the servos of the profile `ideal` are known: start the graph with `--set"
-                " mujoco_bridge.profile=openarm` to identify those of a robot as owners have it",
+                "the servos of the profile `ideal` are known: start the graph with the default one, `openarm`, to"
+                " identify those of a robot as owners have it",
             )
         return int(seed.integer_value)
 
