@@ -127,6 +127,7 @@ class BackgroundNode(ContextNode):
         self._watches: dict[str, Watch] = {}
         self._making = threading.Lock()
         self._closing = threading.Event()
+        self._ended = ""
         self._thread = threading.Thread(target=self._spin, name=name, daemon=True)
         self._thread.start()
 
@@ -300,14 +301,15 @@ class BackgroundNode(ContextNode):
         missed, stopped = 0, False
         while not done.wait(_CHECK_S):
             meanwhile()
+            if not self._thread.is_alive():
+                why = self._ended or ("it was closed" if self._closing.is_set() else "its context was shut down")
+                raise OpenArmError(Code.NOT_READY, f"the client ended while waiting for {name}: {why}")
             check_alive(died, name)
             missed = 0 if there() else missed + 1
             if missed > _GONE:
                 raise OpenArmError(Code.NOT_READY, f"the server of {name} is gone")
             if trouble:
                 raise trouble[0]
-            if not self._thread.is_alive():
-                raise OpenArmError(Code.NOT_READY, f"the client was closed while waiting for {name}")
             if time.monotonic() > deadline:
                 raise OpenArmError(Code.TIMEOUT, f"no answer of {name} within {timeout:g} s")
             if stop is not None and stop.is_set() and not stopped:
@@ -337,6 +339,10 @@ class BackgroundNode(ContextNode):
                     return
                 self._node.get_logger().error(f"what arrived could not be handled, the rest goes on: {error!r}")
                 self._closing.wait(_CHECK_S)  # of an error that stays, a few lines a second
+            except BaseException as error:  # it is to end, as by sys.exit
+                self._ended = repr(error)
+                self._node.get_logger().error(f"the thread of the client ends: {error!r}")
+                return
 
 
 def _check(name: str, message: Any) -> None:

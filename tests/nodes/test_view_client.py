@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import json
+import sys
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -12,18 +14,19 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.ros.client import BackgroundNode
 
 
 class Looking:
     """A view of the graph of a test, and the newest that it has seen of each key."""
 
-    def __init__(self, ros) -> None:
+    def __init__(self, ros, timeout: float = 0.3) -> None:
         from openarm_bringup.view.ros.page import GraphView
 
         self.ros = ros
         self.seen: dict[str, Any] = {}
         self.ended: list[BaseException] = []
-        self.view = GraphView(self._take, self.ended.append, timeout=0.3)
+        self.view = GraphView(self._take, self.ended.append, timeout=timeout)
 
     def _take(self, item) -> None:
         self.seen[item.key] = item.payload
@@ -40,6 +43,51 @@ def looking(ros):
     made = Looking(ros)
     with made.view:
         yield made
+
+
+@pytest.fixture
+def patient(ros):
+    """A view that gives servers time to be discovered."""
+    made = Looking(ros, timeout=10.0)
+    with made.view:
+        yield made
+
+
+def serve(ros) -> None:
+    """Offer what the page asks for."""
+    from action_msgs.srv import CancelGoal
+    from openarm_interfaces.srv import ResetWorld
+    from std_srvs.srv import Trigger
+
+    def answered(_: Any, response: Any) -> Any:
+        response.success, response.message = True, "heard"
+        return response
+
+    ros.node.create_service(ResetWorld, "/sim/reset_world", answered)
+    for name in ("/stop", "~/reset"):
+        ros.node.create_service(Trigger, name, answered)
+    ros.node.create_service(CancelGoal, "/grasp/pick/_action/cancel_goal", lambda _, response: response)
+
+
+def begin(question: Callable[[], Any]) -> list[Any]:
+    """Ask in a thread; the returned list gets the answer, or the error in its place."""
+    ended: list[Any] = []
+
+    def run() -> None:
+        try:
+            ended.append(question())
+        except OpenArmError as error:
+            ended.append(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return ended
+
+
+def ask(ros, question: Callable[[], Any]) -> Any:
+    """The answer to a question, or the error in its place."""
+    ended = begin(question)
+    ros.spin_until(lambda: ended, 20.0, "an answer")
+    return ended[0]
 
 
 def test_a_cloud_is_made_of_depth_and_colour_of_one_stamp(ros, looking: Looking) -> None:
@@ -194,43 +242,107 @@ def test_without_a_graph_every_question_has_an_answer(looking: Looking) -> None:
 
 def test_no_request_ends_the_client(ros, looking: Looking) -> None:
     """A value that no message can hold is refused; the same client then still resets, stops and cancels."""
-    from action_msgs.srv import CancelGoal
-    from openarm_interfaces.srv import ResetWorld
-    from std_srvs.srv import Trigger
-
     from openarm_bringup.view.server import Order, Reset
 
-    def answered(_: Any, response: Any) -> Any:
-        response.success, response.message = True, "heard"
-        return response
-
-    ros.node.create_service(ResetWorld, "/sim/reset_world", answered)
-    for name in ("/stop", "~/reset"):
-        ros.node.create_service(Trigger, name, answered)
-    ros.node.create_service(CancelGoal, "/grasp/pick/_action/cancel_goal", lambda _, response: response)
+    serve(ros)
     view = looking.view
-
-    def ask(question: Callable[[], Any]) -> Any:
-        ended: list[Any] = []
-
-        def run() -> None:
-            try:
-                ended.append(question())
-            except OpenArmError as error:
-                ended.append(error)
-
-        threading.Thread(target=run, daemon=True).start()
-        ros.spin_until(lambda: ended, 10.0, "an answer")
-        return ended[0]
-
-    refused = ask(lambda: view.reset(Reset.model_construct(scene="", seed=2**63)))
+    refused = ask(ros, lambda: view.reset(Reset.model_construct(scene="", seed=2**63)))
     assert isinstance(refused, OpenArmError)
     assert refused.code is Code.INVALID_ARGUMENT, refused
     assert (
         "/sim/reset_world can't be asked that: seed is 9223372036854775808; expected a whole number" in refused.message
     )
-    assert ask(lambda: view.reset(Reset(seed=3))) == (True, "heard")
-    assert ask(view.stop) == (True, "heard")
-    assert ask(view.release) == (True, "heard")
-    assert ask(view.cancel) == (False, "no grasp runs that was asked for by /grasp/pick")
-    assert ask(lambda: view.pick(Order())).code is Code.NOT_READY
+    assert ask(ros, lambda: view.reset(Reset(seed=3))) == (True, "heard")
+    assert ask(ros, view.stop) == (True, "heard")
+    assert ask(ros, view.release) == (True, "heard")
+    assert ask(ros, view.cancel) == (False, "no grasp runs that was asked for by /grasp/pick")
+    assert ask(ros, lambda: view.pick(Order())).code is Code.NOT_READY
+
+
+def test_what_fails_in_the_thread_of_the_client_is_said_and_does_not_end_it(ros, patient: Looking, capfd) -> None:
+    from openarm_bringup.view.server import Reset
+
+    def fail() -> None:
+        raise RuntimeError("a fault of the test")
+
+    serve(ros)
+    said = ""
+
+    def is_said() -> bool:
+        nonlocal said
+        said += capfd.readouterr().err
+        return "RuntimeError('a fault of the test')" in said
+
+    client = patient.view._ask
+    client._executor.create_task(fail)
+    ros.spin_until(is_said, 10.0, "a line of the log")
+    assert "what arrived could not be handled, the rest goes on: RuntimeError" in said
+    assert ask(ros, lambda: patient.view.reset(Reset(seed=3))) == (True, "heard")
+    assert client._thread.is_alive()
+
+
+def test_stop_and_cancel_are_answered_while_another_request_is_stuck(ros, patient: Looking) -> None:
+    from openarm_bringup.view.server import Reset
+
+    serve(ros)
+    view, stuck, go_on = patient.view, threading.Event(), threading.Event()
+    cancelled = (False, "no grasp runs that was asked for by /grasp/pick")
+    assert ask(ros, view.stop) == (True, "heard")  # the servers are discovered
+    assert ask(ros, view.cancel) == cancelled
+
+    def stick() -> None:
+        stuck.set()
+        go_on.wait(60.0)
+
+    view._ask._executor.create_task(stick)
+    try:
+        ros.spin_until(stuck.is_set, 10.0, "a client that is stuck")
+        reset = begin(lambda: view.reset(Reset(seed=3)))
+        for question, answer in ((view.stop, (True, "heard")), (view.cancel, cancelled)):
+            began = time.monotonic()
+            assert ask(ros, question) == answer
+            assert time.monotonic() - began < 2.0
+        assert not reset, "the other client was not stuck"
+    finally:
+        go_on.set()
+    ros.spin_until(lambda: reset, 20.0, "an answer")
+    assert reset == [(True, "heard")]
+
+
+def test_a_layer_that_can_t_be_made_ends_the_view_with_its_error(ros, looking: Looking, monkeypatch) -> None:
+    def fail(_: object) -> None:
+        raise RuntimeError("a fault of the test")
+
+    monkeypatch.setitem(looking.view._makers, "robot", fail)
+    looking.view.want(frozenset({"robot"}))
+    ros.spin_until(lambda: looking.ended, 10.0, "the end of the view")
+    assert [repr(error) for error in looking.ended] == ["RuntimeError('a fault of the test')"]
+
+
+@pytest.mark.parametrize(
+    ("end", "why"),
+    [
+        (lambda client: client.close(), "it was closed"),
+        (lambda client: client._context.try_shutdown(), "its context was shut down"),
+        (lambda client: client._executor.create_task(sys.exit, 3), "SystemExit(3)"),
+    ],
+)
+def test_a_request_whose_client_ends_says_why(ros, end: Callable[[BackgroundNode], object], why: str) -> None:
+    from rclpy.task import Future
+    from std_srvs.srv import Trigger
+
+    asked: list[Trigger.Request] = []
+    never = Future()
+
+    async def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        asked.append(request)
+        await never
+        return response
+
+    ros.node.create_service(Trigger, "/slow", answer)
+    with BackgroundNode("client") as client:
+        ended = begin(lambda: client.call(Trigger, "/slow", Trigger.Request()))
+        ros.spin_until(lambda: asked, 20.0, "the request")
+        end(client)
+        ros.spin_until(lambda: ended, 10.0, "the end of the request")
+    assert (ended[0].code, ended[0].message) == (Code.NOT_READY, f"the client ended while waiting for /slow: {why}")
