@@ -16,9 +16,11 @@ from trajectory_msgs.msg import JointTrajectory
 from vision_msgs.msg import Detection3DArray
 from visualization_msgs.msg import MarkerArray
 
+from benchmarks.fuzz import __main__ as fuzz
 from benchmarks.fuzz.files import KINDS, read_altered
+from benchmarks.fuzz.graph import Lot
 from benchmarks.fuzz.hostile import hostile, plausible
-from benchmarks.fuzz.judge import Tally
+from benchmarks.fuzz.judge import BOUND_MIB, Tally
 from openarm_bringup.view.ros.layers import _show_robot, _text
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
@@ -28,13 +30,15 @@ from openarm_motion.ros import convert as motion
 
 
 @pytest.mark.requirement("R-22")
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "contents"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_altered_files_are_read_or_refused_in_a_sentence(kind: str) -> None:
-    tally = read_altered(kind, 60, 11)
+    tally = read_altered(kind, 8 if kind == "contents" else 60, 11)
     assert not tally.raw, tally.raw
     assert not tally.hangs
+    assert tally.worst_mib < BOUND_MIB
+    assert tally.sound
     assert tally.accepted
-    assert tally.refused > 10
+    assert tally.refused > (0 if kind == "contents" else 10)
 
 
 def _edges(message: TFMessage) -> None:
@@ -97,3 +101,33 @@ def test_what_is_no_sentence_is_counted_as_a_raw_error() -> None:
     for work in (lambda: None, lambda: refuse("no"), lambda: refuse("one\ntwo"), lambda: [][0]):
         tally.take(work)
     assert (tally.inputs, tally.accepted, tally.refused, tally.raw.total()) == (4, 1, 2, 2)
+
+
+def test_the_memory_of_an_input_is_measured_and_too_much_of_it_ends_the_run_with_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tally = Tally("bags")
+    tally.take(lambda: bytearray(b"x") * (64 * 2**20))
+    assert 60.0 < tally.worst_mib < 130.0
+    assert tally.sound
+    monkeypatch.setattr(fuzz, "in_a_process", lambda *_: [tally])
+    monkeypatch.setattr("sys.argv", ["fuzz", "--only", "bags"])
+    for worst, code in ((tally.worst_mib, 0), (BOUND_MIB + 1.0, 1)):
+        tally.worst_mib = worst
+        with pytest.raises(SystemExit) as ended:
+            fuzz.main()
+        assert ended.value.code == code
+    assert f"{BOUND_MIB + 1.0:9.1f}" in capsys.readouterr().out
+
+
+def test_each_name_is_drawn_before_any_comes_again() -> None:
+    lot, names = Lot(random.Random(0)), list("abcdefgh")
+    drawn = [lot.draw(names) for _ in names]
+    assert sorted(drawn) == names
+    assert drawn != names
+    assert lot.rounds == 1
+    drawn = [lot.draw(names) for _ in range(3)]
+    drawn += [lot.draw([*names, "new"]) for _ in range(6)]
+    assert sorted(drawn) == [*names, "new"]
+    assert lot.rounds == 2
+    assert lot.draw(["other"]) == "other"

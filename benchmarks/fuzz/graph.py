@@ -10,7 +10,7 @@ import re
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,11 @@ ALIVE_S, ANSWER_S = 2.0, 20.0
 #: A goal is cancelled after this time, s.
 _GOAL_S = 1.0
 #: Written by what should not happen.
-_DEFECT = re.compile(r"^.*(Error raised in|physics thread ended|Exception in|exception was never).*$", re.MULTILINE)
+_DEFECT = re.compile(
+    r"^.*(Error raised in|(physics|control) thread ended|Exception in|exception was never).*$", re.MULTILINE
+)
+#: Names that both nodes offer that control arms.
+_OF_BOTH = ("/stop", "/joint_commands")
 _CAMERA = re.compile(r"/(?P<camera>\w+)/(?P<stream>color|depth)/(image_raw|camera_info)")
 
 
@@ -57,6 +61,7 @@ class Nodes:
         from openarm_bringup.view.ros.layers import makers
         from openarm_calibration.ros.node import CalibrationNode
         from openarm_calibration.ros.publisher import PublisherNode
+        from openarm_control.ros.node import ArmControl
         from openarm_grasp.ros.node import GraspNode
         from openarm_motion.ros.node import MotionNode
         from openarm_octomap.ros.node import OctomapNode
@@ -75,6 +80,9 @@ class Nodes:
         self._spin(self.probe)
         self._alive = {}
         store = str(folder / "store")
+        # Both offer these; and what it commands is not the robot of the bridge, which others command.
+        behind = {f"topics.{part}": f"/arm_control/{{arm}}_{part}/joint_trajectory" for part in ("arm", "gripper")}
+        remaps = [part for name in _OF_BOTH for part in ("-r", f"{name}:=/arm_control{name}")]
         for kind, parameters in (
             (MujocoBridge, {"images": False}),
             (PublisherNode, {"store": store}),
@@ -85,15 +93,19 @@ class Nodes:
             (GraspNode, {}),
             (CalibrationNode, {"store": store, "camera": "wrist"}),
             (FlightRecorder, {"folder": str(folder / "recordings")}),
+            (ArmControl, {"calibrations": store, **behind}),
         ):
             overrides = [Parameter(name, value=value) for name, value in parameters.items()]
-            node: Any = kind(parameter_overrides=overrides)
+            arguments = ["--ros-args", *remaps] if kind is ArmControl else []
+            node: Any = kind(parameter_overrides=overrides, cli_args=arguments)
             self.nodes.append(node)
             self._spin(node)
         self._listen()
         #: What the page shows; polled, not spun.
         self.page: Any = Node("page")
         cameras = list(load_cameras().values())
+        #: Nodes whose subscriptions are polled: they are not spun.
+        self.polled = (self.page, *(node._driver._listener for node in self.nodes if isinstance(node, ArmControl)))
         self.layers = [make(self.page) for make in makers(RobotDescription.load(), cameras, "overhead").values()]
 
     def _spin(self, node: Any) -> None:
@@ -179,6 +191,30 @@ class Nodes:
         rclpy.try_shutdown()
 
 
+class Lot:
+    """Draws from what there is at the time, what was not drawn yet before anything comes again.
+
+    Args:
+        rng: Source of all choices.
+    """
+
+    def __init__(self, rng: random.Random) -> None:
+        self._rng = rng
+        self._drawn: set[Any] = set()
+        #: How often everything was drawn.
+        self.rounds = 0
+
+    def draw(self, there: Iterable[Any]) -> Any:
+        """Choose one of these; their order does not matter."""
+        items = set(there)
+        item = self._rng.choice(sorted(items - self._drawn or items, key=str))
+        self._drawn.add(item)
+        if self._drawn >= items:
+            self.rounds += 1
+            self._drawn.clear()
+        return item
+
+
 class Sender:
     """Hostile inputs for the nodes.
 
@@ -196,6 +232,8 @@ class Sender:
         self._made: dict[Any, Any] = {}
         self._sound, self._mounts = _recorded()
         self._actions: list[tuple[str, Any]] = []
+        #: Of subscriptions, services or actions.
+        self.lot = Lot(rng)
 
     # --- topics
     def restore(self) -> None:
@@ -203,7 +241,11 @@ class Sender:
         from openarm_interfaces.srv import SetPause
         from std_srvs.srv import Trigger
 
-        for name, kind in (("/sim/set_pause", SetPause), ("/mujoco_bridge/reset", Trigger)):
+        for name, kind in (
+            ("/sim/set_pause", SetPause),
+            ("/mujoco_bridge/reset", Trigger),
+            ("/arm_control/reset", Trigger),
+        ):
             client = self._made.get(name) or self._made.setdefault(name, self._probe.create_client(kind, name))
             if client.wait_for_service(timeout_sec=5.0):
                 client.call_async(kind.Request())
@@ -215,11 +257,11 @@ class Sender:
         """One message on one subscription."""
         heard = {
             (s.topic_name, s.msg_type)
-            for node in (*self._nodes.nodes, self._nodes.page)
+            for node in (*self._nodes.nodes, *self._nodes.polled)
             for s in list(node.subscriptions)
             if s.topic_name not in ("/clock", "/parameter_events")
         }
-        topic, kind = self._rng.choice(sorted(heard, key=lambda item: item[0]))
+        topic, kind = self.lot.draw(heard)
         return partial(self._publish, topic, kind)
 
     def _publish(self, topic: str, kind: Any) -> None:
@@ -256,7 +298,7 @@ class Sender:
         offered = [
             (node.resolve_service_name(s.srv_name), s.srv_type) for node in self._nodes.nodes for s in node.services
         ]
-        name, kind = self._rng.choice(offered)
+        name, kind = self.lot.draw(offered)
         request = hostile(plausible(kind.Request, self._rng), self._rng)
         return partial(self._call, name, kind, request)
 
@@ -277,7 +319,7 @@ class Sender:
             for node in self._nodes.nodes:
                 found = get_action_server_names_and_types_by_node(self._probe, node.get_name(), node.get_namespace())
                 self._actions += [(name, interface(kinds[0])) for name, kinds in found]
-        name, kind = self._rng.choice(self._actions)
+        name, kind = self.lot.draw(self._actions)
         return partial(self._send, name, kind, hostile(plausible(kind.Goal, self._rng), self._rng))
 
     def _send(self, name: str, kind: Any, goal: Any) -> None:
@@ -438,6 +480,8 @@ def send_hostile(counts: dict[str, int], seed: int) -> list[Tally]:
                 nodes.look()
                 while nodes.errors:
                     tally.raw[nodes.errors.pop()] += 1
+            if sender.lot.rounds:
+                tally.notes.append(f"each subscription, service or action {sender.lot.rounds} times or more")
             tally.notes.append(f"{reset_peak() - first_mib:+.0f} MiB from the first input to the last")
             tally.notes += [f"{node.get_name()}: {node._BaseNode__status.message[:150]}" for node in nodes.nodes]
             at = Path(log.name)

@@ -16,6 +16,8 @@ from openarm_common.errors import OpenArmError
 
 #: An input that takes longer hangs, s.
 BOUND_S = 20.0
+#: An input that needs more memory is a defect, MiB: twice what a recording may unpack to at a time.
+BOUND_MIB = 512.0
 #: Longest text of a refusal, characters.
 LONGEST = 4000
 
@@ -34,6 +36,11 @@ class Tally:
     #: Where raw errors came from, and how often.
     raw: Counter[str] = field(default_factory=Counter[str])
     notes: list[str] = field(default_factory=list[str])
+
+    @property
+    def sound(self) -> bool:
+        """Whether every input was accepted or refused, within bounds of time and memory."""
+        return not self.raw and not self.hangs and self.worst_mib <= BOUND_MIB
 
     def take(self, work: Callable[[], object], *, bounded: bool = True) -> None:
         """Do the work of one input, and count how it ended.
