@@ -165,19 +165,24 @@ def test_a_diverged_world_stands_until_it_is_reset(
     goal = arm.check(Trajectory(("j1",), np.array([5.0]), np.array([[0.6]])))
     bench.simulation.call(lambda: arm.start(goal, bench.world.t_ns, state.position[:1], outcomes.append)).result(10.0)
     bench.simulation.check_able()
-    bench.simulation.call(lambda: bench.world.data.qvel.fill(np.nan)).result(10.0)
-    deadline = time.monotonic() + 5.0
-    while not bench.simulation.fault:
-        assert time.monotonic() < deadline
-        bench.simulation.call(lambda: None).result(10.0)
-    assert "diverged" in bench.simulation.fault
-    bench.simulation.call(lambda: None).result(10.0)  # the tick has ended
+
+    def diverge() -> None:
+        bench.simulation.call(lambda: bench.world.data.qvel.fill(np.nan)).result(10.0)
+        deadline = time.monotonic() + 5.0
+        while not bench.simulation.fault:
+            assert time.monotonic() < deadline
+            bench.simulation.call(lambda: None).result(10.0)
+        assert "diverged" in bench.simulation.fault
+        bench.simulation.call(lambda: None).result(10.0)  # the tick has ended
+
+    diverge()
     assert outcomes[0].end is End.ABORTED
     assert "diverged" in outcomes[0].text
     with pytest.raises(OpenArmError, match=r"no command is taken: the physics diverged.*Reset the world") as caught:
         bench.simulation.check_able()
     assert caught.value.code is Code.NOT_READY
     (dump,) = tmp_path.glob("openarm_diverged_*.npz")
+    assert dump.stat().st_mode & 0o777 == 0o600
     assert str(dump) in bench.simulation.fault
     with np.load(dump) as data:
         assert data["joint_names"].tolist() == ["j1", "f1"]
@@ -188,6 +193,10 @@ def test_a_diverged_world_stands_until_it_is_reset(
     t_ns = bench.world.t_ns
     bench.wait(lambda: bench.t_ns > t_ns + 50_000_000)
     assert np.all(np.isfinite(bench.states[-1][1].position))
+
+    diverge()
+    (second,) = set(tmp_path.glob("openarm_diverged_*.npz")) - {dump}
+    assert str(second) in bench.simulation.fault
 
 
 def test_stop_ends_the_thread_and_cancels_what_waits() -> None:
