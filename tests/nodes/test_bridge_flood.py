@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from openarm_common.ros.node import QOS_COMMAND
 
 #: What a client gone wild sends, s and messages a second: right ones, ones of bad sizes and values, bytes that are no
-#: message, and messages of another type on a topic of the controller.
+#: message, and messages of another type on a topic of the controller. It prints when it had sent how many.
 FLOOD = """
 import sys, time
 import rclpy
@@ -36,7 +36,7 @@ messages = [
     JointState(name=["tail"], position=[1.0]),
     bytes([0, 1, 0, 0]) + bytes(8) + bytes([0, 0, 0, 0, 255, 255, 255, 127]),
 ]
-rate, began, sent = float(sys.argv[1]), None, 0
+rate, began, sent, told = float(sys.argv[1]), None, 0, 0.0
 while True:
     if not publisher.get_subscription_count():
         time.sleep(0.01)
@@ -47,6 +47,9 @@ while True:
         publisher.publish(messages[i % len(messages)])
     other.publish(String(data="go"))
     sent = due
+    if time.monotonic() > told + 0.1:
+        told = time.monotonic()
+        print(told, sent, flush=True)
     time.sleep(0.0005)
 """
 
@@ -73,10 +76,15 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp
             v.key: v.value for v in last.values
         }
 
-    log = (tmp_path / "log").open("w")  # a pipe that is not read would hold the bridge up
+    log, told = (tmp_path / "log").open("w"), (tmp_path / "told").open("w")  # a pipe would hold up who writes to it
 
     def run(*command: str) -> subprocess.Popen:
-        return subprocess.Popen([sys.executable, *command], stderr=log, env=os.environ)
+        return subprocess.Popen([sys.executable, *command], stdout=told, stderr=log, env=os.environ)
+
+    def sent() -> tuple[float, int]:
+        """When the flood last said how many commands it had sent, and how many."""
+        moment, count = (tmp_path / "told").read_text().rpartition("\n")[0].rpartition("\n")[2].split()
+        return float(moment), int(count)
 
     bridge = run("-m", "openarm_sim_bridge.ros.node", "--ros-args", "-p", "scene:=empty", "-p", "images:=false")
     flood: subprocess.Popen | None = None
@@ -85,8 +93,11 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp
         flood = run("-c", FLOOD, "4000")
         ros.spin_until(lambda: int(status().get("commands_per_s", 0)) > 300, 20.0, "the flood to be counted")
         published.clear()
+        begin = sent()
         ros.spin_until(lambda: len(published) > 400, 20.0, "four seconds of joint states")
         periods = np.diff(published) * 1e-6
+        end = sent()
+        assert end[1] - begin[1] > 3000.0 * (end[0] - begin[0]) > 0.0, "no flood"
         reports = len(diagnostics)
         ros.spin_until(lambda: len(diagnostics) >= reports + 2, 20.0, "/diagnostics")
         kept = abs(periods.mean() - 10.0) < 0.2 and np.percentile(periods, 99) <= 15.0
@@ -106,3 +117,4 @@ def test_four_thousand_commands_a_second_leave_the_rate_or_are_reported(ros, tmp
                 process.kill()
                 process.wait()
         log.close()
+        told.close()
