@@ -17,7 +17,7 @@ from openarm_bringup import cli
 from openarm_bringup.commands import graph
 from openarm_bringup.commands.checks import _in_order
 from openarm_bringup.outcome import Outcome
-from openarm_bringup.supervision import runs
+from openarm_bringup.supervision import runs, session
 from openarm_common.errors import Code, OpenArmError
 from openarm_evaluation.campaign.options import parse_seeds
 
@@ -140,6 +140,23 @@ def test_draw_writes_json_to_a_file_and_text_to_stdout(tmp_path: Path, capsys: p
     answer = json.loads(sink.read_text())
     assert answer["success"] is True
     assert ["detector", "grasp", ["/detections_3d"]] in answer["edges"]
+
+
+@pytest.mark.parametrize("discovery", ["subnet", "system_default", "localhost"])
+def test_up_warns_that_the_network_can_move_the_arms_before_it_starts_anything(
+    discovery: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said: list[str] = []
+
+    def start(*_: object) -> None:
+        said.append(capsys.readouterr().err)
+        raise OpenArmError(Code.CANCELLED, "nothing is started in this test")
+
+    monkeypatch.setattr(session, "running_graph", start)
+    assert cli.run(["up", "sim_only", "--discovery", discovery]) == 1
+    (text,) = said
+    warned = f"warning: discovery {discovery}: whoever is on this network can see the cameras and move the arms" in text
+    assert warned == (discovery != "localhost"), text
 
 
 def test_ps_and_logs_find_a_running_graph(capsys: pytest.CaptureFixture[str]) -> None:
