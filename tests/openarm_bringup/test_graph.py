@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from openarm_bringup.supervision.draw import mermaid, text
-from openarm_bringup.supervision.graph import load_graph
+from openarm_bringup.supervision.graph import graph_names, load_graph
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 
@@ -152,6 +152,12 @@ def test_wrong_set_is_refused(tmp_path: Path, item: str, words: str) -> None:
 def test_unknown_graph_lists_those_of_the_suite() -> None:
     with pytest.raises(OpenArmError, match=r"no graph 'simm'; give a file, or one of .*sim"):
         load_graph("simm")
+
+
+def test_every_graph_that_grasps_leaves_recordings_of_what_failed() -> None:
+    grasping = {name for name in graph_names() if "grasp" in load_graph(name).nodes}
+    assert {"sim", "no_depth", "openarm_ros2"} <= grasping
+    assert {name for name in graph_names() if "flight_recorder" in load_graph(name).nodes} == grasping
 
 
 def test_extends_keeps_some_nodes_and_changes_others(tmp_path: Path) -> None:
