@@ -68,8 +68,8 @@ def test_closing_on_nothing_shows_in_gap_and_effort() -> None:
 
 @pytest.mark.parametrize("kind", ["cube_4cm", "box", "cylinder", "can"])
 @pytest.mark.requirement("A-07")
-def test_a_hundred_grasps_in_a_row_neither_throw_nor_lose_an_object(kind: str) -> None:
-    """25 of each object, aimed 2 mm beside where it stands then: lift, put down, leave, twice as fast as the suite."""
+def test_25_grasps_in_a_row_neither_throw_nor_lose_an_object(kind: str) -> None:
+    """Aimed 2 mm beside where it stands then: lift, put down, leave, twice as fast as the suite."""
     item, error = make(kind, 3)
     trial = Trial(item, "right", error)
     start, rng = trial.position, np.random.default_rng(3)

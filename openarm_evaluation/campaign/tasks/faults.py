@@ -188,6 +188,7 @@ KINDS: Mapping[str, Maker] = MappingProxyType(
         "two_alike": _two_alike,
         "arms_in_the_way": _arm_in_the_way,
         "corridor_blocked": _corridor,
+        # what must be refused; here, since the order gives each seed its kind
         "intrinsics_off": _fault(
             "intrinsics_bias", Code.INTRINSICS_MISMATCH, camera="overhead", focal=(0.05, 1.0), cx=(-60.0, 60.0)
         ),
