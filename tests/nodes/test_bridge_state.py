@@ -35,7 +35,7 @@ from openarm_common.ros.node import QOS_CLOCK, QOS_COMMAND, QOS_LATCHED, QOS_SEN
 from openarm_sim_bridge.ros.state_publisher import JOINT_STATE_DEADLINE
 
 
-@pytest.mark.requirement("A-15", "A-16", "A-17")
+@pytest.mark.requirement("A-04", "A-15", "A-16", "A-17")
 def test_names_types_and_qos(seeing) -> None:
     node = seeing.ros.node
     assert "mujoco_bridge" in node.get_node_names()

@@ -94,7 +94,7 @@ def test_a_place_puts_it_down_at_position_and_yaw(picked: Bench) -> None:
         picked.ask("", phase="place")
 
 
-@pytest.mark.requirement("P-01")
+@pytest.mark.requirement("P-01", "R-21")
 def test_a_new_session_takes_up_what_the_hand_holds_and_places_it_or_releases_it() -> None:
     bench = Bench(BOX, CUBE)
     trials = bench.trials

@@ -212,6 +212,7 @@ def refusal(localizer: Localizer, found, view, depth=None) -> OpenArmError:
     return caught.value
 
 
+@pytest.mark.requirement("B-20")
 def test_a_cut_object_is_refused_by_name(tabletop, detector, localizer) -> None:
     """Its size would be wrong by what is outside."""
     view = tabletop.render([tabletop.Thing("red", "box", (0.06, 0.06, 0.06), 0.25, 0.51)])

@@ -145,7 +145,7 @@ def test_the_client_says_when_no_server_answers(ros):
     assert error.value.code is Code.NOT_READY
 
 
-@pytest.mark.requirement("P-01")
+@pytest.mark.requirement("P-01", "R-21")
 def test_a_node_that_starts_with_a_full_hand_names_what_it_holds_and_the_client_releases_it(ros) -> None:
     robot = RobotDescription.load()
     finger, tcp = robot.finger_joint("right"), robot.tcp_link("right")
