@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +32,7 @@ from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.strategies.registry import carry_out
 from openarm_octomap.config import GridConfig
 from openarm_octomap.grid import OccupancyGrid
+from openarm_perception.detection.faults import DetectionFaults
 from tests.tag_paint import paint
 
 
@@ -228,13 +231,23 @@ QUICK = SimulatedSenses(depth_noise=False, sets=("octomap.period=2.0", "grasp.li
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.requirement("N-03", "N-05")
-def test_every_kind_of_fault_ends_with_a_recovery_or_the_right_code(kind: str) -> None:
+def test_every_kind_of_fault_ends_with_a_recovery_or_the_right_code(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    missed, seen = list[int](), DetectionFaults.seen
+
+    def count_missed(faults: DetectionFaults, found: Sequence[Any], t_ns: int) -> tuple[Any, ...]:
+        kept = seen(faults, found, t_ns)
+        missed.append(len(found) - len(kept))
+        return kept
+
+    monkeypatch.setattr(DetectionFaults, "seen", count_missed)
     task = make_task("faults", list(KINDS).index(kind))
     assert task.kind == kind
     run = trial.Trials(task, QUICK, suite_config(QUICK.parameters()).grasp)
     found = run.run()
     assert found["as_expected"], f"{found['outcome']}, {found['code']}: {found['message']}; {found['expected']}"
     assert run.injected == (task.fault is not None)
+    assert any(missed) == (kind == "detection_missed")
+    assert any("by fault injection" in step.reason for step in run.steps) == (kind == "plan_fails_once")
     assert found["attempts"] == 2 or not kind.startswith(("nudged", "gripper_stuck_once"))
 
 
