@@ -184,8 +184,8 @@ class GraphRobot:
         # All end, also those next to one that failed: they watch the same cancel, robot and deadlines.
         while not all(task.done() for task in tasks):
             await self._nodes.tick()
-        if faults:
-            raise faults[0]
+        if faults:  # an emergency stop ends all, and only an arm's controller can say that it was one
+            raise next((f for f in faults if isinstance(f, OpenArmError) and f.code is Code.STOPPED), faults[0])
 
     async def observe(self, count: int, *, near: bool = False) -> Frames:
         """Frames of detections that are taken from now on."""

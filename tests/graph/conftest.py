@@ -17,9 +17,11 @@ from typing import Any
 import psutil
 import pytest
 
-from openarm_bringup.supervision.runs import RunRecord
+from openarm_bringup.supervision.runs import NodeRecord, RunRecord
 from openarm_bringup.supervision.state import state_dir
 from openarm_common.domain import reserve_domain
+from openarm_evaluation.judging.ros.observer import Observer
+from openarm_grasp.ros.client import GraspClient
 
 ROOT = Path(__file__).parents[2]
 
@@ -59,6 +61,18 @@ class Up:
                     return record
             time.sleep(0.05)
         pytest.fail(f"not ready within {seconds:g} s: {self.output.read_text()}")
+
+    def node(self, name: str) -> NodeRecord:
+        """Return what the supervisor has recorded of a node."""
+        written = state_dir(self.env) / f"{self.process.pid}.json"
+        return RunRecord.model_validate_json(written.read_text()).nodes[name]
+
+    def wait_back(self, name: str, killed: int, seconds: float = 60.0) -> None:
+        """Wait until a node that was killed runs in another process, and is ready."""
+        deadline = time.monotonic() + seconds
+        while (node := self.node(name)).pid == killed or node.state != "ready":
+            assert time.monotonic() < deadline, f"{name} is not back within {seconds:g} s: {self.output.read_text()}"
+            time.sleep(0.05)
 
     def pids(self) -> list[int]:
         """Return every process below the supervisor, and itself."""
@@ -108,3 +122,22 @@ def start_graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Starter]:
     yield start
     for up in started:
         up.stop()
+
+
+@pytest.fixture
+def domain(up: Any, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Clients of this process meet the graph."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(up.domain))
+    return up.domain
+
+
+@pytest.fixture
+def observer(domain: int) -> Iterator[Observer]:
+    with Observer(domain) as watching:
+        yield watching
+
+
+@pytest.fixture
+def client(domain: int) -> Iterator[GraspClient]:
+    with GraspClient() as asking:
+        yield asking

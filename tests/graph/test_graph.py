@@ -54,25 +54,6 @@ def up(start_graph: Any) -> Any:
     return graph
 
 
-@pytest.fixture
-def domain(up: Any, monkeypatch: pytest.MonkeyPatch) -> int:
-    """Clients of this process meet the graph."""
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(up.domain))
-    return up.domain
-
-
-@pytest.fixture
-def observer(domain: int) -> Iterator[Observer]:
-    with Observer(domain) as watching:
-        yield watching
-
-
-@pytest.fixture
-def client(domain: int) -> Iterator[GraspClient]:
-    with GraspClient() as asking:
-        yield asking
-
-
 @pytest.fixture(scope="module")
 def visitor(up: Any) -> Iterator[Node]:
     """A node that looks at the graph, spun by tests."""
