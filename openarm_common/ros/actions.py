@@ -215,7 +215,10 @@ class ActionServer(action.ActionServer):
 
 
 class ActionClient(action.ActionClient):
-    """An action client that knows when its server has died.
+    """An action client that knows when its server has died, and that a goal was accepted whose answer was lost.
+
+    A server answers a client that it has discovered; one that has just appeared it may not have, on a busy machine,
+    and its goal would run unattended. The status of the server, which late subscribers receive, says so, too.
 
     Args:
         node: Owner.
@@ -241,6 +244,24 @@ class ActionClient(action.ActionClient):
     def watch(self) -> Callable[[], str]:
         """Return a function that says who has died since this call: the node's name; "" while its server lives."""
         return self._watch.begin()
+
+    async def execute(self, taken_data: dict[str, Any]) -> None:
+        """Handle what has come: a goal in the server's status is accepted, and its answer is not needed any more.
+
+        See `rclpy.action.ActionClient.execute`.
+        """
+        sent: dict[int, Any] = self._goal_sequence_number_to_goal_id
+        answers = dict(taken_data.pop(key) for key in ("goal",) if key in taken_data)
+        for status in taken_data["status"].status_list if "status" in taken_data else ():
+            info = status.goal_info
+            accepted = self._action_type.Impl.SendGoalService.Response(accepted=True, stamp=info.stamp)
+            for number in (number for number, goal_id in sent.items() if goal_id == info.goal_id):
+                answers.setdefault(number, accepted)
+        for number, answer in answers.items():
+            if number in sent:
+                await super().execute({"goal": (number, answer)})
+                sent.pop(number, None)
+        await super().execute(taken_data)
 
 
 def check_alive(died: Callable[[], str], what: str, code: Code = Code.NOT_READY) -> None:
