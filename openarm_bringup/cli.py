@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from openarm_bringup.daemon.client import ask
-from openarm_bringup.outcome import FOR_PEOPLE, Outcome, failure
+from openarm_bringup.outcome import AT_END, FOR_PEOPLE, Outcome, failure
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.printable import printable_lines
 
@@ -222,6 +222,8 @@ def main() -> None:
     except BrokenPipeError:  # as in `openarm topic echo ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
+    for last in AT_END:
+        last(code)
     sys.exit(code)
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from openarm_bringup.supervision.supervisor import Event
 
+#: What the command line does last, with the exit code.
+AT_END: list[Callable[[int], object]] = []
 #: Whether stdout is for people, not for the one JSON document of `--json`.
 FOR_PEOPLE: ContextVar[bool] = ContextVar("FOR_PEOPLE", default=True)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from openarm_bringup.commands.connect import Sets
-from openarm_bringup.outcome import Outcome, console, failure
+from openarm_bringup.outcome import AT_END, Outcome, console, failure
 from openarm_bringup.supervision.discovery import Discovery, exposure
 from openarm_common.errors import OpenArmError
 
@@ -62,6 +62,7 @@ def up(
 
 
 async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
+    from openarm_bringup.supervision import shm
     from openarm_bringup.supervision.environment import domain_id
     from openarm_bringup.supervision.session import running_graph
 
@@ -78,7 +79,8 @@ async def _up(graph: Graph, run_dir: Path, viz_address: str) -> Outcome:
     if warning := exposure(graph.discovery):
         shown.print(f"warning: {warning}", style="yellow", markup=False, soft_wrap=True)
     try:
-        async with running_graph(graph, run_dir, show) as supervisor:
+        async with running_graph(graph, run_dir, show, ends=True) as supervisor:
+            AT_END.append(lambda code: shm.leave(supervisor.left, code))
             data["ready_s"] = round(await supervisor.wait_ready(), 2)
             supervisor.daemon.start()  # it has nothing to compete with any more
             shown.print(

@@ -25,6 +25,7 @@ from openarm_bringup import cli
 from openarm_bringup.commands import connect, processes, ros2, tf  # what is asked for, imported before
 from openarm_bringup.daemon.protocol import LONGEST, build, is_answered, peer_uid, send
 from openarm_bringup.ros.peer import Peer
+from openarm_bringup.supervision import shm
 from openarm_common.errors import OpenArmError
 from openarm_common.ros.client import ContextNode, new_context
 
@@ -34,8 +35,6 @@ _REQUEST_S = 5.0
 _MOST = 16
 #: Longest wait for requests to end when the daemon does, s.
 _END_S = 1.0
-#: Leaving the graph takes so long at most, s.
-_LEAVE_S = 5.0
 _CLIENT: ContextVar[Client | None] = ContextVar("_CLIENT", default=None)
 _WARM = (processes, ros2, tf)
 
@@ -138,16 +137,11 @@ class Daemon:
             thread.start()
 
     def close(self) -> None:
-        """End the requests, then leave the graph."""
+        """End the requests."""
         self._stopping.set()
         deadline = time.monotonic() + _END_S
         for thread in self._threads:
             thread.join(max(0.0, deadline - time.monotonic()))
-        hurry = threading.Timer(_LEAVE_S, os._exit, (0,))  # the middleware may wait for a process that was killed
-        hurry.daemon = True
-        hurry.start()
-        self._resident.close()
-        self._context.try_shutdown()
 
     def _serve(self, connection: socket.socket) -> None:
         with connection:
@@ -197,12 +191,15 @@ def main() -> None:
     """Answer on the inherited socket until SIGINT or SIGTERM."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.stdout, sys.stderr = _ToClient("out", sys.stdout), _ToClient("err", sys.stderr)
-    daemon = None
+    daemon, code = None, 0
     try:
         daemon = Daemon(socket.socket(fileno=int(sys.argv[1])), int(sys.argv[2]))
         daemon.run()
     except KeyboardInterrupt:
         pass
-    finally:
-        if daemon is not None:
-            daemon.close()
+    except Exception:
+        traceback.print_exc()
+        code = 1
+    if daemon is not None:
+        daemon.close()
+    shm.leave(shm.mapped_by(os.getpid()), code)

@@ -21,7 +21,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @asynccontextmanager
 async def running_graph(
-    graph: Graph, run_dir: Path, listener: Callable[[Event], None] | None = None
+    graph: Graph, run_dir: Path, listener: Callable[[Event], None] | None = None, *, ends: bool = False
 ) -> AsyncIterator[Supervisor]:
     """Start a graph; at the end of the block, or at Ctrl-C, stop it.
 
@@ -32,6 +32,7 @@ async def running_graph(
         graph: What to run.
         run_dir: Folder for logs and parameters.
         listener: Is called with every change of a node.
+        ends: After the block this process ends, as `Supervisor.stop` says.
 
     Yields:
         The supervisor, while the nodes are still starting: `await supervisor.wait_ready()`.
@@ -52,7 +53,7 @@ async def running_graph(
         yield supervisor
     finally:
         try:
-            await supervisor.stop()
+            await supervisor.stop(ends=ends)
         finally:
             for number in SIGNALS:
                 loop.remove_signal_handler(number)

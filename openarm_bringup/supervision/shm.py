@@ -7,11 +7,13 @@ import fcntl
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NoReturn
 
 from openarm_bringup.supervision.graph import Graph
 from openarm_bringup.supervision.ports import in_domain, unicast
@@ -25,6 +27,8 @@ _LARGE_EXTRA_MIB = 2.2
 #: Largest factor by which segments grow, and the share of the free space that a graph may then take.
 _GROWTH, _SHARE = 4, 0.25
 
+#: Argument of the image that a process ends with.
+_LEAVE = "--leave"
 #: Time after which a segment without a lock is not just being made, s.
 _UNBORN_S = 5.0
 
@@ -160,6 +164,20 @@ def sweep(names: Iterable[str], shm: Path = SHM) -> list[str]:
     return removed
 
 
+def leave(names: Iterable[str], code: int) -> NoReturn:
+    """End this process with an exit code and remove what it had in /dev/shm; its participants stay until then.
+
+    Fast DDS 2.14 can't always take a participant down: its event thread may wait for ever for the discovery data, which
+    are held by a thread that removes an endpoint of another process and waits for the event thread; the interpreter
+    then waits for both. A new image of the process has none of these threads.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    os.execv(sys.executable, [sys.executable, "-m", __name__, _LEAVE, str(code), *names])
+
+
 def _locked(path: Path) -> bool:
     try:
         with path.open("rb") as lock:
@@ -173,6 +191,10 @@ def _locked(path: Path) -> bool:
 
 def main() -> None:
     """`python -m openarm_bringup.supervision.shm DOMAIN`: clean up after a graph whose supervisor is dead."""
+    if sys.argv[1] == _LEAVE:
+        os.closerange(3, os.sysconf("SC_OPEN_MAX"))  # locks of the image before
+        sweep(sys.argv[3:])
+        sys.exit(int(sys.argv[2]))
     clean_shm()
     sweep({*names_of(int(sys.argv[1])), *unborn()})
 

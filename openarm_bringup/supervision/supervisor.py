@@ -86,6 +86,8 @@ class Supervisor:
         self._logs: list[LogFile] = []
         self._log = self.log_file("supervisor")
         self._disk_faults: set[Path] = set()
+        #: What was in /dev/shm at the end.
+        self.left: set[str] = set()
         self.ports = HeldPorts()
         self._keepers = {name: Keeper(name, self) for name in self.graph.nodes}
         self.daemon = Activation(self)
@@ -162,8 +164,12 @@ class Supervisor:
             self.say(f"no emergency stop: {error!r}")
         self.ladder.hurry()
 
-    async def stop(self) -> None:
-        """Stop every node, dependents before their needs, and leave nothing behind."""
+    async def stop(self, *, ends: bool = False) -> None:
+        """Stop every node, dependents before their needs, and leave nothing behind.
+
+        Args:
+            ends: So does this process, by `shm.leave` with the names in `left`.
+        """
         self.stop_asked.set()
         await self.daemon.close()
         async with self.spawning:  # a process that is being started is known before its watcher is cancelled
@@ -179,12 +185,14 @@ class Supervisor:
         await asyncio.gather(*stops)
         self.ports.close()
         mapped = shm.mapped_by(os.getpid())
-        if self._probe is not None and (await asyncio.wait([self._probe])) and self._probe.exception() is None:
+        made = self._probe is not None and (await asyncio.wait([self._probe])) and self._probe.exception() is None
+        if made and not ends:
             await self.ask(lambda probe: probe.close())
         self._threads.shutdown()
         mapped |= self.daemon.mapped.union(*(keeper.mapped for keeper in self._keepers.values()))
         domain = environment.domain_id(self.graph)
-        swept = await asyncio.to_thread(lambda: shm.sweep({*mapped, *shm.names_of(domain), *shm.unborn()}))
+        self.left = {*mapped, *shm.names_of(domain), *shm.unborn()}
+        swept = await asyncio.to_thread(shm.sweep, self.left)
         self.say(f"removed from /dev/shm: {', '.join(swept) or 'nothing'}")
         await self._dismiss_guard()
         runs.remove_record(os.getpid())

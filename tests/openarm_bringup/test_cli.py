@@ -148,7 +148,7 @@ def test_up_warns_that_the_network_can_move_the_arms_before_it_starts_anything(
 ) -> None:
     said: list[str] = []
 
-    def start(*_: object) -> None:
+    def start(*_: object, **__: object) -> None:
         said.append(capsys.readouterr().err)
         raise OpenArmError(Code.CANCELLED, "nothing is started in this test")
 

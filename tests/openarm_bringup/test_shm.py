@@ -7,6 +7,8 @@ import fcntl
 import mmap
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ import pytest
 from openarm_bringup.supervision.environment import node_arguments, node_environment, write_profile
 from openarm_bringup.supervision.graph import Graph, NodeSpec
 from openarm_bringup.supervision.shm import (
+    SHM,
     mapped_by,
     names_of,
     shm_need_mib,
@@ -22,6 +25,7 @@ from openarm_bringup.supervision.shm import (
     with_larger_segments,
     without_reader,
 )
+from openarm_common.domain import release_domain, reserve_domain
 
 
 def make(folder: Path, name: str, *, lock: bool) -> Path:
@@ -146,3 +150,33 @@ def test_command_line_of_a_node_carries_name_remaps_and_parameters(graph: Graph,
     written = Path(eye[eye.index("--params-file") + 1]).read_text()
     assert "a.b: 1" in written
     assert "none" not in written
+
+
+#: A process that the interpreter would not end.
+LEAVING = """
+import os, threading
+import rclpy
+from openarm_bringup.supervision import shm
+
+rclpy.init()
+node = rclpy.create_node("leaving")
+threading.Thread(target=threading.Event().wait).start()
+print(*(left := shm.mapped_by(os.getpid())))
+shm.leave(left, 3)
+"""
+
+
+@pytest.mark.requirement("P-34")
+def test_a_process_whose_threads_hang_leaves_with_its_exit_code_and_nothing_of_it_stays() -> None:
+    domain = reserve_domain()
+    try:
+        env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        done = subprocess.run(
+            [sys.executable, "-c", LEAVING], env=env, capture_output=True, text=True, timeout=60, check=False
+        )
+    finally:
+        release_domain(domain)
+    assert done.returncode == 3, done.stderr
+    names = done.stdout.split()
+    assert len(names) >= 2
+    assert [name for name in names if (SHM / name).exists()] == []
