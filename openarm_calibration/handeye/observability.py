@@ -177,7 +177,7 @@ def _degenerate(seen: Motion, noise: Noise, what: str) -> OpenArmError:
             f"{seen.poses} poses that contradict each other, as if the robot were off by"
             f" {noise.translation * 1e3:.1f} mm and {math.degrees(noise.rotation):.2f}°"
         )
-        advice = "check the intrinsics in camera_info, the size of the board, and that it did not move"
+        advice = "check the joint zeros, the intrinsics in camera_info, the size of the board, and that it did not move"
     else:
         cause = f"{seen.poses} poses that are too noisy or too far from the board"
     return OpenArmError(Code.DEGENERATE, f"{cause}: {what}; {advice}")

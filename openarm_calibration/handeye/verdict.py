@@ -33,6 +33,7 @@ class Limits(Config):
     held_out: float = Field(default=1e-3, gt=0.0, description="rms error at the board of poses that were left out, m")
     scale: float = Field(default=0.003, gt=0.0, description="of the board against what is stated")
     focal: float = Field(default=0.005, gt=0.0, description="of the focal length against the camera's info")
+    robot: float = Field(default=math.radians(0.1), gt=0.0, description="spread of the hand's rotations, rad")
     samples: int = Field(default=10, ge=3, description="fewer are a warning")
     drift: float = Field(default=2e-3, gt=0.0, description="distance from the stored calibration, m")
 
@@ -184,6 +185,7 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
     away = max(abs(focal - 1.0) - 3.0 * focal_sigma, 0.0)
     hint = "; are these its intrinsics?" if away > limits.focal else ""
     outliers, views = len(solution.outliers), len(problem)
+    arm = solution.estimate.noise
     checks = [
         Check("position", sigma_t / limits.translation, f"predicted error of the position {sigma_t * 1e3:.3f} mm"),
         Check("rotation", sigma_r / limits.rotation, f"predicted error of the rotation {math.degrees(sigma_r):.4f}°"),
@@ -197,6 +199,11 @@ def assess(problem: Problem, solution: Solution, limits: Limits | None = None, s
         Check(
             "focal length", away / limits.focal,
             f"the focal length seems {(focal - 1.0) * 100:+.2f} % off its value in camera_info{hint}",
+        ),
+        Check(
+            "robot", arm.rotation / limits.robot,
+            f"the hand seems off by {arm.translation * 1e3:.1f} mm and {math.degrees(arm.rotation):.2f}° from pose to"
+            " pose, as with wrong joint zeros; calibrate the zeros of the motors",
         ),
         Check(
             "contradictions", outliers / max(views, 1) / 0.1,

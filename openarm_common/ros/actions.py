@@ -251,7 +251,7 @@ class ActionClient(action.ActionClient):
         See `rclpy.action.ActionClient.execute`.
         """
         sent: dict[int, Any] = self._goal_sequence_number_to_goal_id
-        answers = dict(taken_data.pop(key) for key in ("goal",) if key in taken_data)
+        answers = dict([taken_data.pop("goal")]) if "goal" in taken_data else {}
         for status in taken_data["status"].status_list if "status" in taken_data else ():
             info = status.goal_info
             accepted = self._action_type.Impl.SendGoalService.Response(accepted=True, stamp=info.stamp)

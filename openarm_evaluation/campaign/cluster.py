@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_evaluation.campaign.mounts import with_mounts
 from openarm_evaluation.campaign.options import CampaignOptions, Row
 from openarm_evaluation.campaign.tasks.suites import make_task
-from openarm_evaluation.campaign.trial import run_one
+from openarm_evaluation.campaign.trial import run_one, with_robot
 from openarm_evaluation.judging import provenance
 
 Files = dict[str, bytes]
@@ -43,9 +42,10 @@ class _Answer:
 class _Worker:
     """A process on some machine of the cluster."""
 
-    def __init__(self, mounts: Files) -> None:
+    def __init__(self, robots: Mapping[str, Files]) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="openarm_campaign_")
-        unpack(mounts, Path(self._folder.name) / "mounts")
+        for name, files in robots.items():
+            unpack(files, Path(self._folder.name) / name)
 
     def run(self, options: CampaignOptions, seed: int) -> _Answer:
         """Run one task."""
@@ -68,12 +68,12 @@ def rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Genera
     """
     ray = _connect(options)
     try:
-        _prepare_mounts(options, seeds, folder)
-        mounts = ray.put(pack(folder / "mounts"))
+        _prepare_robots(options, seeds, folder)
+        robots = ray.put({name: pack(folder / name) for name in ("mounts", "servos")})
         make = ray.remote(num_cpus=1)(_Worker).remote
         local = replace(options, ray="", workers=1)
         queue, lost = list(reversed(seeds)), dict[int, int]()
-        idle = [make(mounts) for _ in range(min(options.workers, len(seeds)))]
+        idle = [make(robots) for _ in range(min(options.workers, len(seeds)))]
         running: dict[Any, tuple[Any, int]] = {}
         while queue or running:
             while queue and idle:
@@ -89,7 +89,7 @@ def rows(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> Genera
                     text = f"seed {seed}: {lost[seed]} workers were lost with it, the last: {error}"
                     raise OpenArmError(Code.EXECUTION_FAILED, f"{text}; the rows so far are kept") from error
                 queue.append(seed)
-                idle.append(make(mounts))
+                idle.append(make(robots))
                 continue
             idle.append(worker)
             _check_versions(answer)
@@ -129,13 +129,12 @@ def _connect(options: CampaignOptions) -> Any:
     return ray
 
 
-def _prepare_mounts(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> None:
-    """Calibrate here what is missing, once, instead of on every machine."""
-    if not options.mount_seeds:
-        return
-    first = {options.mount_seeds[seed % len(options.mount_seeds)]: seed for seed in seeds}
+def _prepare_robots(options: CampaignOptions, seeds: Sequence[int], folder: Path) -> None:
+    """Calibrate and identify here what is missing, once, instead of on every machine."""
+    turns = [len(draws) or 1 for draws in (options.mount_seeds, options.dynamics_seeds)]
+    first = {tuple(seed % turn for turn in turns): seed for seed in reversed(seeds)}
     for seed in first.values():
-        with_mounts(make_task(options.set_name, seed), options.mount_seeds, folder / "mounts")
+        with_robot(make_task(options.set_name, seed), options, folder)
 
 
 def _check_versions(answer: _Answer) -> None:

@@ -2,7 +2,8 @@
 """Camera mounts of a campaign: true ones that no configuration knows, each calibrated once by the suite itself.
 
 The robot takes random postures in which the board is visible by the nominal mounts; images are rendered from the true
-mounts, the marks are detected in them and the calibration is solved as on a real robot. World = base frame, m.
+mounts, the marks are detected in them and the calibration is solved as on a real robot, from joint positions that are
+as wrong as its joint zeros. World = base frame, m.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from openarm_common.scene.scene import load_scene
 from openarm_common.types import Array
 from openarm_evaluation.campaign.robot import shared_renderer
 from openarm_evaluation.campaign.tasks.task import Task
+from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig, drawn
 from openarm_sim_bridge.world.model import build_spec
 from openarm_sim_bridge.world.world import Snapshot, start_qpos
 
@@ -44,20 +46,25 @@ _SPREAD = 0.4  # rad, of each joint around the middle of the postures
 _MAX_MISSED = 200
 
 
-def with_mounts(task: Task, mount_seeds: Sequence[int], folder: Path) -> tuple[Task, Mapping[str, Array]]:
+def with_mounts(
+    task: Task, mount_seeds: Sequence[int], folder: Path, hardware: HardwareConfig = IDEAL
+) -> tuple[Task, Mapping[str, Array]]:
     """The task with true mounts of one of the seeds (each in turn), and T_parent_link by camera as calibrated.
 
     Args:
         task: The task.
         mount_seeds: To go through.
         folder: Of calibrations; those that it lacks are made.
+        hardware: Of the robot that calibrates.
     """
     seed = mount_seeds[task.seed % len(mount_seeds)]
-    store = CalibrationStore(folder / str(seed))
+    robot = f"_zeros_{hardware.zero_seed}" if hardware.zero_rms else ""
+    store = CalibrationStore(folder / f"{seed}{robot}")
+    zeros = drawn(hardware, RobotDescription.load()).zero
     mounts: dict[str, Array] = {}
     for camera in (load_cameras()[name] for name in ("overhead", "wrist")):
         if store.find(camera.name) is None:
-            store.save(calibrated(camera, seed).calibration)
+            store.save(calibrated(camera, seed, zeros).calibration)
         found = store.find(camera.name)
         if found is None:
             raise OpenArmError(Code.INTERNAL, f"the calibration of {camera.name!r} was saved and is not there")
@@ -65,10 +72,10 @@ def with_mounts(task: Task, mount_seeds: Sequence[int], folder: Path) -> tuple[T
     return replace(task, mount_seed=seed), mounts
 
 
-def calibrated(camera: CameraConfig, mount_seed: int) -> Result:
-    """Calibrate a camera at true mounts of a seed."""
+def calibrated(camera: CameraConfig, mount_seed: int, zeros: Mapping[str, float] | None = None) -> Result:
+    """Calibrate a camera at true mounts of a seed; `zeros` as for `Bench`."""
     with tempfile.TemporaryDirectory() as name:
-        bench = Bench(camera, mount_seed, Path(name))
+        bench = Bench(camera, mount_seed, Path(name), zeros)
         bench.fill(np.random.default_rng(mount_seed))
         return calibrate(bench.samples)
 
@@ -80,9 +87,11 @@ class Bench:
         camera: Which.
         seed: Of the true mounts.
         folder: For the board's files.
+        zeros: What is added to true joint positions, rad by name.
     """
 
-    def __init__(self, camera: CameraConfig, seed: int, folder: Path) -> None:
+    def __init__(self, camera: CameraConfig, seed: int, folder: Path, zeros: Mapping[str, float] | None = None) -> None:
+        self._zeros = zeros or {}
         self._camera, self._board, self._description = camera, CircleGrid(), RobotDescription.load()
         self._fixed = camera.parent != HAND
         posture = self._description.group_state
@@ -135,7 +144,8 @@ class Bench:
                 if missed > _MAX_MISSED:
                     raise
                 continue
-            self.samples.take(0, Matched(joints, 0, 0.0), found)
+            reported = {name: q + self._zeros.get(name, 0.0) for name, q in joints.items()}
+            self.samples.take(0, Matched(reported, 0, 0.0), found)
 
     def _middle(self, tries: int = 3000) -> Array:
         """Joint positions around which most postures show the board."""

@@ -231,16 +231,31 @@ class Trials:
                 return
 
 
+def with_robot(
+    task: Task, options: CampaignOptions, folder: Path
+) -> tuple[Task, Mapping[str, Array], Mapping[Side, ServoModel] | None]:
+    """The task with the robot of its seed: mounts by camera and servos by side, as calibrated and identified by it.
+
+    Args:
+        task: The task.
+        options: Of the campaign.
+        folder: Of the campaign; what it lacks of calibrations and identifications is made.
+    """
+    mounts: Mapping[str, Array] = {}
+    servos: Mapping[Side, ServoModel] | None = None
+    if options.profile != "ideal":
+        task, servos = with_servos(task, options, folder / "servos")
+    if options.mount_seeds:
+        hardware = suite_config(options.graph_parameters()).bridge.hardware.of_seed(task.dynamics_seed)
+        task, mounts = with_mounts(task, options.mount_seeds, folder / "mounts", hardware)
+    return task, mounts, servos
+
+
 def run_one(options: CampaignOptions, seed: int, folder: Path) -> Row:
     """Run one task in this process and return its row, whatever happens."""
     task, sets = make_task(options.set_name, seed), options.graph_parameters()
-    mounts: Mapping[str, Array] = {}
-    servos: Mapping[Side, ServoModel] | None = None
     try:
-        if options.mount_seeds:
-            task, mounts = with_mounts(task, options.mount_seeds, folder / "mounts")
-        if options.profile != "ideal":
-            task, servos = with_servos(task, options, folder / "servos")
+        task, mounts, servos = with_robot(task, options, folder)
         trials = Trials(
             task,
             SimulatedSenses(sets=sets),
@@ -291,13 +306,13 @@ def add_clearance(row: dict[str, Any], least: float, sim_s: float) -> None:
 
 
 def crashed_row(task: Task, error: Exception) -> dict[str, Any]:
-    """The row of a task that a fault of this program ended."""
+    """The row of a task that an error ended outside the grasp."""
     return _head(task, len(task.labels)) | {
         "outcome": "failed",
         "as_expected": False,
         "placed": False,
         "false_success": False,
-        "code": Code.INTERNAL.value,
+        "code": (error.code if isinstance(error, OpenArmError) else Code.INTERNAL).value,
         "message": f"{type(error).__name__}: {error}",
         "reasons": [],
         "arm": "",

@@ -350,7 +350,7 @@ async def verify(run: Run, placed: Placed) -> CameraVerdict:
         text = f"{run.label!r} is not in view after the place; observing again"
     error = placing_error(run.label, placed.target, frames[-1]) if frames else None
     if error is not None:
-        run.task.session.drift.add(*error)
+        run.task.session.drift.add(run.arm, *error)
     p_target, yaw = placed.target.position, run.request.place_yaw
     height, footprint = (None, None) if run.size is None else (float(run.size[2]), run.size[:2])
     tolerance = config.place.tolerance

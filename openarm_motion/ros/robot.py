@@ -10,14 +10,13 @@ from typing import Any, TypeVar
 
 from action_msgs.msg import GoalInfo
 from control_msgs.action import FollowJointTrajectory
-from rclpy.action import ActionClient
 from rclpy.task import Future, Task
 from unique_identifier_msgs.msg import UUID
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.lifeline import Lifeline
 from openarm_common.robot.robot_state import RobotStateBuffer
-from openarm_common.ros.actions import LEASE, latest, owner_topic
+from openarm_common.ros.actions import LEASE, ActionClient, latest, owner_topic
 from openarm_common.ros.convert import ns_to_stamp, stamp_to_ns, trajectory_to_msg
 from openarm_common.ros.holds import HoldListener
 from openarm_common.ros.node import BaseNode

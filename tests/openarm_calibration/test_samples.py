@@ -209,7 +209,10 @@ def test_wrong_intrinsics_fail_by_name_and_right_ones_do_not(session, setup: str
     assert any(re.match(r"the focal length seems -3\.\d+ % off", reason) for reason in verdict.reasons)
     far = (width, height, 1.2 * fx, 1.2 * fy, cx, cy)
     samples.head = samples.head.model_copy(update={"intrinsics": far})
-    with pytest.raises(OpenArmError, match=r"poses that contradict each other.*check the intrinsics in camera_info"):
+    with pytest.raises(
+        OpenArmError,
+        match=r"poses that contradict each other.*check the joint zeros, the intrinsics",
+    ):
         solve(samples.problem())
 
 

@@ -23,7 +23,19 @@ def watched(bias: tuple[float, float], noise: float, n: int = 10, seed: int = 0)
     for _ in range(n):
         angle = rng.uniform(0.0, np.pi)
         axis = np.array([np.cos(angle), np.sin(angle)])
-        watch.add(axis, float(axis @ np.array(bias)) + rng.normal(0.0, noise))
+        watch.add("left", axis, float(axis @ np.array(bias)) + rng.normal(0.0, noise))
+    return watch
+
+
+def of_both(biases: dict[str, tuple[float, float]], noise: float, seed: int) -> DriftWatch:
+    """Five grasps of each arm, in turn, with hands turned at random."""
+    rng = np.random.default_rng(seed)
+    watch = DriftWatch(DriftConfig(), "overhead")
+    for k in range(10):
+        arm = ("left", "right")[k % 2]
+        angle = rng.uniform(0.0, np.pi)
+        axis = np.array([np.cos(angle), np.sin(angle)])
+        watch.add(arm, axis, float(axis @ np.array(biases[arm])) + rng.normal(0.0, noise))
     return watch
 
 
@@ -52,8 +64,36 @@ def test_few_grasps_say_nothing():
 def test_old_grasps_are_forgotten():
     watch = watched((0.008, 0.0), 0.001)
     for k in range(10):
-        watch.add(np.array([1.0, 0.0]) if k % 2 else np.array([0.0, 1.0]), 0.0)
+        watch.add("left", np.array([1.0, 0.0]) if k % 2 else np.array([0.0, 1.0]), 0.0)
     assert not watch.drift().alarm
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.requirement("N-06")
+def test_arms_that_differ_have_wrong_joint_zeros(seed):
+    drift = of_both({"left": (0.008, 0.0), "right": (-0.008, 0.006)}, 0.001, seed).drift()
+    assert drift.alarm
+    assert set(drift.arms) == {"left", "right"}
+    assert "joint zeros are wrong" in drift.message
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.requirement("N-06")
+def test_what_is_wrong_with_the_camera_is_no_difference_of_the_arms(seed):
+    drift = of_both({"left": (0.008, -0.004), "right": (0.008, -0.004)}, 0.001, seed).drift()
+    assert drift.alarm
+    assert not drift.arms
+    assert "calibrate it again" in drift.message
+
+
+@pytest.mark.requirement("N-06")
+def test_arms_that_measured_different_directions_are_not_compared():
+    watch = DriftWatch(DriftConfig(), "overhead")
+    for _ in range(5):
+        watch.add("left", np.array([1.0, 0.0]), 0.006)
+        watch.add("right", np.array([0.0, 1.0]), 0.006)
+    assert watch.drift().alarm
+    assert not watch.drift().arms
 
 
 @pytest.mark.slow
