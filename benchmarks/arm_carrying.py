@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from openarm_common.errors import OpenArmError
-from openarm_common.robot.description import SIDES, RobotDescription, Side
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ServoModel
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Array
@@ -34,6 +34,8 @@ from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
+
+SIDES = RobotDescription.load().arm_names
 
 _REST_NS = 300_000_000
 _OFF = CarrierConfig(weight=False, lag=False, correction=0.0, settle=False)
@@ -135,7 +137,7 @@ def play(
     out.static.append(off(plan.q[-1], world.data.qpos[qpos] + zero[at])[0])
 
 
-def identified(hardware: HardwareConfig) -> dict[Side, ServoModel]:
+def identified(hardware: HardwareConfig) -> dict[str, ServoModel]:
     """Return the servos as the suite identifies them."""
     return {side: found.servos for side, found in DynamicsBench(hardware).identified().items()}
 

@@ -16,15 +16,17 @@ import mujoco
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.robot.description import RobotDescription, Side, mirror
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene, SceneObject, Table
 from openarm_common.types import Array
 from openarm_sim_bridge.world.model import PhysicsConfig, compile_model
 
+mirror = RobotDescription.load().mirrored
+
 TABLE = Table()
 OPEN, LIFT, BACK = 0.044, 0.12, 0.08
 SHOULDER, UPPER, FORE, HAND = np.array([0.0, -0.1535, 0.698]), 0.220, 0.216, 0.1801
-LOWER, UPPER_LIMIT = RobotDescription.load().limits(RobotDescription.arm_joints("right"))
+LOWER, UPPER_LIMIT = RobotDescription.load().limits(RobotDescription.load().arm_joints("right"))
 
 OBJECTS = {
     "cube_4cm": ("box", (0.04, 0.04, 0.04), 0.064),
@@ -162,7 +164,7 @@ def quintic(u: float) -> float:
 class Trial:
     """One grasp in a world of its own. The left arm does the mirror image of what the right one would."""
 
-    def __init__(self, item: SceneObject, side: Side, error: Array, physics: PhysicsConfig | None = None) -> None:
+    def __init__(self, item: SceneObject, side: str, error: Array, physics: PhysicsConfig | None = None) -> None:
         description = RobotDescription.load()
         flipped = item.model_copy(update={"position": (item.position[0], -item.position[1]), "yaw": -item.yaw})
         self.item = item if side == "right" else flipped

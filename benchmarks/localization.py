@@ -5,6 +5,8 @@
 
 Every pose is a random object (cube, box, cylinder or can, 4 to 7 cm wide) at a random place and yaw on the table, drawn
 from a seed of its own. The overhead camera looks past the robot at home; the wrist camera looks from a posture within
+
+SIDES = RobotDescription.load().arm_names
 0.06 rad of `wrist_look`, at objects that are in its picture. Images are 640 x 480, 16UC1; noisy depth is that of a
 D435 (`openarm_sim_bridge.cameras.noise`: error growing with the square of the depth, flying pixels, holes).
 
@@ -33,7 +35,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, load_cameras
 from openarm_common.config import load_config
 from openarm_common.resources import config_dir
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene, SceneObject, Table, random_scene
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig
 from openarm_perception.detection.localize import Localizer, LocalizerConfig, LocatedObject
@@ -61,7 +63,7 @@ class Studio:
 
     def home(self) -> dict[str, float]:
         """Joint positions of the home posture, grippers open."""
-        opening = {self.description.finger_joint(side): 0.044 for side in SIDES}
+        opening = {self.description.finger_joint(side): 0.044 for side in self.description.arm_names}
         return self.description.group_state("both_arms", "home") | opening
 
     def looking(self, rng: np.random.Generator | None = None) -> dict[str, float]:

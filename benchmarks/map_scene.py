@@ -16,7 +16,7 @@ from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, load_cameras, true_mount
 from openarm_common.camera.housings import with_housings
 from openarm_common.octree.lattice import Lattice
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene
 from openarm_common.types import Array
 from openarm_octomap.grid import DepthScan
@@ -25,6 +25,8 @@ from openarm_sim_bridge.cameras.noise import DepthNoiseConfig, add_depth_noise
 from openarm_sim_bridge.cameras.renderer import SnapshotRenderer
 from openarm_sim_bridge.world.model import compile_model
 from openarm_sim_bridge.world.world import Snapshot
+
+SIDES = RobotDescription.load().arm_names
 
 _D435 = DepthNoiseConfig()
 

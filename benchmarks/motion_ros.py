@@ -15,9 +15,11 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
 from openarm_common import se3
+from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import matrix_to_pose
-from openarm_common.ros.node import BASE_FRAME
 from openarm_motion.planning.arm import Arm
+
+BASE_FRAME = RobotDescription.load().base
 
 _LIMIT = 30.0
 

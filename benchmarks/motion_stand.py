@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ArmLoad
 from openarm_common.scene.scene import load_scene
 from openarm_control.arm import TrajectoryConfig, TrajectoryOutcome
@@ -21,6 +21,8 @@ from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.hardware import HardwareConfig
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
+
+SIDES = RobotDescription.load().arm_names
 
 #: Distances of the arms are looked for up to here, m.
 FAR = 0.3

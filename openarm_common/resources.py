@@ -11,7 +11,7 @@ from pathlib import Path
 
 from openarm_common.errors import Code, OpenArmError
 
-_MARKER = Path("models") / "openarm" / "openarm.urdf.xacro"
+_MARKER = Path("models") / "robots"
 
 
 @lru_cache(maxsize=1)
@@ -25,7 +25,7 @@ def resource_root() -> Path:
     prefixes = [Path(sys.prefix), *package.parents]
     candidates = [package.parent, *(p / "share" / "openarm" for p in prefixes)]
     for candidate in candidates:
-        if (candidate / _MARKER).is_file():
+        if (candidate / _MARKER).is_dir():
             return candidate
     places = ", ".join(str(c) for c in candidates[:3])
     raise OpenArmError(Code.ENVIRONMENT, f"{_MARKER} was not found in {places}, …; is the installation complete?")

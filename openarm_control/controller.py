@@ -13,7 +13,6 @@ from typing import Protocol
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import Side
 from openarm_common.types import Array, Ints
 from openarm_control.arm import TrajectoryConfig, TrajectoryFollower
 from openarm_control.carrier import Carrier
@@ -104,14 +103,14 @@ class RobotController(JointController):
 
     def __init__(
         self,
-        arms: Mapping[Side, JointGroup],
-        grippers: Mapping[Side, JointGroup],
+        arms: Mapping[str, JointGroup],
+        grippers: Mapping[str, JointGroup],
         joint_names: tuple[str, ...],
         state: JointReadout,
-        gripper_effort: Mapping[Side, float],
+        gripper_effort: Mapping[str, float],
         trajectory: TrajectoryConfig,
         gripper: GripperConfig,
-        carriers: Mapping[Side, Carrier],
+        carriers: Mapping[str, Carrier],
     ) -> None:
         self.joint_names = joint_names
         self._timeout_ns = round(trajectory.command_timeout * 1e9)
@@ -196,7 +195,7 @@ class RobotController(JointController):
             self.arms[side].carrier.hold(gripper.pressing)
         return self._targets
 
-    def carry_by(self, carriers: Mapping[Side, Carrier]) -> None:
+    def carry_by(self, carriers: Mapping[str, Carrier]) -> None:
         """Let other carriers make the targets of the arms, because more is known of the servos."""
         for side, carrier in carriers.items():
             self.arms[side].carry_by(carrier)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openarm_common.robot.description import SIDES, RobotDescription, Side
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ArmLoad, ServoModel
 from openarm_common.types import Array
 from openarm_control.carrier import Carrier, CarrierConfig
@@ -33,27 +33,34 @@ class JointReadout:
 
 def joint_names(description: RobotDescription) -> tuple[str, ...]:
     """Return the controlled joints: of each side those of the arm, then the driving finger joint."""
-    return tuple(name for side in SIDES for name in (*description.arm_joints(side), description.finger_joint(side)))
+    return tuple(
+        name
+        for side in description.arm_names
+        for name in (*description.arm_joints(side), description.finger_joint(side))
+    )
 
 
-def arm_groups(description: RobotDescription) -> dict[Side, JointGroup]:
+def arm_groups(description: RobotDescription) -> dict[str, JointGroup]:
     """Return the joint group of each arm, by side."""
-    return {side: _group(description, description.arm_joints(side)) for side in SIDES}
+    return {side: _group(description, description.arm_joints(side)) for side in description.arm_names}
 
 
-def gripper_groups(description: RobotDescription) -> dict[Side, JointGroup]:
+def gripper_groups(description: RobotDescription) -> dict[str, JointGroup]:
     """Return the joint group (the driving finger joint) of each gripper, by side."""
-    return {side: _group(description, (description.finger_joint(side),)) for side in SIDES}
+    return {side: _group(description, (description.finger_joint(side),)) for side in description.arm_names}
 
 
-def arm_loads(description: RobotDescription) -> dict[Side, ArmLoad]:
+def arm_loads(description: RobotDescription) -> dict[str, ArmLoad]:
     """Return what motions of each arm take, by side."""
-    return {side: ArmLoad(description, description.arm_joints(side), description.tcp_link(side)) for side in SIDES}
+    return {
+        side: ArmLoad(description, description.arm_joints(side), description.tcp_link(side))
+        for side in description.arm_names
+    }
 
 
 def carriers(
-    description: RobotDescription, config: CarrierConfig, servos: Mapping[Side, ServoModel]
-) -> dict[Side, Carrier]:
+    description: RobotDescription, config: CarrierConfig, servos: Mapping[str, ServoModel]
+) -> dict[str, Carrier]:
     """Return what makes servo targets of commands, by side.
 
     Args:
@@ -63,7 +70,7 @@ def carriers(
     """
     soft = any(one.soft for one in servos.values())
     loads = arm_loads(description) if soft else {}
-    found = dict[Side, Carrier]()
+    found = dict[str, Carrier]()
     for side, one in servos.items():
         if not one.soft:
             found[side] = Carrier(one, config)

@@ -16,7 +16,6 @@ from pydantic import Field, field_validator
 from openarm_common.config import Config
 from openarm_common.errors import OpenArmError
 from openarm_common.records import default_folder
-from openarm_common.robot.description import Side
 from openarm_common.robot.servo_store import ServoStore
 from openarm_common.robot.servos import ArmLoad, ServoModel
 
@@ -78,7 +77,7 @@ class KnownServos:
 
     def __init__(
         self,
-        configured: Mapping[Side, ServoModel],
+        configured: Mapping[str, ServoModel],
         folder: str,
         dynamics_seed: int | None,
         warn: Callable[[str], object],

@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from openarm_common.robot.description import RobotDescription, Side
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Table
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.arms import ARMS
+from openarm_grasp.planning.arms import Shoulders, arm_order
 
 
 @dataclass(frozen=True)
@@ -24,12 +23,16 @@ class GraspContext:
 
     config: GraspConfig
     table: Table
-    shoulders: Mapping[str, Sequence[float]]
+    shoulders: Shoulders
 
     @classmethod
     def of(cls, config: GraspConfig, table: Table, robot: RobotDescription) -> GraspContext:
         """That of a robot at a table."""
-        return cls(config, table, {arm: _shoulder(robot, arm) for arm in ARMS})
+        return cls(config, table, {arm: _shoulder(robot, arm) for arm in robot.arm_names})
+
+    def arm_order(self, arm: str, y: float) -> tuple[str, ...]:
+        """Arms to try for an object; see `openarm_grasp.planning.arms.arm_order`."""
+        return arm_order(arm, y, self.config.approach.overlap_half_width, self.shoulders)
 
     @property
     def clear_of_objects(self) -> float:
@@ -37,7 +40,7 @@ class GraspContext:
         return self.table.top_z + 2.0 * self.config.approach.lift_height
 
 
-def _shoulder(robot: RobotDescription, arm: Side) -> tuple[float, float]:
+def _shoulder(robot: RobotDescription, arm: str) -> tuple[float, float]:
     """(x, y) of the arm's first joint, base frame, m."""
     first = robot.joint(robot.arm_joints(arm)[0])
     T_base_shoulder = robot.link_pose(first.parent, {}) @ first.T_parent_joint

@@ -138,8 +138,8 @@ class FaultsConfig(Config):
 class MotionConfig(Config):
     """Parameters of the motion node."""
 
-    arms: tuple[str, ...] = Field(default=("left", "right"), min_length=1, description="names of the arms")
-    tool_link: str = Field(default="openarm_{arm}_hand_tcp", description="link that is moved to poses")
+    arms: tuple[str, ...] = Field(default=(), description="names of the arms; empty: all of the robot")
+    tool_link: str = Field(default="", description="link that is moved to poses; empty: the robot's tool centre point")
     group: str = Field(default="{arm}_arm", description="SRDF group of an arm's postures")
     controller: str = Field(
         default="/{arm}_joint_trajectory_controller/follow_joint_trajectory", description="FollowJointTrajectory action"

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from openarm_common.octree.lattice import KEY_ZERO, Lattice
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision.exact import CollisionContext, CollisionScene
 from openarm_motion.collision.fast import FastScene
 from openarm_motion.collision.occupancy import OccupancyMap
@@ -20,10 +20,11 @@ from openarm_motion.planning.rrt import warm_search
 def warm() -> None:
     """Run each kernel once with the types that the package uses; the compiled code is cached next to the sources."""
     description = RobotDescription.load()
-    kinematics = ArmKinematics(description, description.tcp_link(SIDES[0]))
+    name, parts = next(iter(description.arms.items()))
+    kinematics = ArmKinematics(description, parts.tcp)
     inverse = InverseKinematics(kinematics)
-    home = description.group_state(f"{SIDES[0]}_arm", "home")  # clear of singularities: a straight line leads away
-    q = np.array([home[joint] for joint in description.arm_joints(SIDES[0])])
+    home = description.group_state(f"{name}_arm", "home")  # clear of singularities: a straight line leads away
+    q = np.array([home[joint] for joint in parts.joints])
     pose = kinematics.fk_many(np.stack([q, q]))[0]
     inverse.nearest(pose, q)
     inverse.position_solutions(pose, near=q)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array, Ints
 from openarm_control.controller import JointController
 from openarm_control.follower import End
@@ -103,7 +103,7 @@ class OpenArmRos2(JointController):
     def __init__(self, description: RobotDescription, joint_names: tuple[str, ...], state: JointReadout) -> None:
         self.joint_names = joint_names
         groups: dict[str, Sequence[str]] = {}
-        for side in SIDES:
+        for side in description.arm_names:
             groups[f"{side}_joint_trajectory_controller"] = description.arm_joints(side)
             groups[f"{side}_gripper_controller"] = (description.finger_joint(side),)
         self._at: dict[str, Ints] = {
@@ -113,7 +113,7 @@ class OpenArmRos2(JointController):
         self.controllers = {
             name: PositionController(joints, state.position[self._at[name]]) for name, joints in groups.items()
         }
-        self._fingers = np.concatenate([self._at[f"{side}_gripper_controller"] for side in SIDES])
+        self._fingers = np.concatenate([self._at[f"{side}_gripper_controller"] for side in description.arm_names])
         self._targets = state.position.copy()
 
     def update(self, state: JointReadout, dt_ns: int) -> Array:

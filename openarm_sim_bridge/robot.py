@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Generic, TypeVar
 
-from openarm_common.robot.description import SIDES, Side
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ServoModel
 from openarm_common.scene.scene import Scene
 from openarm_common.types import Array
@@ -28,6 +28,7 @@ class SimulatedRobot(Generic[ControllerT]):
     """A world with controllers and faults. One thread.
 
     Args:
+        description: The robot.
         world: The world.
         controller: Of its joints.
 
@@ -37,10 +38,10 @@ class SimulatedRobot(Generic[ControllerT]):
         targets: (n,) actuator targets of the last tick, in the order of the world's joints.
     """
 
-    def __init__(self, world: World, controller: ControllerT) -> None:
+    def __init__(self, description: RobotDescription, world: World, controller: ControllerT) -> None:
         self.world = world
         self.controller = controller
-        self.faults = WorldFaults(world.joint_names)
+        self.faults = WorldFaults(description, world.joint_names)
         self.state: JointReadout = world.read_joints()
         self.targets: Array = self.state.position
 
@@ -50,7 +51,7 @@ class SimulatedRobot(Generic[ControllerT]):
         scene: Scene,
         trajectory: TrajectoryConfig | None = None,
         gripper: GripperConfig | None = None,
-        servos: Mapping[Side, ServoModel] | None = None,
+        servos: Mapping[str, ServoModel] | None = None,
     ) -> SimulatedRobot[RobotController]:
         """Return the robot of a stage in a scene.
 
@@ -66,7 +67,7 @@ class SimulatedRobot(Generic[ControllerT]):
         """
         world = stage.world(scene)
         controllers = SimulatedRobot.controllers(stage, world, trajectory or TrajectoryConfig(), gripper, servos)
-        return SimulatedRobot(world, controllers)
+        return SimulatedRobot(stage.description, world, controllers)
 
     @staticmethod
     def controllers(
@@ -74,16 +75,17 @@ class SimulatedRobot(Generic[ControllerT]):
         world: World,
         trajectory: TrajectoryConfig,
         gripper: GripperConfig | None = None,
-        servos: Mapping[Side, ServoModel] | None = None,
+        servos: Mapping[str, ServoModel] | None = None,
     ) -> RobotController:
         """Return the controllers of a world of a stage; arguments as `on`."""
         description, limits = stage.description, world.effort_limits()
+        fingers = {arm: world.joint_names.index(description.finger_joint(arm)) for arm in description.arm_names}
         return RobotController(
             arm_groups(description),
             gripper_groups(description),
             world.joint_names,
             world.read_joints(),
-            {side: float(limits[world.joint_names.index(description.finger_joint(side))]) for side in SIDES},
+            {arm: float(limits[finger]) for arm, finger in fingers.items()},
             trajectory,
             gripper or GripperConfig(),
             carriers(description, trajectory.carrier, stage.servos if servos is None else servos),

@@ -12,7 +12,7 @@ from typing import Any
 from openarm_bringup.messages import SEQUENCE, interface
 from openarm_common.robot.description import RobotDescription
 
-_ARM = RobotDescription.arm_joints("right")
+_ARM = RobotDescription.load().arm_joints("right")
 #: Values of fields of these names that requests of the suite have; others are words or small numbers.
 _SENSE: dict[str, tuple[Any, ...]] = {
     "arm": ("left", "right"),

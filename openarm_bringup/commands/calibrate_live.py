@@ -153,13 +153,13 @@ def dynamics(*, arm: str = "both", postures: int = 6, dry_run: bool = False, dom
         dry_run: Identify, and store nothing.
     """
     join_graph(domain)
-    from openarm_bringup.calibration.ros.dynamics import DynamicsClient, arm_sides
+    from openarm_bringup.calibration.ros.dynamics import DynamicsClient, named_arms
     from openarm_common.records import default_folder
     from openarm_common.robot.servo_store import ServoStore
 
     if not LEAST_POSTURES <= postures <= MOST_POSES:
         raise OpenArmError(Code.INVALID_ARGUMENT, f"--postures {postures}: expected {LEAST_POSTURES} to {MOST_POSES}")
-    sides, store = arm_sides(arm), ServoStore(default_folder())
+    sides, store = named_arms(arm), ServoStore(default_folder())
     data, lines, show = dict[str, Any](), list[str](), _Show()
     with requires_node("motion", "motion"), DynamicsClient() as client:
         seed = client.dynamics_seed()

@@ -28,7 +28,7 @@ def graph(*, form: Literal["text", "mermaid"] = "text") -> Outcome:
 
 
 @grasp.command
-def release(*, arm: Literal["", "left", "right"] = "", domain: Domain = None) -> Outcome:
+def release(*, arm: str = "", domain: Domain = None) -> Outcome:
     """Open a hand where it is: what it holds falls from there. `openarm pick --phase place` puts it down instead.
 
     Args:

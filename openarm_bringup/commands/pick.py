@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from openarm_grasp.ros.client import GraspResult, PairResult
 
 
-Arm = Literal["auto", "left", "right"]
 T = TypeVar("T")
 
 
@@ -30,7 +29,7 @@ def pick(
     label: str = "",
     second: str = "",
     *,
-    arm: list[Arm] | None = None,
+    arm: list[str] | None = None,
     at: list[tuple[float, float]] | None = None,
     place: list[tuple[float, float, float]] | None = None,
     yaw: list[float] | None = None,

@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from aiohttp import WSCloseCode, WSMsgType, web
 from pydantic import Field, ValidationError
@@ -54,7 +54,7 @@ class Order(Config):
     """A grasp that a page asks for."""
 
     label: str = Field(default="", max_length=64, description="what to pick; empty = the best detection")
-    arm: Literal["auto", "left", "right"] = "auto"
+    arm: str = "auto"
     dry_run: bool = False
     confirm: bool = False
 

@@ -18,7 +18,7 @@ from openarm_common.camera.stream import Frame
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.camera_stream import CameraStream
 from openarm_common.ros.convert import image_to_array, rgb_image
-from openarm_common.ros.node import BASE_FRAME, BaseNode
+from openarm_common.ros.node import BaseNode
 from openarm_common.ros.tf import RobotStateListener
 
 #: Period in which a condition is checked, s of wall clock.
@@ -44,7 +44,7 @@ class ImageCapture:
         }
         # the mount of the camera is not known yet: the pose of the base alone is looked up
         self._stream = CameraStream(
-            node, states, topics, joints="required", pose_of=BASE_FRAME, on_refusal=self._refuse
+            node, states, topics, joints="required", pose_of=node.description.base, on_refusal=self._refuse
         )
 
     async def state(self) -> dict[str, float]:

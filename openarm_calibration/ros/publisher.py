@@ -31,7 +31,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.records import default_folder, now
 from openarm_common.ros.answers import answering
 from openarm_common.ros.convert import info_from_intrinsics, matrix_to_transform
-from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
+from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
 from openarm_common.ros.tf import TABLE_FRAME
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Array
@@ -90,7 +90,9 @@ class PublisherNode(BaseNode[PublisherConfig]):
                 matrix_to_transform(camera.link_frame, camera.optical_frame, T_LINK_OPTICAL, 0),
             ]
         height, sources[TABLE] = self._table(faults)
-        message.transforms.append(matrix_to_transform(BASE_FRAME, TABLE_FRAME, se3.make(None, (0.0, 0.0, height)), 0))
+        message.transforms.append(
+            matrix_to_transform(self.description.base, TABLE_FRAME, se3.make(None, (0.0, 0.0, height)), 0)
+        )
         self._mounts.publish(message)
         for fault in faults:
             self.get_logger().warning(fault)

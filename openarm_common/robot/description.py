@@ -1,41 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """The robot: one description for every part of the suite.
 
-`RobotDescription.load()` expands `models/openarm`; the same URDF text goes to MuJoCo, pinocchio and
+`RobotDescription.load()` reads a folder of `models/robots`; the same URDF text goes to MuJoCo, pinocchio and
 `/robot_description`. Forward kinematics here needs nothing but numpy. Poses are ``T_root_link``, (4, 4), in the frame
-of the root link (`world`, identical to `openarm_body_link0`); joint positions are rad, or m for a finger.
+of the root link (`world`, identical to the base frame); joint positions are rad, or m for a finger.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
 
 import numpy as np
 import xacro
 
+from openarm_common.config import read_text
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.resources import models_dir
+from openarm_common.robot.folder import ArmParts, RobotFolder, load_folder, robot_name
 from openarm_common.robot.srdf import Semantics, parse_srdf
 from openarm_common.robot.urdf import Joint, Link, Primitive, parse_urdf
 from openarm_common.robot.xml_text import fault
 from openarm_common.types import Array
 
-__all__ = ["BASE_LINK", "SIDES", "Joint", "Link", "Primitive", "RobotDescription", "Side", "mirror"]
-
-Side = Literal["left", "right"]
-SIDES: tuple[Side, Side] = ("left", "right")
-BASE_LINK = "openarm_body_link0"
-_MIRROR = np.array([-1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])
-
-
-def mirror(q: Iterable[float]) -> Array:
-    """Mirror joint positions (7,) of one arm: the other arm takes the pose with y negated."""
-    return np.fromiter(q, dtype=np.float64) * _MIRROR
+__all__ = ["Joint", "Link", "Primitive", "RobotDescription"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +41,9 @@ class RobotDescription:
         links: By name, in the order of the URDF.
         joints: By name, in the order of the URDF.
         semantics: What the SRDF says.
+        base: Base frame.
+        arms: By name.
+        mirror: Signs that mirror the joint positions of one arm to the other; empty: arms are no mirror images.
     """
 
     urdf: str
@@ -60,17 +54,27 @@ class RobotDescription:
     joints: Mapping[str, Joint]
     semantics: Semantics
     _chains: Mapping[str, tuple[Joint, ...]] = field(repr=False)
+    base: str = ""
+    arms: Mapping[str, ArmParts] = field(default_factory=dict[str, ArmParts])
+    mirror: tuple[float, ...] = ()
 
     @classmethod
-    @lru_cache(maxsize=1)
-    def load(cls) -> RobotDescription:
-        """Return the OpenArm description of `models/openarm`; expanded once a process.
+    def load(cls, name: str = "") -> RobotDescription:
+        """Return a robot of `models/robots`; expanded once a process.
+
+        Args:
+            name: Of its folder; "": that of this process.
 
         Raises:
-            OpenArmError: CONFIG_INVALID, when the xacro or the SRDF is faulty; ENVIRONMENT, when the files are missing.
+            OpenArmError: INVALID_ARGUMENT, listing the robots there are; CONFIG_INVALID, when a file of it is faulty.
         """
-        folder = models_dir() / "openarm"
-        source = folder / "openarm.urdf.xacro"
+        return _loaded(name or robot_name())
+
+    @classmethod
+    def from_folder(cls, name: str) -> RobotDescription:
+        """Read a robot of `models/robots`; as `load`."""
+        folder, parts = load_folder(name)
+        source = folder / parts.xacro
         try:
             document = xacro.process_file(str(source))
         except xacro.XacroException as error:
@@ -78,7 +82,9 @@ class RobotDescription:
         root = ET.fromstring(document.toxml())  # drops xacro's comments, which name the folder it ran in
         ET.indent(root)
         urdf = ET.tostring(root, encoding="unicode") + "\n"
-        return cls.from_urdf(urdf, (folder / "openarm.srdf").read_text(encoding="utf-8"))
+        robot = cls.from_urdf(urdf, read_text(folder / parts.srdf))
+        _check_parts(parts, robot, folder / "robot.yaml")
+        return replace(robot, name=name, base=parts.base, arms=parts.arms, mirror=parts.mirror)
 
     @classmethod
     def from_urdf(cls, urdf: str, srdf: str = "") -> RobotDescription:
@@ -112,20 +118,49 @@ class RobotDescription:
             _chains=MappingProxyType(chains),
         )
 
-    @staticmethod
-    def arm_joints(side: Side) -> tuple[str, ...]:
-        """Return the names of the seven joints of an arm, from the shoulder."""
-        return tuple(f"openarm_{side}_joint{i}" for i in range(1, 8))
+    @property
+    def arm_names(self) -> tuple[str, ...]:
+        """Names of the arms."""
+        return tuple(self.arms)
 
-    @staticmethod
-    def finger_joint(side: Side) -> str:
-        """Return the name of the joint that drives both fingers of a hand."""
-        return f"openarm_{side}_finger_joint1"
+    def arm(self, name: str) -> ArmParts:
+        """Return an arm.
 
-    @staticmethod
-    def tcp_link(side: Side) -> str:
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, listing the arms there are.
+        """
+        if name not in self.arms:
+            there = ", ".join(self.arms) or "none"
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"no arm {name!r} in robot {self.name!r}; arms: {there}")
+        return self.arms[name]
+
+    def arm_joints(self, arm: str) -> tuple[str, ...]:
+        """Return the names of the joints of an arm, from the shoulder."""
+        return self.arm(arm).joints
+
+    def finger_joint(self, arm: str) -> str:
+        """Return the name of the joint that drives the fingers of a hand."""
+        return self.arm(arm).finger_joint
+
+    def tcp_link(self, arm: str) -> str:
         """Return the name of the tool centre point of an arm: z out of the fingers, y the opening direction."""
-        return f"openarm_{side}_hand_tcp"
+        return self.arm(arm).tcp
+
+    def links_of(self, arm: str) -> tuple[str, ...]:
+        """Return the links of an arm: its base and all beyond it, in the order of the URDF."""
+        base = self.arm(arm).base
+        beyond = {base, *(link for link, chain in self._chains.items() if any(j.parent == base for j in chain))}
+        return tuple(link for link in self.links if link in beyond)
+
+    def mirrored(self, q: Iterable[float]) -> Array:
+        """Mirror joint positions (n,) of one arm: the other arm takes the pose with y negated.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when the arms of this robot are no mirror images.
+        """
+        if not self.mirror:
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"the arms of robot {self.name!r} are no mirror images")
+        return np.fromiter(q, dtype=np.float64) * np.array(self.mirror)
 
     @property
     def allowed_collisions(self) -> frozenset[frozenset[str]]:
@@ -233,6 +268,25 @@ class RobotDescription:
         if joint.mimic is not None:
             position = joint.multiplier * position + joint.offset
         return joint.T_parent_joint @ joint.motion(position)
+
+
+@lru_cache(maxsize=8)
+def _loaded(name: str) -> RobotDescription:
+    return RobotDescription.from_folder(name)
+
+
+def _check_parts(parts: RobotFolder, robot: RobotDescription, path: Path) -> None:
+    """Raise CONFIG_INVALID, naming every link, joint and group of a folder that its URDF and SRDF don't have."""
+    faults = [] if parts.base in robot.links else [f"base: no link {parts.base!r}"]
+    for name, arm in parts.arms.items():
+        links = [arm.base, arm.flange, arm.hand, arm.tcp, *arm.fingers]
+        faults += [f"arms.{name}: no link {link!r}" for link in links if link not in robot.links]
+        joints = (*arm.joints, arm.finger_joint)
+        faults += [f"arms.{name}: no joint {joint!r}" for joint in joints if joint not in robot.joints]
+        if f"{name}_arm" not in robot.semantics.groups:
+            faults.append(f"arms.{name}: the SRDF has no group {name}_arm")
+    if faults:
+        raise OpenArmError(Code.CONFIG_INVALID, f"{path}: {'; '.join(faults)}")
 
 
 def _chain_of(link: str, parent_joint: Mapping[str, Joint]) -> tuple[Joint, ...]:

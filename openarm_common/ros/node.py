@@ -47,8 +47,6 @@ R = TypeVar("R")
 #: Time that a node has to stop motion before the process ends, s.
 _HOLD = 2.0
 _ENDING = (signal.SIGINT, signal.SIGTERM)
-#: Frame of the poses of the suite.
-BASE_FRAME = "openarm_body_link0"
 
 
 def _profile(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProfile:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from openarm_common.robot.description import SIDES, Side
 from openarm_common.robot.servos import ServoModel
 from openarm_common.ros.node import run
 from openarm_control.config import ArmControlConfig
@@ -32,12 +31,12 @@ class ArmControl(ControlNode[ArmControlConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("arm_control", ArmControlConfig, **kwargs)
         config, description = self.config, self.description
-        known: dict[Side, ServoModel] = {
+        known: dict[str, ServoModel] = {
             side: config.servos.model(load) for side, load in arm_loads(description).items()
         }
         seed = None if config.dynamics_seed < 0 else config.dynamics_seed
         servos = KnownServos(known, config.calibrations, seed, self.get_logger().warning)
-        names, effort = joint_names(description), dict[Side, float].fromkeys(SIDES, np.inf)
+        names, effort = joint_names(description), dict[str, float].fromkeys(description.arm_names, np.inf)
         controller = RobotController(
             arm_groups(description),
             gripper_groups(description),

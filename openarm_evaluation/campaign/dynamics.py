@@ -12,7 +12,7 @@ import numpy as np
 from openarm_calibration.dynamics.excite import postures, waves
 from openarm_calibration.dynamics.identify import Identified, ServoLog, identify
 from openarm_common.errors import OpenArmError
-from openarm_common.robot.description import SIDES, RobotDescription, Side
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servo_store import ServoStore
 from openarm_common.robot.servos import ArmLoad, ServoModel
 from openarm_common.scene.scene import load_scene
@@ -49,9 +49,9 @@ class DynamicsBench:
 
     def identified(self) -> Mapping[str, Identified]:
         """Move both arms in turn and identify their servos, by side."""
-        return {side: self._identified(side) for side in SIDES}
+        return {side: self._identified(side) for side in self._description.arm_names}
 
-    def _identified(self, side: Side) -> Identified:
+    def _identified(self, side: str) -> Identified:
         arm, description = self._arms[side], self._description
         load = ArmLoad(description, arm.names, description.tcp_link(side))
         collides = arm.scene(self._state(), ()).collides
@@ -93,7 +93,7 @@ class DynamicsBench:
         return dict(zip(world.joint_names, world.read_joints().position.tolist(), strict=True))
 
 
-def with_servos(task: Task, options: CampaignOptions, folder: Path) -> tuple[Task, Mapping[Side, ServoModel] | None]:
+def with_servos(task: Task, options: CampaignOptions, folder: Path) -> tuple[Task, Mapping[str, ServoModel] | None]:
     """The task with the robot of one of the dynamics seeds (each in turn), and its servos as identified, by side.
 
     Args:
@@ -105,9 +105,9 @@ def with_servos(task: Task, options: CampaignOptions, folder: Path) -> tuple[Tas
     task = replace(task, dynamics_seed=seed)
     if not options.identify:
         return task, None
-    store = ServoStore(folder / str(seed))
-    if any(store.find(side) is None for side in SIDES):
+    store, arms = ServoStore(folder / str(seed)), RobotDescription.load().arm_names
+    if any(store.find(arm) is None for arm in arms):
         hardware = suite_config(options.graph_parameters()).bridge.hardware.of_seed(seed)
         for side, found in DynamicsBench(hardware).identified().items():
             store.save(found.record(side, seed))
-    return task, {side: store.load(side).model() for side in SIDES}
+    return task, {arm: store.load(arm).model() for arm in arms}

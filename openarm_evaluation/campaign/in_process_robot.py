@@ -30,7 +30,6 @@ from openarm_motion.service.requests import (
     PlanApproachRequest,
 )
 from openarm_motion.timing.trajectory import Trajectory
-from openarm_sim_bridge.world.touch import pad_links
 
 T = TypeVar("T")
 AnswerT = TypeVar("AnswerT", bound=MotionAnswer)
@@ -84,7 +83,7 @@ class InProcessRobot:
 
     def pads(self, arm: str) -> tuple[float, ...]:
         """Force on each finger pad of a hand, N, from its sensors."""
-        links = pad_links("left" if arm == "left" else "right")
+        links = self.description.arm(arm).fingers
         return tuple(float(np.linalg.norm(self.robot.world.pad_wrench(link)[0])) for link in links)
 
     def held_box(self, arm: str) -> GraspBox | None:

@@ -37,7 +37,6 @@ from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig, drawn
 from openarm_sim_bridge.world.model import build_spec
 from openarm_sim_bridge.world.world import Snapshot, start_qpos
 
-HAND = "openarm_right_link7"
 #: The board between the fingers, for a fixed camera; and lying on the table, for one on the hand.
 _HELD = se3.make(se3.rotation_from_z_y((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.37))
 _PLACED = se3.make(se3.rotation_from_z_y((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)), (0.33, -0.2, 0.405))
@@ -93,10 +92,11 @@ class Bench:
     def __init__(self, camera: CameraConfig, seed: int, folder: Path, zeros: Mapping[str, float] | None = None) -> None:
         self._zeros = zeros or {}
         self._camera, self._board, self._description = camera, CircleGrid(), RobotDescription.load()
-        self._fixed = camera.parent != HAND
+        self._carrier = load_cameras()["wrist"].parent
+        self._fixed = camera.parent != self._carrier
         posture = self._description.group_state
         self._home = {**posture("right_arm", "home"), **posture("left_arm", "home")}
-        self._T_carrier_board, carrier = (_HELD, HAND) if self._fixed else (_PLACED, "")
+        self._T_carrier_board, carrier = (_HELD, self._carrier) if self._fixed else (_PLACED, "")
         write_board(self._board, folder / "board.xml")
         spec = build_spec(self._description, load_scene("empty"), load_cameras(), seed)
         child = mujoco.MjSpec.from_file(str(folder / "board.xml"))
@@ -113,7 +113,7 @@ class Bench:
             camera=camera.name,
             setup="to_hand" if self._fixed else "in_hand",
             parent=camera.parent,
-            carrier=HAND,
+            carrier=self._carrier,
             intrinsics=numbers,
             board=self._board.model_dump(),
             mount_seed=seed,
@@ -163,7 +163,7 @@ class Bench:
         return best
 
     def _visible(self, joints: dict[str, float]) -> bool:
-        hand = self._description.link_pose(HAND, joints)
+        hand = self._description.link_pose(self._carrier, joints)
         if self._fixed:
             T = se3.inverse(self._camera.T_parent_optical) @ hand @ self._T_carrier_board
         else:

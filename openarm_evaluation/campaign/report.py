@@ -32,6 +32,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
     placed = [row for row in possible if row["placed"]]
     grasps = [grasp for row in rows for grasp in row["grasps"]]
     done = [grasp for grasp in grasps if grasp["placed"]]
+    arms = sorted({grasp["arm"] for grasp in grasps} - {""})
     failed = [row for row in rows if not row["as_expected"]]
     success = interval(len(placed), len(possible))
     first = sum(row["attempts"] == 1 for row in placed)
@@ -51,7 +52,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Any]:
         "attempts": dict(sorted(Counter(int(row["attempts"]) for row in placed).items())),
         "causes": dict(Counter(_cause(row) for row in failed).most_common()),
         "kinds": _kinds(rows),
-        "arms": {arm: rate_of(g["placed"] for g in grasps if g["arm"] == arm) for arm in ("left", "right")},
+        "arms": {arm: rate_of(g["placed"] for g in grasps if g["arm"] == arm) for arm in arms},
         "detectors": {
             kind: rate_of(row["placed"] for row in possible if row["detector"] == kind)
             for kind in sorted({row["detector"] for row in rows})

@@ -25,7 +25,7 @@ from openarm_common.camera.depth_view import DepthView
 from openarm_common.config import Config, load_config
 from openarm_common.errors import OpenArmError
 from openarm_common.resources import config_dir
-from openarm_common.robot.description import RobotDescription, Side
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.robot.servos import ServoModel
@@ -112,7 +112,7 @@ class SimRobot:
         mount_seed: int | None = None,
         mounts: Mapping[str, Array] | None = None,
         dynamics_seed: int | None = None,
-        servos: Mapping[Side, ServoModel] | None = None,
+        servos: Mapping[str, ServoModel] | None = None,
         table: Table | None = None,
         seed: int = 0,
         posture: Mapping[str, float] | None = None,

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import Side
 from openarm_common.robot.servos import ServoModel
 from openarm_common.types import Array
 from openarm_evaluation.campaign import record
@@ -33,7 +32,6 @@ from openarm_evaluation.judging.provenance import scene_hash
 from openarm_evaluation.judging.trial import Step, Trial, choose_targets
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.requests.orders import Order
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest
 from openarm_grasp.requests.task import GraspSession, Status
@@ -69,7 +67,7 @@ class Trials:
         senses: SimulatedSenses,
         config: GraspConfig,
         mounts: Mapping[str, Array] | None = None,
-        servos: Mapping[Side, ServoModel] | None = None,
+        servos: Mapping[str, ServoModel] | None = None,
         folder: Path | None = None,
         again: str = "",
     ) -> None:
@@ -157,7 +155,7 @@ class Trials:
             self._report(status)
             steps[status.request].append(self.steps[-1])
 
-        robots: dict[Side, RobotInterface] = {arm: self.link.next_to_other() for arm in ARMS}
+        robots: dict[str, RobotInterface] = {arm: self.link.next_to_other() for arm in self.robot.description.arm_names}
         requests = (GraspRequest(task.labels[0]), GraspRequest(task.labels[1]))
         pair = Pair(self.session, self.skills, robots, requests, report, carry_out)
         robot.pass_time(0.1)
@@ -233,7 +231,7 @@ class Trials:
 
 def with_robot(
     task: Task, options: CampaignOptions, folder: Path
-) -> tuple[Task, Mapping[str, Array], Mapping[Side, ServoModel] | None]:
+) -> tuple[Task, Mapping[str, Array], Mapping[str, ServoModel] | None]:
     """The task with the robot of its seed: mounts by camera and servos by side, as calibrated and identified by it.
 
     Args:
@@ -242,7 +240,7 @@ def with_robot(
         folder: Of the campaign; what it lacks of calibrations and identifications is made.
     """
     mounts: Mapping[str, Array] = {}
-    servos: Mapping[Side, ServoModel] | None = None
+    servos: Mapping[str, ServoModel] | None = None
     if options.profile != "ideal":
         task, servos = with_servos(task, options, folder / "servos")
     if options.mount_seeds:

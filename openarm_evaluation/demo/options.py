@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -33,7 +33,7 @@ class DemoOptions:
 
     seeds: Seeds = ()
     label: str | None = None
-    arm: Literal["auto", "left", "right"] = "auto"
+    arm: str = "auto"
     place: tuple[float, float, float] | None = None
     scene: str | None = None
     graph: str = "sim"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, Intrinsics, load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import SHAPES, Scene, SceneObject, Table
 from openarm_common.types import Array
 from openarm_evaluation.detector.appearance import colour, draw_shape, pattern, sensor, surface
@@ -171,8 +171,8 @@ class RandomViews:
     def _pose_robot(self, rng: Rng, camera: str) -> None:
         description = self._description
         joints: dict[str, float] = {}
-        for side in SIDES:
-            observes = camera == "wrist" and side == "right"
+        for side in description.arm_names:
+            observes = self._cameras[camera].parent in description.links_of(side)
             state = description.group_state(f"{side}_arm", "wrist_look" if observes else "home")
             spread = 0.10 if observes else 0.05 if rng.random() < 0.55 else 0.5
             joints |= {name: state[name] + float(rng.normal(0.0, spread)) for name in description.arm_joints(side)}

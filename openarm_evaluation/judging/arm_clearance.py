@@ -7,7 +7,8 @@ distance so far; so no smaller one is missed. m, s.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -34,12 +35,13 @@ class ArmClearance:
     """The least distance of the arms of a simulated robot so far.
 
     Args:
+        description: The robot.
         model: The simulation.
     """
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, description: RobotDescription, model: mujoco.MjModel) -> None:
         self._model = model
-        self.sides = tuple(_arm_geoms(model, side) for side in ("left", "right"))
+        self.arms = tuple(_arm_geoms(model, description.links_of(arm)) for arm in description.arm_names)
         self._next_ns = 0
         #: m.
         self.least = float(np.inf)
@@ -55,9 +57,12 @@ class ArmClearance:
         self._next_ns = t_ns + round(1e9 * max(0.0, distance - self.least) / _APPROACH)
 
     def distance(self, data: mujoco.MjData) -> float:
-        """Distance of the arms in a state whose kinematics are done, m."""
+        """Least distance of two arms in a state whose kinematics are done, m; infinite with one arm."""
+        pairs = combinations(self.arms, 2)
+        return min((self._distance(data, *pair) for pair in pairs), default=float(np.inf))
+
+    def _distance(self, data: mujoco.MjData, first: NDArray[np.intp], second: NDArray[np.intp]) -> float:
         model = self._model
-        first, second = self.sides
         centres, radii = data.geom_xpos, model.geom_rbound
         bound = np.linalg.norm(centres[first][:, None] - centres[second][None], axis=-1)
         bound = bound - radii[first][:, None] - radii[second][None]
@@ -72,7 +77,7 @@ class ArmClearance:
 
 def watch_clearance(robot: SimRobot) -> ArmClearance:
     """Measure on a robot in this process, from each control tick to the next."""
-    clearance = ArmClearance(robot.world.model)
+    clearance = ArmClearance(robot.description, robot.world.model)
     tick: Callable[[], None] = robot.tick
 
     def watched() -> None:
@@ -90,8 +95,9 @@ def least_clearance(states: Iterable[tuple[int, Mapping[str, float]]]) -> float:
     Args:
         states: Stamp in ns, and position by joint; oldest first, as often as a control tick.
     """
-    world = Stage(RobotDescription.load(), load_cameras(), None, PhysicsConfig()).world(load_scene("empty"))
-    clearance = ArmClearance(world.model)
+    description = RobotDescription.load()
+    world = Stage(description, load_cameras(), None, PhysicsConfig()).world(load_scene("empty"))
+    clearance = ArmClearance(description, world.model)
     for t_ns, joints in states:
         if clearance.due(t_ns):
             world.data.qpos[:] = start_qpos(world.model, joints)
@@ -100,13 +106,13 @@ def least_clearance(states: Iterable[tuple[int, Mapping[str, float]]]) -> float:
     return clearance.least
 
 
-def _arm_geoms(model: mujoco.MjModel, side: str) -> NDArray[np.intp]:
+def _arm_geoms(model: mujoco.MjModel, links: Collection[str]) -> NDArray[np.intp]:
     """Colliding geoms of an arm and its hand; the fixed base is not a part of it."""
     found = [
         geom
         for geom in range(model.ngeom)
         if model.geom_contype[geom] or model.geom_conaffinity[geom]
-        if model.body(model.geom_bodyid[geom]).name.startswith(f"openarm_{side}_")
+        if model.body(model.geom_bodyid[geom]).name in links
         if model.body_weldid[model.geom_bodyid[geom]] != 0
     ]
     return np.array(found, dtype=np.intp)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
 
@@ -24,10 +23,10 @@ class HandReader:
     Args:
         description: The robot.
         states: Its joint states.
-        arm: "left" or "right".
+        arm: Whose.
     """
 
-    def __init__(self, description: RobotDescription, states: RobotStateBuffer, arm: Literal["left", "right"]) -> None:
+    def __init__(self, description: RobotDescription, states: RobotStateBuffer, arm: str) -> None:
         self._description = description
         self._states = states
         self.joint = description.finger_joint(arm)

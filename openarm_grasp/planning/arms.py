@@ -3,33 +3,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal
+from collections.abc import Collection, Mapping, Sequence
 
 from openarm_common.errors import Code, OpenArmError
 
-#: The arms of the description, by side.
-ARMS: tuple[Literal["left", "right"], ...] = ("left", "right")
+#: By (x, y) of the first joint of each arm, base frame, m.
+Shoulders = Mapping[str, Sequence[float]]
 
 
-def arm_order(arm: str, y: float, overlap_half_width: float) -> tuple[str, ...]:
+def check_arm(arm: str, arms: Collection[str]) -> None:
+    """Refuse an arm that the robot does not have; "auto" and "" leave the choice to the suite.
+
+    Raises:
+        OpenArmError: INVALID_ARGUMENT, listing the arms.
+    """
+    if arm not in ("auto", "", *arms):
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"arm {arm!r} does not exist; valid: auto, {', '.join(arms)}")
+
+
+def arm_order(arm: str, y: float, overlap_half_width: float, shoulders: Shoulders) -> tuple[str, ...]:
     """Arms to try, in order.
 
     Args:
-        arm: "left", "right", or "auto" (also ""): the arm on the object's side, and in the strip between both also
-            the other.
-        y: Of the object, base frame, m; the left arm stands at y > 0.
-        overlap_half_width: |y| up to which both arms are tried, m.
+        arm: Which, or "auto" (also ""): that whose shoulder is nearest to the object's y, then those that the object is
+            midway to.
+        y: Of the object, base frame, m.
+        overlap_half_width: Distance from the middle of two arms up to which both are tried, m.
+        shoulders: Of the arms.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, for another arm.
     """
-    if arm in ARMS:
+    check_arm(arm, shoulders)
+    if arm in shoulders:
         return (arm,)
-    if arm not in ("auto", ""):
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"arm {arm!r} does not exist; valid: auto, {', '.join(ARMS)}")
-    near, far = ("left", "right") if y >= 0.0 else ("right", "left")
-    return (near, far) if abs(y) <= overlap_half_width else (near,)
+    near, *others = sorted(shoulders, key=lambda name: abs(shoulders[name][1] - y))
+    far = [o for o in others if abs(y - 0.5 * (shoulders[near][1] + shoulders[o][1])) <= overlap_half_width]
+    return (near, *far)
+
+
+def sides(arm: str, shoulders: Shoulders) -> tuple[float, ...]:
+    """Signs of y on an arm's side of the table: both, when no other arm stands on one."""
+    y = shoulders[arm][1]
+    others = [other[1] for name, other in shoulders.items() if name != arm]
+    return (1.0, -1.0) if not others else (1.0,) if y >= sum(others) / len(others) else (-1.0,)
 
 
 def out_of_reach(what: str, distances: Mapping[str, float]) -> str:

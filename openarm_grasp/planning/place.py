@@ -22,6 +22,7 @@ from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig, PlaceConfig
 from openarm_grasp.evidence.verdicts import SQUARE_WITHIN
 from openarm_grasp.perception.detections import Frame
+from openarm_grasp.planning.arms import Shoulders, sides
 from openarm_grasp.planning.candidates import UP, GraspCandidate, PlaceTarget, hold_of
 
 #: Spots nearer to each other than this are one, m.
@@ -139,7 +140,9 @@ def turns_to(target: Detection, yaw: float) -> tuple[float, ...]:
     return tuple(sorted((float(turn) for turn in turns), key=abs))
 
 
-def free_spots(arm: str, target: Detection, others: Sequence[Detection], config: GraspConfig) -> tuple[Array, ...]:
+def free_spots(
+    arm: str, target: Detection, others: Sequence[Detection], config: GraspConfig, shoulders: Shoulders
+) -> tuple[Array, ...]:
     """Free spots on the arm's side of the table, best first.
 
     A spot keeps its distance from every other object and from where the object came. Those come first that leave room
@@ -147,16 +150,17 @@ def free_spots(arm: str, target: Detection, others: Sequence[Detection], config:
     where it came from, which keeps the carry short.
 
     Args:
-        arm: "left" (y > 0) or "right".
+        arm: Whose side.
         target: The object as it stood at the grasp.
         others: Other objects in view.
         config: Parameters.
+        shoulders: Of the arms.
 
     Raises:
         OpenArmError: PLACE_FAILED, when nothing is free.
     """
     place = config.place
-    ys = grid(*place.region_abs_y, place.spot_step) * (1.0 if arm == "left" else -1.0)
+    ys = np.concatenate([grid(*place.region_abs_y, place.spot_step) * side for side in sides(arm, shoulders)])
     ranked = [
         (clearance < place.neighbour_room, cost, x, y)
         for cost, clearance, x, y in clear_spots(grid(*place.region_x, place.spot_step), ys, target, others, place)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from openarm_common.printable import LONGEST_TEXT, check_length
 from openarm_grasp.config import DetectConfig
 from openarm_grasp.evidence.verdicts import CameraVerdict, GripperVerdict
 from openarm_grasp.perception.detections import Frame, Sighting, find
-from openarm_grasp.planning.arms import arm_order
+from openarm_grasp.planning.arms import check_arm
 from openarm_grasp.requests.state_times import StateTime
 
 if TYPE_CHECKING:
@@ -69,15 +69,18 @@ class GraspRequest:
         label, arm, phase = (text[:LONGEST_TEXT] for text in (self.label, self.arm, self.phase))
         return replace(self, label=label, arm=arm, phase=phase)
 
-    def check(self) -> None:
+    def check(self, arms: Collection[str]) -> None:
         """Refuse an arm or a phase that does not exist, and a long text.
+
+        Args:
+            arms: Of the robot.
 
         Raises:
             OpenArmError: INVALID_ARGUMENT.
         """
         for name in ("label", "arm", "phase"):
             check_length(getattr(self, name), name)
-        arm_order(self.arm, 0.0, 0.0)
+        check_arm(self.arm, arms)
         if self.phase not in PHASES:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"phase {self.phase!r} does not exist; valid: {', '.join(PHASES)}"

@@ -13,7 +13,6 @@ from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.drift import DriftWatch
 from openarm_grasp.evidence.verdicts import GripperVerdict, Verdict
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NO_WAY
 from openarm_grasp.requests.confirm import PlanGate, ShownPlan
@@ -108,13 +107,16 @@ class GraspSession:
         Raises:
             OpenArmError: INVALID_ARGUMENT, for no arm or when both hold something; NOT_READY, when no hand does.
         """
-        holding = [name for name in ARMS if name in self.kept or self.partly_open(robot, name)]
-        if arm not in ("", *ARMS):
-            raise OpenArmError(Code.INVALID_ARGUMENT, f"arm is {arm!r}; valid: {', '.join(ARMS)}, or none")
+        arms = robot.description.arm_names
+        holding = [name for name in arms if name in self.kept or self.partly_open(robot, name)]
+        if arm not in ("", *arms):
+            raise OpenArmError(Code.INVALID_ARGUMENT, f"arm is {arm!r}; valid: {', '.join(arms)}, or none")
         if not arm and len(holding) != 1:
             raise OpenArmError(
                 Code.INVALID_ARGUMENT if holding else Code.NOT_READY,
-                "both hands hold something: say which, left or right" if holding else "no hand holds anything",
+                f"several hands hold something: say which, {' or '.join(holding)}"
+                if holding
+                else "no hand holds anything",
             )
         arm = arm or holding[0]
         await robot.grip(arm, self.context.config.hand.opening, "release")

@@ -15,10 +15,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import Side
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 
@@ -53,10 +51,10 @@ class CoordinatedRobot:
         config: Parameters.
     """
 
-    def __init__(self, arm: Side, robot: RobotInterface, coordination: ArmCoordination, config: GraspConfig) -> None:
-        self.arm: Side = arm
+    def __init__(self, arm: str, robot: RobotInterface, coordination: ArmCoordination, config: GraspConfig) -> None:
+        self.arm = arm
         self._robot, self._coordination, self._config = robot, coordination, config
-        self._other: Side = "right" if arm == "left" else "left"
+        self._other = next(name for name in robot.description.arm_names if name != arm)
         self._homes = {a: robot.description.group_state(f"{a}_arm", config.home_state) for a in (arm, self._other)}
         self.deadline_ns = 0
 
@@ -134,7 +132,7 @@ class CoordinatedRobot:
     async def _gone_on(self, what: str) -> bool:
         """Wait until the other arm has gone on; false when it waits for this one, and this one is to give way."""
         coordination, before = self._coordination, self._pose(self._other)
-        gives_way = ARMS.index(self.arm) > 0
+        gives_way = self._robot.description.arm_names.index(self.arm) > 0
 
         def over() -> bool:
             moved = float(np.max(np.abs(self._pose(self._other) - before))) > _GONE_ON
@@ -148,11 +146,11 @@ class CoordinatedRobot:
             coordination.waiting.discard(self.arm)
         return not (gives_way and self._other in coordination.waiting)
 
-    def _pose(self, arm: Side) -> Array:
+    def _pose(self, arm: str) -> Array:
         _, q = self._robot.states.latest()
         return np.array([q[name] for name in self._homes[arm]])
 
-    def _is_home(self, arm: Side) -> bool:
+    def _is_home(self, arm: str) -> bool:
         off = np.abs(self._pose(arm) - np.array(list(self._homes[arm].values())))
         return float(np.max(off)) <= self._config.home_tolerance
 
@@ -160,6 +158,6 @@ class CoordinatedRobot:
         return self._other in self._coordination.done or self._is_home(self._other)
 
 
-def coordinated(arm: Side, robot: RobotInterface, coordination: ArmCoordination, config: GraspConfig) -> RobotInterface:
+def coordinated(arm: str, robot: RobotInterface, coordination: ArmCoordination, config: GraspConfig) -> RobotInterface:
     """The robot for one arm while the other works, too; arguments as of `CoordinatedRobot`."""
     return cast("RobotInterface", CoordinatedRobot(arm, robot, coordination, config))

@@ -19,7 +19,6 @@ from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import SPEED_WINDOW_NS, HandReader
 from openarm_grasp.evidence.verdicts import Evidence
 from openarm_grasp.perception.detections import Sighting, in_base
-from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import Box, GraspCandidate, PlaceTarget, held_box, obstacle_boxes, target_box
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, RobotInterface, Trajectory
 
@@ -41,14 +40,14 @@ class Skills:
     Args:
         robot: Interface to it.
         config: Parameters.
-        arms: Those that may be sent home.
+        arms: Those that may be sent home; none named: all.
     """
 
-    def __init__(self, robot: RobotInterface, config: GraspConfig, *, arms: Sequence[str] = ARMS) -> None:
+    def __init__(self, robot: RobotInterface, config: GraspConfig, *, arms: Sequence[str] = ()) -> None:
         self.robot = robot
         self._config = config
-        self._arms = frozenset(arms)
-        self._hands = {arm: HandReader(robot.description, robot.states, arm) for arm in ARMS}
+        self._arms = frozenset(arms or robot.description.arm_names)
+        self._hands = {arm: HandReader(robot.description, robot.states, arm) for arm in robot.description.arm_names}
 
     @property
     def now_ns(self) -> int:
@@ -256,7 +255,7 @@ class Skills:
     def joints(self) -> dict[str, float]:
         """Positions of the joints of all arms, rad by name."""
         _, q = self.robot.states.latest()
-        return {name: q[name] for arm in ARMS for name in self.description.arm_joints(arm)}
+        return {name: q[name] for arm in self.description.arm_names for name in self.description.arm_joints(arm)}
 
     # --- the hand
     def aperture(self, arm: str) -> float:

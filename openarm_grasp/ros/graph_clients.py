@@ -23,7 +23,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.actions import ActionClient, check_alive
 from openarm_common.ros.convert import stamp_to_ns
 from openarm_common.ros.detections import detections_from_msg
-from openarm_common.ros.node import BASE_FRAME, BaseNode, reliable
+from openarm_common.ros.node import BaseNode, reliable
 from openarm_common.ros.tf import RobotStateListener
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.evidence.hand import Silence
@@ -57,7 +57,7 @@ class GraphClients:
         self._detections: dict[str, Subscription] = {}
         self._topic = DETECTIONS
         self._frames: list[Frame] = []
-        self._frame_id = BASE_FRAME
+        self._frame_id = node.description.base
         self._observing_since_ns = 0
         self._next_tick = Future()
         self._timer = node.create_timer(_TICK_S, self._on_tick, clock=node.steady_clock)

@@ -18,10 +18,9 @@ from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.actions import ActionClient, check_alive
 from openarm_common.ros.holds import Holder
-from openarm_common.ros.node import BASE_FRAME, BaseNode
+from openarm_common.ros.node import BaseNode
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
-from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import Box
 from openarm_grasp.robot.interface import Frames, PlanGrasp, Planned, PlanPlace, Trajectory, check_deadline
 from openarm_grasp.ros import messages
@@ -47,7 +46,9 @@ class GraphRobot:
         self._ik = node.create_client(ComputeIK, "/motion/compute_ik")
         self._scene = node.create_client(GetScene, "/motion/get_scene")
         kind = messages.GRIPPER_ACTIONS[config.gripper_action]
-        self._grippers = {arm: ActionClient(node, kind, config.gripper.format(arm=arm)) for arm in ARMS}
+        self._grippers = {
+            arm: ActionClient(node, kind, config.gripper.format(arm=arm)) for arm in node.description.arm_names
+        }
         self.deadline_ns = 0
         #: Longest start delay of a motion until the other arm leaves clearance, s; 0: the arms never move at once.
         self.max_start_delay = 0.0
@@ -119,7 +120,7 @@ class GraphRobot:
     @property
     def base_frame(self) -> str:
         """Name of the base frame."""
-        return BASE_FRAME
+        return self._node.description.base
 
     @property
     def now_ns(self) -> int:
@@ -136,7 +137,7 @@ class GraphRobot:
 
     def held_box(self, arm: str) -> Box | None:
         """What /motion/attached_objects says of a hand; none, when it says more than one thing."""
-        link = self.description.tcp_link("left" if arm == "left" else "right")
+        link = self.description.tcp_link(arm)
         held = [box for box in self._nodes.robot.tracker.held if box.link == link]
         if len(held) != 1:
             return None
@@ -216,7 +217,9 @@ class GraphRobot:
         """Ask /motion/compute_ik."""
         if not self._ik.service_is_ready():
             return {}
-        answer = await self._answer(self._ik, messages.reach_request(arm, T_base_tcp), "/motion/compute_ik")
+        answer = await self._answer(
+            self._ik, messages.reach_request(arm, self.base_frame, T_base_tcp), "/motion/compute_ik"
+        )
         return messages.reach_from_msg(arm, answer, T_base_tcp)
 
     async def scene_version(self) -> int:
@@ -243,7 +246,9 @@ class GraphRobot:
 
     async def move(self, arm: str, to: str | Array, what: str, obstacles: Sequence[Box] = ()) -> None:
         """Ask /motion/move."""
-        goal = messages.move_goal(arm, to, obstacles, self._config.velocity_scale, self.max_start_delay)
+        goal = messages.move_goal(
+            arm, self.base_frame, to, obstacles, self._config.velocity_scale, self.max_start_delay
+        )
         await self._moved(arm, self._move, goal, what)
 
     async def _moved(

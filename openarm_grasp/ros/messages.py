@@ -23,7 +23,6 @@ from visualization_msgs.msg import Marker, MarkerArray
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, point, stamp_to_ns, vector, xyz
-from openarm_common.ros.node import BASE_FRAME
 from openarm_common.types import Array
 from openarm_grasp.config import GripperAction
 from openarm_grasp.evidence.verdicts import Verdict
@@ -134,10 +133,10 @@ def pair_result(outcome: PairOutcome) -> PickTwo.Result:
     return result
 
 
-def status_msg(status: Status, t_ns: int) -> GraspStatus:
+def status_msg(status: Status, frame: str, t_ns: int) -> GraspStatus:
     """A state that was entered."""
     return GraspStatus(
-        header=Header(stamp=ns_to_stamp(t_ns), frame_id=BASE_FRAME),
+        header=Header(stamp=ns_to_stamp(t_ns), frame_id=frame),
         state=status.state.value,
         previous_state=status.previous.value,
         reason=status.reason,
@@ -153,7 +152,7 @@ def status_msg(status: Status, t_ns: int) -> GraspStatus:
 # --- pictures
 def status_markers(status: Status, robot: RobotDescription, t_ns: int) -> MarkerArray:
     """The candidates of a state, and the plan that waits in it; they replace what was shown before."""
-    markers = candidate_markers(status.candidates, status.chosen, status.refused, t_ns)
+    markers = candidate_markers(status.candidates, status.chosen, status.refused, robot.base, t_ns)
     if status.plan is not None:
         markers.markers += plan_markers(status.plan, robot, t_ns)
     return markers
@@ -161,7 +160,7 @@ def status_markers(status: Status, robot: RobotDescription, t_ns: int) -> Marker
 
 def plan_markers(plan: ShownPlan, robot: RobotDescription, t_ns: int) -> list[Marker]:
     """The path of the TCP on each part of a plan, a point for each point of its trajectory."""
-    link = robot.tcp_link("left" if plan.arm == "left" else "right")
+    link = robot.tcp_link(plan.arm)
     found: list[Marker] = []
     for i, (name, trajectory) in enumerate(plan.parts):
         if not isinstance(trajectory, JointTrajectory):
@@ -170,14 +169,14 @@ def plan_markers(plan: ShownPlan, robot: RobotDescription, t_ns: int) -> list[Ma
         joints = (dict(zip(planned.joint_names, p.positions, strict=True)) for p in planned.points)
         path = _points(*(robot.link_pose(link, q)[:3, 3] for q in joints))
         line = Marker(ns=f"{PLAN}{name}", id=i, type=Marker.LINE_STRIP, color=_WAITING, points=path)
-        line.header = Header(stamp=ns_to_stamp(t_ns), frame_id=BASE_FRAME)
+        line.header = Header(stamp=ns_to_stamp(t_ns), frame_id=robot.base)
         line.pose.orientation.w, line.scale.x = 1.0, 0.005
         found.append(line)
     return found
 
 
 def candidate_markers(
-    candidates: Sequence[GraspCandidate], chosen: str, refused: Collection[str], t_ns: int
+    candidates: Sequence[GraspCandidate], chosen: str, refused: Collection[str], frame: str, t_ns: int
 ) -> MarkerArray:
     """An arrow along each approach and a bar along its opening axis: the chosen one green, what was refused red."""
     markers = [Marker(action=Marker.DELETEALL)]
@@ -192,7 +191,7 @@ def candidate_markers(
         bar.scale.x = 0.003
         markers += [arrow, bar]
     for marker in markers:
-        marker.header = Header(stamp=ns_to_stamp(t_ns), frame_id=BASE_FRAME)
+        marker.header = Header(stamp=ns_to_stamp(t_ns), frame_id=frame)
         marker.pose.orientation.w = 1.0
     return MarkerArray(markers=markers)
 
@@ -304,10 +303,10 @@ def gripped(result: Any) -> bool:
     return bool(result.stalled or result.reached_goal)
 
 
-def reach_request(arm: str, T_base_tcp: Array) -> ComputeIK.Request:
+def reach_request(arm: str, frame: str, T_base_tcp: Array) -> ComputeIK.Request:
     """Ask how near an arm's TCP comes to a point, in any orientation."""
     request = ComputeIK.Request(arm=arm, position_only=True)
-    request.pose.header.frame_id = BASE_FRAME
+    request.pose.header.frame_id = frame
     request.pose.pose = matrix_to_pose(T_base_tcp)
     return request
 
@@ -322,12 +321,13 @@ def reach_from_msg(arm: str, answer: ComputeIK.Response, T_base_tcp: Array) -> d
 
 
 def move_goal(
-    arm: str, to: str | Array, obstacles: Sequence[Box], velocity_scale: float, max_start_delay: float
+    arm: str, frame: str, to: str | Array, obstacles: Sequence[Box], velocity_scale: float, max_start_delay: float
 ) -> MoveArm.Goal:
     """A free path to a named posture, or a straight line of the TCP to a pose.
 
     Args:
         arm: Which.
+        frame: Base frame.
         to: Name of the posture, or the pose (4, 4), base frame.
         obstacles: Boxes to keep clear of, base frame.
         velocity_scale: Of the motion limits; 0: the planner's default.
@@ -343,7 +343,7 @@ def move_goal(
     if isinstance(to, str):
         goal.kind, goal.named = MoveArm.Goal.NAMED, to
         return goal
-    goal.kind, goal.pose.header.frame_id = MoveArm.Goal.LINEAR, BASE_FRAME
+    goal.kind, goal.pose.header.frame_id = MoveArm.Goal.LINEAR, frame
     goal.pose.pose = matrix_to_pose(to)
     return goal
 

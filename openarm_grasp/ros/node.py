@@ -21,13 +21,11 @@ from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import Side
 from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
-from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome
 from openarm_grasp.requests.states import State
 from openarm_grasp.requests.task import GraspSession, Status, Task
@@ -71,7 +69,9 @@ class GraspNode(BaseNode[GraspConfig]):
             self._serve(Pick, "/grasp/pick", self._on_pick),
             self._serve(PickTwo, "/grasp/pick_two", self._on_pick_two),
         ]
-        self._status_topic.publish(messages.status_msg(Status(State.IDLE, State.IDLE, "waiting for a request"), 0))
+        self._status_topic.publish(
+            messages.status_msg(Status(State.IDLE, State.IDLE, "waiting for a request"), self.description.base, 0)
+        )
 
     def close(self) -> None:
         """Stop listening and take the actions down."""
@@ -166,7 +166,7 @@ class GraspNode(BaseNode[GraspConfig]):
 
     async def _two(self, requests: tuple[GraspRequest, GraspRequest], on_status: OnStatus) -> PairOutcome:
         report = partial(self._publish, on_status=on_status)
-        robots: dict[Side, RobotInterface] = {arm: self._robot.next_to_other() for arm in ARMS}
+        robots: dict[str, RobotInterface] = {arm: self._robot.next_to_other() for arm in self.description.arm_names}
         try:
             outcome = await self._take(
                 _grasp_of(*(request.cut() for request in requests)),
@@ -201,7 +201,7 @@ class GraspNode(BaseNode[GraspConfig]):
         self.get_logger().warning(f"{what} refused: {error}")
         if error.code is not Code.BUSY:  # what runs publishes its own state
             status = Status(State.IDLE, State.IDLE, error.message, code=error.code.value)
-            self._status_topic.publish(messages.status_msg(status, self._robot.now_ns))
+            self._status_topic.publish(messages.status_msg(status, self.description.base, self._robot.now_ns))
             self._diagnose(error.code is not Code.NOT_READY, f"{error.code}: {error.message}")
 
     # --- publishing
@@ -229,7 +229,7 @@ class GraspNode(BaseNode[GraspConfig]):
         t_ns = self._robot.now_ns
         before = self._newest.get(status.request)
         self._newest[status.request] = status
-        message = messages.status_msg(status, t_ns)
+        message = messages.status_msg(status, self.description.base, t_ns)
         self._status_topic.publish(message)
         if on_status is not None:
             on_status(status.request, message)
@@ -237,7 +237,9 @@ class GraspNode(BaseNode[GraspConfig]):
             # The newest status is not that of one which has ended while the other is at work.
             for other in self._newest.values():
                 if other.request != status.request and other.state is not State.IDLE:
-                    self._status_topic.publish(messages.status_msg(replace(other, previous=other.state), t_ns))
+                    self._status_topic.publish(
+                        messages.status_msg(replace(other, previous=other.state), message.header.frame_id, t_ns)
+                    )
         change = f"{message.previous_state} -> {message.state} at {t_ns * 1e-9:.2f} s, attempt {status.attempt}"
         about = f"{status.label} " if status.label else ""
         self.get_logger().info(f"{about}{change}: {status.reason}")

@@ -13,12 +13,9 @@ from geometry_msgs.msg import WrenchStamped
 from rclpy.subscription import Subscription
 
 from openarm_common.ros.node import QOS_SENSOR, BaseNode
-from openarm_grasp.planning.arms import ARMS
 
 #: A force older than this is stale, s of wall clock.
 _FRESH_S = 0.5
-#: Links of the finger pads, by arm.
-_LINKS: dict[str, list[str]] = {arm: [f"openarm_{arm}_{side}_finger" for side in ("left", "right")] for arm in ARMS}
 
 
 class Pads:
@@ -29,7 +26,7 @@ class Pads:
     """
 
     def __init__(self, node: BaseNode[Any]) -> None:
-        self._node = node
+        self._node, self._arms = node, node.description.arms
         self._newest: dict[str, tuple[float, float]] = {}
         self._subscriptions: list[Subscription] = []
 
@@ -39,7 +36,7 @@ class Pads:
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
         self._newest.clear()
-        for link in chain(*_LINKS.values()) if on else ():
+        for link in chain(*(arm.fingers for arm in self._arms.values())) if on else ():
             on_wrench = partial(self._on_wrench, link)
             topic = f"/{link}/contact_wrench"
             self._subscriptions.append(self._node.create_subscription(WrenchStamped, topic, on_wrench, QOS_SENSOR))
@@ -51,5 +48,5 @@ class Pads:
     def of(self, arm: str) -> tuple[float, ...]:
         """Newest force on each pad of a hand, N; empty when one is silent."""
         now = time.monotonic()
-        newest = [self._newest.get(link, (-np.inf, 0.0)) for link in _LINKS[arm]]
+        newest = [self._newest.get(link, (-np.inf, 0.0)) for link in self._arms[arm].fingers]
         return tuple(force for _, force in newest) if all(now - at <= _FRESH_S for at, _ in newest) else ()

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.requests.request import GraspOutcome
 from openarm_grasp.requests.task import Task
@@ -21,7 +20,7 @@ async def direct(task: Task) -> GraspOutcome:
     found = task.findings.need_sighting()
     task.note("no arm that was asked can do it alone; searching for another way")
     feasible = FeasibilityCheck(task.robot, task.context)
-    for arm in ARMS:
+    for arm in task.robot.description.arm_names:
         if arm in task.findings.refusals:
             continue
         if await feasible.refusal(arm, found, asked.place, yaw=asked.place_yaw):

@@ -14,7 +14,7 @@ from openarm_common.wanted import describe
 from openarm_grasp.evidence.verdicts import Verdict
 from openarm_grasp.perception.detections import Frame, Sighting, in_view, on_table
 from openarm_grasp.planning import retries
-from openarm_grasp.planning.arms import ARMS, arm_order, out_of_reach
+from openarm_grasp.planning.arms import out_of_reach
 from openarm_grasp.planning.candidates import GraspCandidate, PlaceTarget
 from openarm_grasp.planning.options import NoWayError, not_placeable, options_of, planned
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets
@@ -112,9 +112,9 @@ async def _clear_view(run: Run) -> None:
         return
     if run.kept is not None:
         # A hand that holds something stays where it is; it may be among the objects.
-        await run.robot.go_home([arm for arm in ARMS if arm not in run.task.session.kept])
+        await run.robot.go_home([arm for arm in run.robot.description.arm_names if arm not in run.task.session.kept])
     else:
-        await run.robot.go_home(ARMS, back_off_below=run.context.clear_of_objects)
+        await run.robot.go_home(run.robot.description.arm_names, back_off_below=run.context.clear_of_objects)
 
 
 def _locate(run: Run, frames: Sequence[Frame]) -> Sighting:
@@ -158,7 +158,7 @@ async def plan(run: Run, sighting: Sighting) -> tuple[Grasp, Planned, str]:
     if request.place is not None:
         check_position(request.place, target, sighting.others, table)
     run.options, why = {}, ""
-    arms = arm_order(request.arm, float(target.p_base[1]), run.config.approach.overlap_half_width)
+    arms = run.context.arm_order(request.arm, float(target.p_base[1]))
     arms = retries.arms_to_try(arms, run.failed)
     ways = {arm: run.ways(arm, sighting) for arm in arms}
     where = "({:.3f}, {:.3f}, {:.3f}) m".format(*target.p_base)
@@ -239,7 +239,7 @@ def _grasp(run: Run, arm: str, sighting: Sighting, candidate: GraspCandidate) ->
     if request.place is not None:
         spots = (check_position(request.place, target, others, table),)
     else:
-        spots = free_spots(arm, target, others, run.config)
+        spots = free_spots(arm, target, others, run.config, run.context.shoulders)
     yaw = request.place_yaw
     return Grasp(
         arm, sighting, candidate, place_targets(target, candidate, spots, run.config, run.used_places, yaw=yaw)

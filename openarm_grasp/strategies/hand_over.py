@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 from math import radians
 
 import numpy as np
@@ -20,7 +21,6 @@ from openarm_common.types import Array
 from openarm_grasp.config import HandOverConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import PlaceTarget
 from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
@@ -131,9 +131,8 @@ async def plan_hand_over(task: Task, seen: Sighting) -> HandOver:
         OpenArmError: NO_PLAN or PLACE_FAILED, with what each arm lacks; what the robot raises.
     """
     spots = middle_spots(seen.target, seen.others, task.context)
-    order = ARMS if seen.target.p_base[1] >= 0.0 else ARMS[::-1]
-    faults: list[str] = []
-    for giver, taker in (order, order[::-1]):
+    shoulders, y, faults = task.context.shoulders, seen.target.p_base[1], list[str]()
+    for giver, taker in sorted(permutations(shoulders, 2), key=lambda two: abs(shoulders[two[0]][1] - y)):
         try:
             return await _between(task, seen, giver, taker, spots)
         except OpenArmError as error:

@@ -16,7 +16,6 @@ from openarm_common.types import Array
 from openarm_grasp.context import GraspContext
 from openarm_grasp.evidence.verdicts import Evidence
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.candidates import UP, Box, GraspCandidate, object_in
 from openarm_grasp.requests.request import GraspRequest
 from openarm_grasp.requests.task import Grasp, GraspSession, release_command
@@ -32,7 +31,7 @@ async def take_up(session: GraspSession, robot: Skills, *requests: GraspRequest)
     if all(request.dry_run and request.phase != "place" for request in requests):
         return
     unknown: list[str] = []
-    for arm in ARMS:
+    for arm in robot.description.arm_names:
         if arm in session.kept or not session.partly_open(robot, arm):
             continue
         config = session.context.config

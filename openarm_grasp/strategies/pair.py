@@ -7,16 +7,15 @@ to each other that the arms would only wait, the objects are picked one after th
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import Side
 from openarm_grasp.config import DetectConfig
 from openarm_grasp.perception.detections import SAME_PLACE, Frame, Sighting, apart, on_table
-from openarm_grasp.planning.arms import ARMS
 from openarm_grasp.planning.feasibility import FeasibilityCheck
 from openarm_grasp.requests.request import GraspOutcome, GraspRequest, PairOutcome
 from openarm_grasp.requests.states import State
@@ -52,7 +51,7 @@ class Pair:
 
     session: GraspSession
     robot: Skills
-    robots: Mapping[Side, RobotInterface]
+    robots: Mapping[str, RobotInterface]
     requests: Requests
     report: Report
     carry_out: Callable[[Task], Awaitable[GraspOutcome]]
@@ -68,7 +67,7 @@ class Pair:
         Raises:
             OpenArmError: INVALID_ARGUMENT; NOT_READY.
         """
-        check_pair(self.requests)
+        check_pair(self.requests, self.robot.description.arm_names)
         for request in self.requests:
             self.session.check_hands(self.robot, request)
 
@@ -158,7 +157,7 @@ async def in_turn(pair: Pair) -> PairOutcome:
 
 
 # --- which arm
-async def _arms_for_both(pair: Pair) -> tuple[tuple[Side, ...], str]:
+async def _arms_for_both(pair: Pair) -> tuple[tuple[str, ...], str]:
     """Observe once, and give an arm to each object; none, with the reason, when they go one after the other."""
     requests = pair.requests
     places = [request.place for request in requests if request.place is not None]
@@ -172,11 +171,14 @@ async def _arms_for_both(pair: Pair) -> tuple[tuple[Side, ...], str]:
         if error.code is Code.CANCELLED:
             pair.task(0, pair.robot)  # a deadline ends work as a cancel does; here it gets its own name
         raise
-    straight: tuple[Side, Side] = ("left", "right")
-    crossed: tuple[Side, Side] = ("right", "left")
-    further_left = found[0].target.p_base[1] >= found[1].target.p_base[1]
+    shoulders = pair.session.context.shoulders
     faults: list[str] = []
-    for arms in (straight, crossed) if further_left else (crossed, straight):
+
+    def crossing(arms: tuple[str, str]) -> float:
+        """Least for the arms that stand on the sides of their objects."""
+        return -sum(shoulders[arm][1] * float(one.target.p_base[1]) for arm, one in zip(arms, found, strict=True))
+
+    for arms in sorted(permutations(shoulders, 2), key=crossing):
         asked = [request.arm in ("", "auto", arm) for request, arm in zip(requests, arms, strict=True)]
         if not all(asked):
             continue
@@ -192,7 +194,7 @@ async def _observe_both(pair: Pair) -> list[Sighting]:
     context, robot = pair.session.context, pair.robot
     robot.set_deadline(pair.requests[0].timeout)
     if not pair.requests[0].dry_run:
-        await robot.go_home(ARMS, back_off_below=context.clear_of_objects)
+        await robot.go_home(robot.description.arm_names, back_off_below=context.clear_of_objects)
     frames = (await robot.observe_in_base(context.config.detect.frames)).frames
     first, second = (request.find(frames, context.config.detect) for request in pair.requests)
     if apart(first.target, second.target) <= _ONE:
@@ -215,7 +217,7 @@ def _two_of(requests: Requests, frames: Sequence[Frame], limits: DetectConfig, o
         return first.find(frames, limits), one
 
 
-async def _fault(pair: Pair, found: Sequence[Sighting], arms: tuple[Side, Side]) -> str:
+async def _fault(pair: Pair, found: Sequence[Sighting], arms: tuple[str, str]) -> str:
     """Why the arms cannot do this; "" when they can."""
     feasible = FeasibilityCheck(pair.robot, pair.session.context)
     for request, one, arm in zip(pair.requests, found, arms, strict=True):
@@ -225,14 +227,14 @@ async def _fault(pair: Pair, found: Sequence[Sighting], arms: tuple[Side, Side])
     return ""
 
 
-def check_pair(requests: Requests) -> None:
+def check_pair(requests: Requests, arms: Collection[str]) -> None:
     """Refuse what is no pair.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT.
     """
     for request in requests:
-        request.check()
+        request.check(arms)
         if request.phase != "all":
             raise OpenArmError(
                 Code.INVALID_ARGUMENT, f"two at once are picked and placed; phase {request.phase!r} is of one alone"

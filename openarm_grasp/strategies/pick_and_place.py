@@ -49,7 +49,7 @@ async def pick_and_place(task: Task, request: GraspRequest) -> GraspOutcome:
     """
     request, robot, session = task.in_time(request), task.robot, task.session
     session.check_hands(robot, request)
-    request.check()
+    request.check(task.robot.description.arm_names)
     kept = session.to_place(request) if request.phase == "place" else None
     run = Run(task, replace(request, label=kept.sighting.target.label) if kept else request, kept)
     robot.set_deadline(request.timeout)

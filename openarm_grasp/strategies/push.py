@@ -19,12 +19,11 @@ import numpy as np
 from openarm_common import se3
 from openarm_common.detection import Detection
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import RobotDescription, Side
+from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_grasp.config import GraspConfig
 from openarm_grasp.context import GraspContext
 from openarm_grasp.perception.detections import Sighting
-from openarm_grasp.planning.arms import ARMS, arm_order
 from openarm_grasp.planning.candidates import UP, GraspCandidate
 from openarm_grasp.planning.feasibility import FeasibilityCheck, standing_at
 from openarm_grasp.planning.options import NO_WAY
@@ -121,7 +120,7 @@ async def _taker(task: Task, found: Sighting, end: Array) -> str:
     """The arm that grasps the object there."""
     feasible, fault = FeasibilityCheck(task.robot, task.context), OpenArmError(Code.UNREACHABLE, "no arm")
     there = replace(found, target=standing_at(found.target, end))
-    for arm in arm_order("auto", float(end[1]), task.context.config.approach.overlap_half_width):
+    for arm in task.context.arm_order("auto", float(end[1])):
         refusal = await feasible.refusal(arm, there, now=found)
         if refusal is None:
             return arm
@@ -132,7 +131,7 @@ async def _taker(task: Task, found: Sighting, end: Array) -> str:
 async def _push_to(task: Task, found: Sighting, end: Array, taker: str) -> Push:
     """The other arm is asked first: it comes from the other side."""
     config, robot, faults = task.context.config, task.robot, list[str]()
-    for arm in sorted(ARMS, key=lambda arm: arm == taker):
+    for arm in sorted(robot.description.arm_names, key=lambda arm: arm == taker):
         ways = push_ways(found.target, end, config, closed_hand(robot.description, arm))
         if not ways:
             faults.append(f"{arm} hand: {found.target.label!r} would tip over")
@@ -288,7 +287,7 @@ def push_ways(target: Detection, end: Array, config: GraspConfig, hand: Array) -
 
 
 @cache
-def closed_hand(description: RobotDescription, arm: Side) -> Array:
+def closed_hand(description: RobotDescription, arm: str) -> Array:
     """Points (n, 3) of the hand and its closed fingers, some mm apart, TCP frame, m."""
     tcp = description.tcp_link(arm)
     palm = description.chain(tcp)[-1].parent

@@ -187,7 +187,7 @@ class Arm(PlanningGroup):
         self.name, self.title = name, f"the {name} arm"
         self.config = config
         self.description = description
-        self.kinematics = ArmKinematics(description, config.tool_link.format(arm=name))
+        self.kinematics = ArmKinematics(description, config.tool_link.format(arm=name) or description.tcp_link(name))
         self.names, self.lower, self.upper = self.kinematics.names, self.kinematics.lower, self.kinematics.upper
         self.inverse = InverseKinematics(self.kinematics, config.planning.swivels)
         self.robot = CollisionRobot(description, self.kinematics)

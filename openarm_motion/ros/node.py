@@ -23,7 +23,7 @@ from openarm_common.octree.distance_field import DistanceFieldReader, field_path
 from openarm_common.ros.actions import ActionServer
 from openarm_common.ros.convert import matrix_to_pose, pose_to_matrix
 from openarm_common.ros.holds import HoldListener
-from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, BaseNode, run
+from openarm_common.ros.node import QOS_LATCHED, BaseNode, run
 from openarm_common.scene.scene import load_scene
 from openarm_motion.config import MotionConfig
 from openarm_motion.ros import convert
@@ -62,7 +62,7 @@ class MotionNode(BaseNode[MotionConfig]):
         self._table = load_scene(config.scene).table if config.scene else None
         arms = make_arms(config, self.description, [table_box(self._table)] if self._table else [])
         field = DistanceFieldReader(field_path(config.map.name or str(self.context.get_domain_id())))
-        self.service = MotionService(self.robot, config, arms, field, (BASE_FRAME, self.description.root))
+        self.service = MotionService(self.robot, config, arms, field, (self.description.base, self.description.root))
         self._scene = self.create_publisher(MarkerArray, "/motion/scene", QOS_LATCHED)
         self._preview = self.create_publisher(MarkerArray, "/motion/preview", QOS_LATCHED)
         self._attached = self.create_publisher(MarkerArray, "/motion/attached_objects", QOS_LATCHED)
@@ -193,14 +193,14 @@ class MotionNode(BaseNode[MotionConfig]):
     def _on_get(self, _: GetScene.Request, response: GetScene.Response) -> GetScene.Response:
         state = self.service.scene_state()
         response.version, response.fixed, response.map = state.version, list(state.fixed), self.config.map.use
-        response.objects = [convert.solid_msg(solid, BASE_FRAME) for solid in state.solids]
+        response.objects = [convert.solid_msg(solid, self.description.base) for solid in state.solids]
         response.map_used, response.map_version = state.map.occupied is not None, state.map.version
         response.map_age, response.map_message = state.map.age_s, state.map.why
         return response
 
     # --- what is published
     def _show_plan(self, plans: Mapping[str, Sequence[Trajectory]]) -> None:
-        self._preview.publish(convert.preview_markers(self.service.tool_paths(plans), BASE_FRAME))
+        self._preview.publish(convert.preview_markers(self.service.tool_paths(plans), self.description.base))
 
     def _show_held(self) -> None:
         self._attached.publish(convert.held_markers(self.service.held_on_links()))
@@ -212,7 +212,7 @@ class MotionNode(BaseNode[MotionConfig]):
             self._show_scene()
 
     def _show_scene(self) -> None:
-        self._scene.publish(convert.scene_markers(self.service.scene_state().solids, BASE_FRAME))
+        self._scene.publish(convert.scene_markers(self.service.scene_state().solids, self.description.base))
 
     def _report(self) -> None:
         age = self.robot.state_age()

@@ -51,7 +51,8 @@ class NodeRobot:
         self._node = node
         self.listener = RobotStateListener(node, node.description)
         self._controllers = {
-            arm: Controller(node, config.controller.format(arm=arm), partial(holds.goal_id, arm)) for arm in config.arms
+            arm: Controller(node, config.controller.format(arm=arm), partial(holds.goal_id, arm))
+            for arm in config.arms or node.description.arm_names
         }
         self._waiting, self._wake = 0, Future(executor=node.executor)
         self._timer = node.create_timer(_PERIOD, self._on_timer, clock=node.steady_clock)

@@ -88,7 +88,7 @@ def make_arms(config: MotionConfig, description: RobotDescription, fixed: Sequen
         fixed: Boxes that are always there (the table), base frame.
     """
     body = with_housings(description, load_cameras().values())
-    return {name: Arm(name, body, config, fixed) for name in config.arms}
+    return {name: Arm(name, body, config, fixed) for name in config.arms or body.arm_names}
 
 
 class MotionService:

@@ -23,11 +23,12 @@ class MapPublisher:
 
     Args:
         node: Its node.
+        frame: Base frame.
         full: Whether octomap_full is published too.
     """
 
-    def __init__(self, node: Node, *, full: bool) -> None:
-        self._full_wanted = full
+    def __init__(self, node: Node, frame: str, *, full: bool) -> None:
+        self._frame, self._full_wanted = frame, full
         self._binary = node.create_publisher(Octomap, "octomap_binary", QOS_LATCHED)
         self._full = node.create_publisher(Octomap, "octomap_full", QOS_LATCHED)
         self._changes = node.create_publisher(PointCloud2, "octomap_changes", QOS_LATCHED)
@@ -52,13 +53,13 @@ class MapPublisher:
             changed: Flat indices of the cells whose state changed.
         """
         resolution = snapshot.lattice.resolution
-        self._binary.publish(convert.octomap_msg(snapshot.binary, resolution, t_ns))
+        self._binary.publish(convert.octomap_msg(snapshot.binary, resolution, self._frame, t_ns))
         if snapshot.full is not None:
-            self._full.publish(convert.octomap_msg(snapshot.full, resolution, t_ns))
+            self._full.publish(convert.octomap_msg(snapshot.full, resolution, self._frame, t_ns))
         if snapshot.states is None:
             return
         for publisher, message in self._pictures:
             if changed is None or publisher.get_subscription_count():
-                publisher.publish(message(snapshot.lattice, snapshot.states, t_ns))
+                publisher.publish(message(snapshot.lattice, snapshot.states, self._frame, t_ns))
         if changed is not None and self._changes.get_subscription_count():
-            self._changes.publish(convert.changes_msg(snapshot.lattice, snapshot.states, changed, t_ns))
+            self._changes.publish(convert.changes_msg(snapshot.lattice, snapshot.states, changed, self._frame, t_ns))

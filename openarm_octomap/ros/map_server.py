@@ -12,7 +12,6 @@ from typing import Any, TypeVar
 import numpy as np
 from octomap_msgs.srv import BoundingBoxQuery, GetOctomap
 from openarm_interfaces.srv import ClearMap, MapFile, QueryMap
-from rclpy.node import Node
 from std_srvs.srv import Empty
 
 from openarm_common.asked_files import file_to_read, file_to_write
@@ -20,6 +19,7 @@ from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree.lattice import DEPTH
 from openarm_common.ros.answers import answering
 from openarm_common.ros.convert import ns_to_stamp, xyz
+from openarm_common.ros.node import BaseNode
 from openarm_octomap.config import UnknownPolicy
 from openarm_octomap.kernels import FREE, UNKNOWN
 from openarm_octomap.mapper import SUFFIXES, Mapper
@@ -41,9 +41,14 @@ class MapServices:
     """
 
     def __init__(
-        self, node: Node, mapper: Mapper, depths: tuple[int, ...], stamp: Callable[[], int], show: Callable[[], None]
+        self,
+        node: BaseNode[Any],
+        mapper: Mapper,
+        depths: tuple[int, ...],
+        stamp: Callable[[], int],
+        show: Callable[[], None],
     ) -> None:
-        self._log = node.get_logger()
+        self._log, self._frame = node.get_logger(), node.description.base
         self._mapper = mapper
         self._stamp = stamp
         self._show = show
@@ -62,13 +67,13 @@ class MapServices:
     def _on_full(self, _: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
         snapshot = self._mapper.snapshot({"full"})
         if snapshot.full is not None:
-            response.map = convert.octomap_msg(snapshot.full, snapshot.lattice.resolution, self._stamp())
+            response.map = convert.octomap_msg(snapshot.full, snapshot.lattice.resolution, self._frame, self._stamp())
         return response
 
     def _answer_at(self, depth: int) -> Any:
         def respond(_: GetOctomap.Request, response: GetOctomap.Response) -> GetOctomap.Response:
             lattice, payload = self._mapper.coarse(depth)
-            response.map = convert.octomap_msg(payload, lattice.resolution, self._stamp())
+            response.map = convert.octomap_msg(payload, lattice.resolution, self._frame, self._stamp())
             return response
 
         return respond

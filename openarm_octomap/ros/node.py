@@ -18,7 +18,7 @@ from openarm_common.octree.distance_field import CameraMoment, DistanceFieldWrit
 from openarm_common.robot.held import HeldBox
 from openarm_common.robot.posture import JointNeed
 from openarm_common.ros.lifecycle_node import ManagedNode
-from openarm_common.ros.node import BASE_FRAME, run
+from openarm_common.ros.node import run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_octomap.config import OctomapNodeConfig
 from openarm_octomap.mapper import Frame, Mapper, Report
@@ -54,7 +54,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         self._last: Report | None = None
         self._fault = ""
         self._field = self._open_field() if config.field.enabled else None
-        self._publisher = MapPublisher(self, full=config.publish_full)
+        self._publisher = MapPublisher(self, self.description.base, full=config.publish_full)
         MapServices(self, self._mapper, config.coarse_depths, lambda: self._t_ns, self._show)
         self._timer = self.create_timer(config.period, self._on_timer, clock=self.steady_clock)
         self._timer.cancel()
@@ -184,7 +184,7 @@ class OctomapNode(ManagedNode[OctomapNodeConfig]):
         domain = str(self.context.get_domain_id())
         path = field_path(self.config.field.name or domain)
         names = [camera.name for camera in self._cameras]
-        return DistanceFieldWriter(path, self._mapper.lattice, self.config.field.reach, BASE_FRAME, names)
+        return DistanceFieldWriter(path, self._mapper.lattice, self.config.field.reach, self.description.base, names)
 
 
 def main() -> None:

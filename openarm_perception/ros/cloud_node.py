@@ -21,7 +21,7 @@ from openarm_common.camera.stream import Frame
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import cloud_from_points, depth_image, intrinsics_from_info, rgb_image
-from openarm_common.ros.node import BASE_FRAME, QOS_SENSOR, BaseNode, run
+from openarm_common.ros.node import QOS_SENSOR, BaseNode, run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_perception.config import CloudNodeConfig
 from openarm_perception.detection.robot import RobotFinder
@@ -158,7 +158,7 @@ class CloudNode(BaseNode[CloudNodeConfig]):
             merged = self._merger.add(name, frame.t_ns, points, frame.posture.T_base_frame)
             if merged is not None:
                 t_ns, cloud = merged
-                self._merged.publish(cloud_from_points(self.filter.points(cloud), BASE_FRAME, t_ns))
+                self._merged.publish(cloud_from_points(self.filter.points(cloud), self.description.base, t_ns))
 
         return add
 

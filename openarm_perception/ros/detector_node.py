@@ -29,7 +29,7 @@ from openarm_common.ros.answers import answering
 from openarm_common.ros.camera_stream import CameraStream, camera_topics
 from openarm_common.ros.convert import array_to_image, depth_image, intrinsics_from_info, rgb_image
 from openarm_common.ros.detections import detections_to_msg
-from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, QOS_SENSOR, BaseNode, reliable, run
+from openarm_common.ros.node import QOS_LATCHED, QOS_SENSOR, BaseNode, reliable, run
 from openarm_common.ros.tf import RobotStateListener
 from openarm_perception.config import DetectNodeConfig
 from openarm_perception.detection.detector import ColorDetector, ColorDetectorConfig, Mask
@@ -215,9 +215,9 @@ class DetectNode(BaseNode[DetectNodeConfig]):
     def _publish(self, t_ns: int, rgb: NDArray[np.uint8], perceived: Perceived, elapsed_ms: float) -> None:
         self._boxes.publish(convert.detections_2d(perceived.found, self._optical_frame, t_ns))
         covariances = [located.covariance for located in perceived.boxes]
-        self._objects.publish(detections_to_msg(perceived.boxes, covariances, BASE_FRAME, t_ns))
+        self._objects.publish(detections_to_msg(perceived.boxes, covariances, self.description.base, t_ns))
         if self._markers.get_subscription_count():
-            self._markers.publish(convert.markers(perceived.boxes, BASE_FRAME, t_ns))
+            self._markers.publish(convert.markers(perceived.boxes, self.description.base, t_ns))
         if self._picture.get_subscription_count():
             self._picture.publish(array_to_image(annotate(rgb, perceived), "rgb8", self._optical_frame, t_ns))
         if self._mask.get_subscription_count():

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import Field
 
@@ -32,13 +32,13 @@ class OfCamera(Config):
 
 
 class OfSide(Config):
-    """Concerns one arm and gripper, or both."""
+    """Concerns one arm and gripper, or all of them."""
 
-    side: Literal["left", "right", "both"] = Field(default="both", description="which arm or gripper")
+    side: str = Field(default="both", description="which arm or gripper, or both")
 
-    def hits(self, side: str) -> bool:
-        """Whether it concerns a side of the robot."""
-        return self.side in ("both", side)
+    def hits(self, arm: str) -> bool:
+        """Whether it concerns an arm of the robot."""
+        return self.side in ("both", arm)
 
 
 class CameraDrop(OfCamera):

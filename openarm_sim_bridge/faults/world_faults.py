@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from openarm_common import se3
-from openarm_common.robot.description import SIDES
+from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_sim_bridge.faults.faults import (
     Fault,
@@ -23,6 +23,7 @@ from openarm_sim_bridge.faults.faults import (
     JointSag,
     JointStateGap,
     ObjectNudged,
+    OfSide,
     ParametersT,
     find,
 )
@@ -33,11 +34,16 @@ class WorldFaults:
     """Active faults of a world.
 
     Args:
-        joint_names: Order of the targets; the name says the side (`left`, `right`) and whether it is a finger.
+        description: The robot.
+        joint_names: Order of the targets.
     """
 
-    def __init__(self, joint_names: tuple[str, ...]) -> None:
-        self._names = joint_names
+    def __init__(self, description: RobotDescription, joint_names: tuple[str, ...]) -> None:
+        self._description = description
+        by_joint = {joint: name for name, arm in description.arms.items() for joint in arm.controlled}
+        fingers = {arm.finger_joint for arm in description.arms.values()}
+        self._arms = tuple(by_joint[joint] for joint in joint_names)
+        self._fingers = tuple(i for i, joint in enumerate(joint_names) if joint in fingers)
         self._faults: dict[str, Fault] = {}
         self._model: mujoco.MjModel | None = None
         self._friction: Array = np.zeros(0)
@@ -54,9 +60,11 @@ class WorldFaults:
         """Begin a fault.
 
         Raises:
-            OpenArmError: INVALID_ARGUMENT for an object that is not there; SCENE_INVALID where it would be pushed into
-                something.
+            OpenArmError: INVALID_ARGUMENT for an object or an arm that is not there; SCENE_INVALID where the object
+                would be pushed into something.
         """
+        if isinstance(fault.parameters, OfSide) and fault.parameters.side != "both":
+            self._description.arm(fault.parameters.side)
         if isinstance(fault.parameters, ObjectNudged):
             nudge(world, fault.parameters, fault.seed)
             return
@@ -83,7 +91,7 @@ class WorldFaults:
             return
         self._changed = False
         late = self._of(JointLate)
-        delays = [late.ms * 1e-3 if late is not None and late.hits(_side(name)) else 0.0 for name in self._names]
+        delays = [late.ms * 1e-3 if late is not None and late.hits(arm) else 0.0 for arm in self._arms]
         world.delay_commands(np.array(delays))
         model = world.model
         model.geom_friction[:] = self._friction
@@ -91,9 +99,9 @@ class WorldFaults:
         if (friction := self._of(FrictionLowered)) is not None:
             model.geom_friction[:] *= friction.scale
         if (sag := self._of(JointSag)) is not None:
-            for body in range(model.nbody):
-                if any(f"_{side}_" in model.body(body).name and sag.hits(side) for side in SIDES):
-                    model.body_gravcomp[body] -= 1.0 - sag.share
+            hit = [arm for arm in self._description.arm_names if sag.hits(arm)]
+            for link in (link for arm in hit for link in self._description.links_of(arm)):
+                model.body_gravcomp[model.body(link).id] -= 1.0 - sag.share
 
     def targets(self, wanted: Array) -> Array:
         """Return the actuator targets (n,) that take effect in place of the wanted ones."""
@@ -101,8 +109,8 @@ class WorldFaults:
             return wanted
         out = wanted.copy()
         if (stuck := self._of(GripperStuck)) is not None:
-            for i, name in enumerate(self._names):
-                if "finger" in name and stuck.hits(_side(name)):
+            for i in self._fingers:
+                if stuck.hits(self._arms[i]):
                     out[i] = self._stuck.setdefault(i, float(out[i]))
         return out
 
@@ -112,7 +120,7 @@ class WorldFaults:
         if weak is None:
             return limits
         out = limits.copy()
-        out[[i for i, name in enumerate(self._names) if "finger" in name and weak.hits(_side(name))]] *= weak.share
+        out[[i for i in self._fingers if weak.hits(self._arms[i])]] *= weak.share
         return out
 
     def publishes_joints(self, t_ns: int) -> bool:
@@ -128,10 +136,6 @@ class WorldFaults:
 
     def _of(self, model: type[ParametersT]) -> ParametersT | None:
         return find(self._faults.values(), model) if self._faults else None
-
-
-def _side(joint: str) -> str:
-    return "left" if "_left_" in joint else "right"
 
 
 def nudge(world: World, parameters: ObjectNudged, seed: int) -> None:

@@ -69,7 +69,7 @@ class SuiteFace(Face):
 
     def serve(self, simulation: Simulation) -> None:
         """See `Face.serve`."""
-        self._sensors = SensorPublisher(self._node)
+        self._sensors = SensorPublisher(self._node, self._node.description)
         self._controllers = Controllers(self._node, simulation, self._robot, self._servos, self._config.gripper_action)
 
     def publish(self, state: JointReadout, world: World) -> JointReadout:

@@ -69,7 +69,7 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         world = stage.world(scene, each_step=upstream)
         self._face: Face = OpenArmRos2Face(self, stage, world) if upstream else SuiteFace(self, config, stage, world)
         self._simulation = Simulation(
-            SimulatedRobot(world, self._face.controller),
+            SimulatedRobot(self.description, world, self._face.controller),
             self._observe,
             speed=config.speed,
             wall_stamps=self._face.wall_stamps,

@@ -11,12 +11,11 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import Imu
 
-from openarm_common.robot.description import SIDES
+from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import ns_to_stamp, vector
 from openarm_common.ros.node import QOS_SENSOR
 from openarm_common.types import Array
 from openarm_control.pacing import RateDivider
-from openarm_sim_bridge.world.touch import hand_link, pad_links
 from openarm_sim_bridge.world.world import World
 
 #: Rate at which subscribers are counted, Hz.
@@ -36,17 +35,17 @@ class SensorPublisher:
 
     Args:
         node: Owner of the publishers.
+        description: The robot.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, description: RobotDescription) -> None:
         self._count = RateDivider(_COUNT_RATE)
         self._sensors: list[_Sensor] = []
-        for side in SIDES:
-            hand = hand_link(side)
+        for name, arm in description.arms.items():
             topics = [
-                (WrenchStamped, f"/{side}_force_torque_sensor_broadcaster/wrench", hand, _wrist_wrench),
-                (Imu, f"/{side}_imu_sensor_broadcaster/imu", hand, _imu),
-                *((WrenchStamped, f"/{link}/contact_wrench", link, _pad_wrench) for link in pad_links(side)),
+                (WrenchStamped, f"/{name}_force_torque_sensor_broadcaster/wrench", arm.hand, _wrist_wrench),
+                (Imu, f"/{name}_imu_sensor_broadcaster/imu", arm.hand, _imu),
+                *((WrenchStamped, f"/{link}/contact_wrench", link, _pad_wrench) for link in arm.fingers),
             ]
             for kind, topic, link, read in topics:
                 self._sensors.append(_Sensor(node.create_publisher(kind, topic, QOS_SENSOR), link, read))

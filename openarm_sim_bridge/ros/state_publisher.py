@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 
-from openarm_common.robot.description import BASE_LINK, SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, matrix_to_transform, ns_to_stamp, vector
 from openarm_common.ros.node import QOS_CLOCK, QOS_LATCHED, QOS_TF, reliable
 from openarm_control.joints import JointReadout
@@ -95,8 +95,8 @@ class StatePublisher:
     def publish_static(self, description: RobotDescription) -> None:
         """Publish the fixed edges of the description and the aliases."""
         edges = [(j.parent, j.child, j.T_parent_joint) for j in description.joints.values() if j.type == "fixed"]
-        edges.append((BASE_LINK, "base_link", np.eye(4)))
-        edges += [(f"openarm_{side}_link0", f"{side}_arm_base", np.eye(4)) for side in SIDES]
+        edges.append((description.base, "base_link", np.eye(4)))
+        edges += [(arm.base, f"{name}_arm_base", np.eye(4)) for name, arm in description.arms.items()]
         self._tf_static.publish(TFMessage(transforms=[matrix_to_transform(*edge, 0) for edge in edges]))
 
     def publish(self, state: JointReadout, world: World, *, joints: bool = True) -> None:

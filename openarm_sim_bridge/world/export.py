@@ -12,7 +12,7 @@ import mujoco
 
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_common.types import Bytes
 from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, robot_spec
@@ -90,7 +90,9 @@ def render(
         raise OpenArmError(
             Code.INVALID_ARGUMENT, f"unknown view {view!r}; views: {', '.join(VIEWS)}; cameras: {', '.join(cameras)}"
         )
-    q = description.group_state("both_arms", posture) | {description.finger_joint(side): opening for side in SIDES}
+    q = description.group_state("both_arms", posture) | {
+        description.finger_joint(side): opening for side in description.arm_names
+    }
     spec = build_spec(description, load_scene(scene, seed), cameras)
     _light_for_people(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = max(width, 640), max(height, 480)

@@ -14,7 +14,7 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field
 
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_control.servos import ServoConfig
 
@@ -107,7 +107,7 @@ class Hardware:
         """Return what commands and states of joints go through; fingers are exact but for their latency."""
         steps = dict.fromkeys(joint_names, (0.0, 0.0, 0.0))
         if self.quantized:
-            for side in SIDES:
+            for side in description.arm_names:
                 for i, name in enumerate(description.arm_joints(side)):
                     steps[name] = (
                         2.0 * MOTOR_RANGE / (2.0**16 - 1.0),
@@ -117,8 +117,8 @@ class Hardware:
         position, velocity, effort = np.array([steps[name] for name in joint_names]).T
         arm_latency = {
             name: self.latency_s[description.arm_joints(side)[0]]
-            for side in SIDES
-            for name in (*description.arm_joints(side), description.finger_joint(side))
+            for side in description.arm_names
+            for name in description.arm(side).controlled
         }
         return Encoders(
             zero=np.array([self.zero.get(name, 0.0) for name in joint_names]),
@@ -136,7 +136,7 @@ def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
         config: What is possible.
         description: The robot.
     """
-    joints = tuple(name for side in SIDES for name in description.arm_joints(side))
+    joints = tuple(name for side in description.arm_names for name in description.arm_joints(side))
     rng = np.random.default_rng([config.dynamics_seed, 901])
     zeros = np.random.default_rng([config.zero_seed, 902])
 
@@ -149,13 +149,13 @@ def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
     n = len(joints)
     stiffness, damping, gearbox = (either(config.gain_error, n) for _ in range(3))
     friction = rng.uniform(*config.friction, n)
-    latency = np.repeat(rng.uniform(*config.latency, len(SIDES)), n // len(SIDES))
-    links = [link for link in description.links if link.startswith(tuple(f"openarm_{side}_" for side in SIDES))]
+    latency = np.repeat(rng.uniform(*config.latency, len(description.arm_names)), n // len(description.arm_names))
+    links = [link for side in description.arm_names for link in description.links_of(side)]
     mass = dict(zip(links, either(config.mass_error, len(links)).tolist(), strict=True))
     return Hardware(
-        stiffness=named(np.tile(config.stiffness, len(SIDES)) * stiffness),
-        damping=named(np.tile(config.damping, len(SIDES)) * damping),
-        armature=named(np.tile(config.armature, len(SIDES))),
+        stiffness=named(np.tile(config.stiffness, len(description.arm_names)) * stiffness),
+        damping=named(np.tile(config.damping, len(description.arm_names)) * damping),
+        armature=named(np.tile(config.armature, len(description.arm_names))),
         gearbox=named(gearbox),
         friction=named(friction) if config.friction[1] > 0.0 else {},
         zero=named(np.radians(config.zero_rms) * zeros.standard_normal(n)),

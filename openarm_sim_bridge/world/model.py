@@ -21,11 +21,11 @@ from pydantic import Field
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import SIDES, RobotDescription, Side
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene
 from openarm_sim_bridge.world import scenery
 from openarm_sim_bridge.world.hardware import IDEAL, MOTOR_RANGE, Hardware, drawn
-from openarm_sim_bridge.world.touch import add_hand_sensors, hand_link
+from openarm_sim_bridge.world.touch import add_hand_sensors
 from openarm_sim_bridge.world.world import compiled_model
 
 Friction = tuple[Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)], Annotated[float, Field(ge=0.0)]]
@@ -147,7 +147,7 @@ def robot_spec(
     spec = _import_urdf(description)
     _set_options(spec, physics)
     _sort_geoms(spec, description)
-    for side in SIDES:
+    for side in description.arm_names:
         _actuate_arm(spec, description, side, hardware)
         _actuate_gripper(spec, description, side, physics)
     for body in spec.bodies:
@@ -207,7 +207,7 @@ def _sort_geoms(spec: mujoco.MjSpec, description: RobotDescription) -> None:
             geom.mass = 0.0  # masses are those of the URDF
 
 
-def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: Side, hardware: Hardware) -> None:
+def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: str, hardware: Hardware) -> None:
     for name in description.arm_joints(side):
         joint = spec.joint(name)
         joint.armature = hardware.armature[name]
@@ -218,9 +218,9 @@ def _actuate_arm(spec: mujoco.MjSpec, description: RobotDescription, side: Side,
             spec, name, hardware.stiffness[name], hardware.damping[name], description.joints[name].effort
         )
         actuator.ctrlrange = (-MOTOR_RANGE, MOTOR_RANGE)
-    add_hand_sensors(spec, hand_link(side))
+    add_hand_sensors(spec, description.arm(side).hand)
     if hardware.tool_stiffness > 0.0:
-        _mount_softly(spec.body(hand_link(side)), hardware.tool_stiffness)
+        _mount_softly(spec.body(description.arm(side).hand), hardware.tool_stiffness)
     tcp = description.tcp_link(side)
     spec.body(tcp).add_site(name=tcp, size=(0.004, 0.004, 0.004), group=4)
 
@@ -239,7 +239,7 @@ def _mount_softly(hand: mujoco.MjsBody, stiffness: float) -> None:
         )
 
 
-def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: Side, physics: PhysicsConfig) -> None:
+def _actuate_gripper(spec: mujoco.MjSpec, description: RobotDescription, side: str, physics: PhysicsConfig) -> None:
     leader = description.finger_joint(side)
     follower = next(joint.name for joint in description.joints.values() if joint.mimic == leader)
     for name in (leader, follower):

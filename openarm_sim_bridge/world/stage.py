@@ -11,7 +11,7 @@ import mujoco
 
 from openarm_common.camera.cameras import CameraConfig
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import SIDES, RobotDescription, Side
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ServoModel
 from openarm_common.scene.scene import Scene, SceneObject, parse_object
 from openarm_control.joints import arm_loads, joint_names
@@ -49,11 +49,11 @@ class Stage:
         self.joint_names = joint_names(description)
         self.encoders = made.encoders(description, self.joint_names)
         self.home: dict[str, float] = {}
-        for side in SIDES:
+        for side in description.arm_names:
             self.home |= description.group_state(f"{side}_arm", "home") | {description.finger_joint(side): 0.0}
 
     @cached_property
-    def servos(self) -> dict[Side, ServoModel]:
+    def servos(self) -> dict[str, ServoModel]:
         """What the profile says of the servos by side, as a client knows it that has not identified them."""
         return {side: self._hardware.model(load) for side, load in arm_loads(self.description).items()}
 
@@ -97,7 +97,7 @@ class Stage:
             OpenArmError: INVALID_ARGUMENT, naming the keyframes there are.
         """
         states = self.description.semantics.states
-        groups = [f"{side}_arm" for side in SIDES]
+        groups = [f"{side}_arm" for side in self.description.arm_names]
         known = sorted({name for group, name in states if group in groups})
         if keyframe not in known:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no keyframe {keyframe!r}; keyframes: {', '.join(known)}")

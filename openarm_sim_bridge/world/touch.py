@@ -11,17 +11,6 @@ import numpy as np
 
 from openarm_common.types import Array
 
-
-def hand_link(side: str) -> str:
-    """Return the link that carries the wrist's force-torque sensor, and an IMU in its origin."""
-    return f"openarm_{side}_hand"
-
-
-def pad_links(side: str) -> tuple[str, str]:
-    """Return the finger links of a hand; the pad of each is its collision geom `{link}_pad_collision`."""
-    return f"openarm_{side}_left_finger", f"openarm_{side}_right_finger"
-
-
 _HAND_SENSORS = {
     "force": mujoco.mjtSensor.mjSENS_FORCE,
     "torque": mujoco.mjtSensor.mjSENS_TORQUE,

@@ -17,6 +17,9 @@ import pytest
 
 from openarm_bringup.view.gate import listening
 from openarm_common.domain import release_domain, reserve_domain
+from openarm_common.robot.description import RobotDescription
+
+SIDES = RobotDescription.load().arm_names
 
 #: A label that would be run if it were ever taken for markup.
 NASTY = "<img src=x onerror='document.title=1'>"
@@ -49,7 +52,7 @@ class StandIns:
 
         from openarm_common.octree.codec import encode_states
         from openarm_common.octree.lattice import Lattice
-        from openarm_common.robot.description import SIDES, RobotDescription
+        from openarm_common.robot.description import RobotDescription
         from openarm_common.ros.convert import array_to_image
         from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 

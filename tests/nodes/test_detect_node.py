@@ -24,9 +24,11 @@ from openarm_common.ros.convert import (
     pose_to_matrix,
     stamp_to_ns,
 )
-from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, QOS_SENSOR
+from openarm_common.ros.node import QOS_LATCHED, QOS_SENSOR
 from openarm_perception.ros.detector_node import DetectNode
 from tests.nodes.detect_bench import MS, TABLE, TOP, Bench, FakeCamera, Watch
+
+BASE_FRAME = RobotDescription.load().base
 
 
 @pytest.fixture

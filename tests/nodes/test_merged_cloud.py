@@ -13,6 +13,7 @@ from tf2_msgs.msg import TFMessage
 
 from benchmarks.map_scene import MapScene
 from openarm_common import se3
+from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import (
     array_to_image,
     info_from_intrinsics,
@@ -21,10 +22,12 @@ from openarm_common.ros.convert import (
     points_from_cloud,
     stamp_to_ns,
 )
-from openarm_common.ros.node import BASE_FRAME, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
+from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR
 from openarm_common.scene.scene import load_scene
 from openarm_perception.geometry.merge import CloudMerger
 from openarm_perception.ros.cloud_node import CloudNode
+
+BASE_FRAME = RobotDescription.load().base
 
 MS = 1_000_000
 #: The wrist camera's image is so much later than that of the overhead camera, and so fast does the arm turn, rad/s.

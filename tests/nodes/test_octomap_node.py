@@ -21,6 +21,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
 from openarm_common.octree.distance_field import DistanceFieldReader, field_path
+from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import (
     cloud_from_points,
     info_from_intrinsics,
@@ -29,9 +30,11 @@ from openarm_common.ros.convert import (
     points_from_cloud,
     stamp_to_ns,
 )
-from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, QOS_SENSOR
+from openarm_common.ros.node import QOS_LATCHED, QOS_SENSOR
 from openarm_octomap.ros.node import OctomapNode
 from tests.nodes.octomap_bench import FRAME, JOINTS, ROBOT, T_BASE_CAMERA, Bench, K, sheet
+
+BASE_FRAME = RobotDescription.load().base
 
 
 @pytest.fixture

@@ -26,9 +26,11 @@ from openarm_common.ros.convert import (
     ns_to_stamp,
     points_from_cloud,
 )
-from openarm_common.ros.node import BASE_FRAME, QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, reliable
+from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, QOS_SENSOR, reliable
 from openarm_perception.ros.cloud_node import CloudNode
 from openarm_perception.ros.detector_node import DetectNode
+
+BASE_FRAME = RobotDescription.load().base
 
 MS = 1_000_000
 ROBOT = RobotDescription.load()

@@ -15,8 +15,10 @@ from openarm_common.camera.cameras import Intrinsics
 from openarm_common.errors import OpenArmError
 from openarm_common.octree.codec import decode, encode_states
 from openarm_common.octree.lattice import Lattice
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
+
+SIDES = RobotDescription.load().arm_names
 
 
 @pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd", "µ"])

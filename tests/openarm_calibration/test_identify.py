@@ -63,6 +63,6 @@ def test_motions_that_show_nothing_are_refused(load: ArmLoad) -> None:
 
 
 def test_a_robot_that_is_walled_in_has_no_postures(load: ArmLoad) -> None:
-    lower, upper = RobotDescription.load().limits(RobotDescription.arm_joints("right"))
+    lower, upper = RobotDescription.load().limits(RobotDescription.load().arm_joints("right"))
     with pytest.raises(OpenArmError, match="0 postures are free, expected 4"):
         postures(lower, upper, load, lambda q: False, 4, np.random.default_rng(0))

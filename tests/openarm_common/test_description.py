@@ -13,9 +13,13 @@ import yourdfpy
 
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
-from openarm_common.robot.description import BASE_LINK, SIDES, RobotDescription, Side, mirror
+from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_sim_bridge.world.model import PhysicsConfig, robot_spec
+
+BASE_LINK = RobotDescription.load().base
+SIDES = RobotDescription.load().arm_names
+mirror = RobotDescription.load().mirrored
 
 HALF_PI = np.pi / 2
 
@@ -37,7 +41,7 @@ LINK_NAMES = {"world", BASE_LINK} | {
 }
 
 
-def table_frames(side: Side, q: Array, finger: float) -> dict[str, Array]:
+def table_frames(side: str, q: Array, finger: float) -> dict[str, Array]:
     """Every frame of one arm, (4, 4) in the world, from the table alone."""
     left = side == "left"
     sign = -1.0 if left else 1.0

@@ -76,14 +76,14 @@ def detections(label: str, name: str = "") -> Any:
 def test_labels_of_requests_and_detections_are_bounded() -> None:
     longest, longer = "x" * LONGEST_TEXT, "x" * 1_000_000
     assert detections(longest)[0].name == longest
-    request_from_msg(Pick.Goal(label=longest)).check()
+    request_from_msg(Pick.Goal(label=longest)).check(("left", "right"))
     assert request_from_msg(Pick.Goal(label=longer)).cut().label == longest
     for take in (
         lambda: detections(longer),
         lambda: detections("red", longer),
-        lambda: request_from_msg(Pick.Goal(label=longer)).check(),
-        lambda: request_from_msg(Pick.Goal(arm=longer)).check(),
-        lambda: request_from_msg(Pick.Goal(phase=longer)).check(),
+        lambda: request_from_msg(Pick.Goal(label=longer)).check(("left", "right")),
+        lambda: request_from_msg(Pick.Goal(arm=longer)).check(("left", "right")),
+        lambda: request_from_msg(Pick.Goal(phase=longer)).check(("left", "right")),
     ):
         with pytest.raises(OpenArmError, match="has 1000000 characters; expected at most 256") as refused:
             take()

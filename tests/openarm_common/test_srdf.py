@@ -11,7 +11,9 @@ import pytest
 
 from openarm_common.errors import OpenArmError
 from openarm_common.resources import models_dir
-from openarm_common.robot.description import RobotDescription, mirror
+from openarm_common.robot.description import RobotDescription
+
+mirror = RobotDescription.load().mirrored
 
 MINI = """<robot name="mini"><link name="base"/><link name="slide"/>
   <joint name="j1" type="prismatic"><parent link="base"/><child link="slide"/>
@@ -27,7 +29,9 @@ def description() -> RobotDescription:
 def test_srdf_states_cover_their_group_within_limits(description: RobotDescription, group: str) -> None:
     side, part = group.split("_")
     sides = ("left", "right") if side == "both" else (side,)
-    joints = RobotDescription.arm_joints if part.startswith("arm") else lambda side: (description.finger_joint(side),)
+    joints = (
+        RobotDescription.load().arm_joints if part.startswith("arm") else lambda side: (description.finger_joint(side),)
+    )
     names = tuple(name for side in sides for name in joints(side))
     lower, upper = description.limits(names)
     states = [name for g, name in description.semantics.states if g == group]
@@ -51,7 +55,7 @@ def test_srdf_home_is_the_observing_posture_and_mirrored(description: RobotDescr
 
 @pytest.fixture(scope="module")
 def generator() -> ModuleType:
-    path = models_dir() / "openarm" / "generate_srdf.py"
+    path = models_dir() / "robots" / "openarm_v1" / "generate_srdf.py"
     spec = importlib.util.spec_from_file_location("generate_srdf", path)
     assert spec is not None
     assert spec.loader is not None

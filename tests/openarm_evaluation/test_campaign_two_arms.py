@@ -60,7 +60,7 @@ def test_the_judge_of_the_gap_measures_what_mujoco_measures_pair_by_pair() -> No
     robot = SimRobot(random_scene(5000), SimulatedSenses(depth_noise=False))
     gap = watch_clearance(robot)
     model, data = robot.world.model, robot.world.data
-    left, right = gap.sides
+    left, right = gap.arms
     pairs = [mujoco.mj_geomDistance(model, data, int(i), int(j), 2.0, None) for i in left for j in right]
     assert min(len(left), len(right)) > 8
     assert gap.distance(data) == pytest.approx(min(pairs), abs=1e-9)
@@ -81,7 +81,7 @@ def test_the_gap_of_joint_states_is_that_of_the_simulation_which_they_come_from(
         found = arms[arm].inverse.position_solutions(target, 0.05, start)[0].q
         return dict(zip(arms[arm].names, found.tolist(), strict=True))
 
-    gap = ArmClearance(robot.world.model)
+    gap = ArmClearance(robot.description, robot.world.model)
     states: list[tuple[int, dict[str, float]]] = []
     distances: list[float] = []
     for k, y in enumerate((-0.20, -0.10, -0.15)):

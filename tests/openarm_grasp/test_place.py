@@ -19,6 +19,7 @@ from openarm_grasp.planning.candidates import GraspCandidate, propose
 from openarm_grasp.planning.place import check_position, free_spots, other_grasps, place_targets, yaw_offsets
 
 CONFIG = GraspConfig()
+SHOULDERS = {"left": (0.0, 0.15), "right": (0.0, -0.15)}
 TABLE = Table()
 
 
@@ -130,7 +131,7 @@ def test_free_spots_keep_clear_of_neighbours_and_origin(arm):
         box(y=side * 0.2),
         [box(x=0.3, y=side * 0.33, label="blue"), box(x=0.2, y=side * 0.1, label="green")],
     )
-    spots = free_spots(arm, target, others, CONFIG)
+    spots = free_spots(arm, target, others, CONFIG, SHOULDERS)
     assert 1 <= len(spots) <= CONFIG.place.spots
     for spot in spots:
         assert 0.16 <= spot[0] <= 0.36
@@ -146,7 +147,7 @@ def test_a_spot_that_leaves_room_for_a_hand_comes_before_a_nearer_one() -> None:
     others = [box(x=x, y=y, label="blue") for x, y in ((0.33, -0.12), (0.20, -0.26), (0.34, -0.36))]
 
     def rooms(config: GraspConfig) -> list[float]:
-        spots = free_spots("right", target, others, config)
+        spots = free_spots("right", target, others, config, SHOULDERS)
         return [min(float(np.linalg.norm(spot - d.p_base[:2])) for d in others) for spot in spots]
 
     near = [room < CONFIG.place.neighbour_room for room in rooms(CONFIG)]
@@ -158,7 +159,7 @@ def test_a_spot_that_leaves_room_for_a_hand_comes_before_a_nearer_one() -> None:
 def test_a_full_table_has_no_free_spot():
     crowd = [box(x=x, y=y, label="blue") for x in np.arange(0.1, 0.5, 0.08) for y in np.arange(-0.5, 0.0, 0.08)]
     with pytest.raises(OpenArmError) as error:
-        free_spots("right", box(), crowd, CONFIG)
+        free_spots("right", box(), crowd, CONFIG, SHOULDERS)
     assert error.value.code is Code.PLACE_FAILED
 
 

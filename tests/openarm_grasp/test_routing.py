@@ -6,7 +6,9 @@ from __future__ import annotations
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
-from openarm_grasp.planning.arms import arm_order, out_of_reach
+from openarm_grasp.planning.arms import arm_order, out_of_reach, sides
+
+SHOULDERS = {"left": (0.0, 0.15), "right": (0.0, -0.15)}
 
 
 @pytest.mark.parametrize(
@@ -23,12 +25,24 @@ from openarm_grasp.planning.arms import arm_order, out_of_reach
 )
 @pytest.mark.requirement("P-11")
 def test_arms_by_side_and_overlap(arm, y, expected):
-    assert arm_order(arm, y, 0.12) == expected
+    assert arm_order(arm, y, 0.12, SHOULDERS) == expected
+
+
+@pytest.mark.parametrize("y", [-0.3, 0.0, 0.3])
+def test_the_one_arm_of_a_robot_does_all(y):
+    assert arm_order("auto", y, 0.12, {"main": (0.0, 0.0)}) == ("main",)
+    assert sides("main", {"main": (0.0, 0.0)}) == (1.0, -1.0)
+
+
+def test_of_three_arms_the_nearest_come_first():
+    three = {"a": (0.0, 0.5), "b": (0.0, 0.0), "c": (0.0, -0.5)}
+    assert arm_order("auto", 0.2, 0.12, three) == ("b", "a")
+    assert arm_order("auto", -0.5, 0.12, three) == ("c",)
 
 
 def test_an_unknown_arm_is_refused_with_the_choices():
     with pytest.raises(OpenArmError, match="auto, left, right") as error:
-        arm_order("middle", 0.0, 0.12)
+        arm_order("middle", 0.0, 0.12, SHOULDERS)
     assert error.value.code is Code.INVALID_ARGUMENT
 
 

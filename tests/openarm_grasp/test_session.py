@@ -19,6 +19,8 @@ from openarm_grasp.requests.task import Grasp, GraspSession
 from openarm_grasp.strategies.pair import check_pair
 from tests.openarm_grasp.scripted import GoHome, Grip, World, standing
 
+ARMS = ("left", "right")
+
 
 def kept(arm: str, label: str) -> Grasp:
     T = np.eye(4)
@@ -114,18 +116,18 @@ def test_the_outcome_of_two_is_given_in_one_word(first: str, second: str, kind: 
 def test_two_requests_for_what_may_be_one_object_are_refused() -> None:
     def refusal(*pair: GraspRequest) -> str:
         with pytest.raises(OpenArmError) as error:
-            check_pair((pair[0], pair[1]))
+            check_pair((pair[0], pair[1]), ARMS)
         assert error.value.code is Code.INVALID_ARGUMENT
         return error.value.message
 
     red, blue = GraspRequest("red"), GraspRequest("blue")
-    check_pair((red, blue))
+    check_pair((red, blue), ARMS)
     assert "'red' is asked for twice" in refusal(red, red)
     for pair in product((red, GraspRequest("")), repeat=2):
         if pair != (red, red):
             assert "need a label each" in refusal(*pair)
     here, near, away = (GraspRequest("red", object_at=(0.26, y)) for y in (0.2, 0.11, 0.0))
-    check_pair((here, away))
+    check_pair((here, away), ARMS)
     assert "90 mm apart, expected more than 100 mm" in refusal(here, near)
     assert "phase 'pick' is of one alone" in refusal(red, GraspRequest("blue", phase="pick"))
     assert "valid: auto, left, right" in refusal(red, GraspRequest("blue", arm="middle"))

@@ -10,12 +10,14 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
-from openarm_common.robot.description import RobotDescription, mirror
+from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision.exact import Clearance, CollisionContext, CollisionScene
 from openarm_motion.collision.robot import CollisionRobot
 from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.kinematics.chain import ArmKinematics, ArmLinks
 from openarm_motion.planning.arm import Arm
+
+mirror = RobotDescription.load().mirrored
 
 BARE = Clearance(own=0.0, world=0.0, arms=0.0, hand=0.0, touch=0.0, rest=0.0)
 

@@ -8,10 +8,12 @@ import pytest
 
 from openarm_common import se3
 from openarm_common.errors import OpenArmError
-from openarm_common.robot.description import RobotDescription, mirror
+from openarm_common.robot.description import RobotDescription
 from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_motion.kinematics.srs import SrsArm
+
+mirror = RobotDescription.load().mirrored
 
 SWIVELS = np.linspace(-np.pi, np.pi, 24, endpoint=False)
 

@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from benchmarks.localization import Studio, errors
-from openarm_common.robot.description import SIDES
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene, random_scene
+
+SIDES = RobotDescription.load().arm_names
 
 
 @pytest.fixture(scope="module")

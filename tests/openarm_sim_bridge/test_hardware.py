@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig, drawn
 from openarm_sim_bridge.world.model import PhysicsConfig, robot_spec
 from openarm_sim_bridge.world.stage import Stage
 from openarm_sim_bridge.world.world import World
+
+SIDES = RobotDescription.load().arm_names
 
 ARM = slice(8, 15)
 

@@ -16,10 +16,12 @@ from pydantic import ValidationError
 from openarm_common import se3
 from openarm_common.camera.cameras import CameraConfig, load_cameras, true_mount
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene, load_scene
 from openarm_sim_bridge.world.hardware import IDEAL, HardwareConfig, drawn
 from openarm_sim_bridge.world.model import PhysicsConfig, build_spec, compile_model, robot_spec
+
+SIDES = RobotDescription.load().arm_names
 
 GEOM, BODY = mujoco.mjtObj.mjOBJ_GEOM, mujoco.mjtObj.mjOBJ_BODY
 

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from openarm_common.robot.description import SIDES, RobotDescription
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import load_scene
 from openarm_control.follower import End
 from openarm_control.trajectory import Trajectory
@@ -17,6 +17,8 @@ from openarm_sim_bridge.robot import SimulatedRobot
 from openarm_sim_bridge.world.hardware import HardwareConfig
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
+
+SIDES = RobotDescription.load().arm_names
 
 ELBOW = "openarm_right_joint4"
 Ends = list[tuple[End, str]]
@@ -75,7 +77,7 @@ def robot() -> SimulatedRobot:
     world = Stage(description, {}, None, PhysicsConfig(), HardwareConfig()).world(load_scene("empty"), each_step=True)
     world.reset({f"openarm_{side}_joint{i}": 0.0 for side in SIDES for i in range(1, 8)} | {ELBOW: 0.4})
     activate(world)
-    return SimulatedRobot(world, OpenArmRos2(description, world.joint_names, world.read_joints()))
+    return SimulatedRobot(description, world, OpenArmRos2(description, world.joint_names, world.read_joints()))
 
 
 @pytest.mark.requirement("R-03")

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ServoModel
 from openarm_control.arm import End, TrajectoryConfig, TrajectoryOutcome
 from openarm_control.carrier import Carrier
@@ -58,7 +59,9 @@ class Bench:
         self.world, self.controller = make_controller()
         self.states: list[tuple[float, JointReadout]] = []
         self._changed = threading.Condition()
-        self.simulation = Simulation(SimulatedRobot(self.world, self.controller), self._observe, speed=speed)
+        self.simulation = Simulation(
+            SimulatedRobot(RobotDescription.load(), self.world, self.controller), self._observe, speed=speed
+        )
 
     def _observe(self, state: JointReadout) -> None:
         with self._changed:
@@ -327,7 +330,7 @@ def test_a_fault_of_the_program_in_the_thread_is_reported() -> None:
     def observe(_state: JointReadout) -> None:
         raise ZeroDivisionError("a fault")
 
-    simulation = Simulation(SimulatedRobot(world, controller), observe, crashed=crashed)
+    simulation = Simulation(SimulatedRobot(RobotDescription.load(), world, controller), observe, crashed=crashed)
     simulation.start()
     assert ended.wait(5.0)
     simulation.stop()

@@ -14,7 +14,7 @@ from openarm_grasp.config import HeldConfig
 from openarm_grasp.evidence.verdicts import Evidence, judge_grip
 from openarm_sim_bridge.world.model import PhysicsConfig
 from openarm_sim_bridge.world.stage import Stage
-from openarm_sim_bridge.world.touch import add_hand_sensors, contact_wrench, hand_link, imu, pad_links, wrist_wrench
+from openarm_sim_bridge.world.touch import add_hand_sensors, contact_wrench, imu, wrist_wrench
 
 WEIGHT = 0.5 * 9.81
 BOX = (
@@ -135,17 +135,18 @@ def test_an_imu_shows_gravity_and_how_the_hand_turns() -> None:
 
 @pytest.mark.requirement("A-24")
 def test_the_robot_has_the_sensors() -> None:
-    stage = Stage(RobotDescription.load(), load_cameras(), None, PhysicsConfig())
+    description = RobotDescription.load()
+    stage = Stage(description, load_cameras(), None, PhysicsConfig())
     world = stage.world(load_scene("empty"))
     for _ in range(30):
         world.step(world.steps_per_tick)
-    for side in ("left", "right"):
-        model, body = world.model, world.model.body(hand_link(side))
-        force, _ = world.wrist_wrench(hand_link(side))
+    for side in description.arm_names:
+        model, body = world.model, world.model.body(description.arm(side).hand)
+        force, _ = world.wrist_wrench(description.arm(side).hand)
         assert np.linalg.norm(force) == pytest.approx(9.81 * model.body_subtreemass[body.id], rel=0.02)
-        rate, acceleration = world.imu(hand_link(side))
+        rate, acceleration = world.imu(description.arm(side).hand)
         np.testing.assert_allclose(rate, np.zeros(3), atol=0.01)
         up = world.data.xmat[body.id].reshape(3, 3) @ acceleration
         np.testing.assert_allclose(up, [0.0, 0.0, 9.81], atol=0.05)
-        for link in pad_links(side):
+        for link in description.arm(side).fingers:
             assert not world.pad_wrench(link)[0].any()

@@ -27,7 +27,6 @@ from openarm_common.resources import config_dir
 from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.robot_state import RobotStateBuffer
 from openarm_common.ros.convert import depth_image, intrinsics_from_info, rgb_image, stamp_to_ns, transform_to_matrix
-from openarm_common.ros.node import BASE_FRAME
 from openarm_common.ros.tf import table_height
 from openarm_common.scene.scene import load_scene
 from openarm_octomap.config import FieldConfig, FilterConfig, GridConfig
@@ -140,7 +139,7 @@ def _stamp(message: Any) -> int:
 def _work(shot: _Shot, states: RobotStateBuffer, pipeline: Pipeline, mapper: Mapper, found: _Found) -> None:
     if shot.depth is None or shot.color is None or shot.info is None:
         raise OpenArmError(Code.BAD_IMAGE, "colour, depth or camera_info of a stamp is missing")
-    T_base_camera = states.lookup(BASE_FRAME, shot.camera.optical_frame, shot.t_ns)
+    T_base_camera = states.lookup(RobotDescription.load().base, shot.camera.optical_frame, shot.t_ns)
     joints = states.joints_at(shot.t_ns)
     intrinsics = intrinsics_from_info(shot.info)
     depth = depth_image(shot.depth)

@@ -15,7 +15,7 @@ from rcl_interfaces.srv import GetParameters
 from openarm_calibration.dynamics.excite import postures, waves
 from openarm_calibration.dynamics.identify import Identified, ServoLog, identify
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.robot.description import SIDES, RobotDescription, Side
+from openarm_common.robot.description import RobotDescription
 from openarm_common.robot.servos import ArmLoad
 from openarm_common.ros.convert import stamp_to_ns, trajectory_to_msg
 from openarm_common.ros.node import QOS_COMMAND
@@ -31,16 +31,16 @@ _ANSWER_S = 5.0
 _BRIDGE = "mujoco_bridge"
 
 
-def arm_sides(arm: str) -> tuple[Side, ...]:
-    """Return the sides of `left`, `right` or `both`.
+def named_arms(arm: str) -> tuple[str, ...]:
+    """Return the arms that an option names: one, or `both` for all.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing the choices.
     """
-    sides: tuple[Side, ...] = tuple(side for side in SIDES if arm in (side, "both"))
-    if not sides:
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"--arm {arm}: expected {', '.join(SIDES)} or both")
-    return sides
+    names = RobotDescription.load().arm_names
+    if arm not in (*names, "both"):
+        raise OpenArmError(Code.INVALID_ARGUMENT, f"--arm {arm}: expected {', '.join(names)} or both")
+    return names if arm == "both" else (arm,)
 
 
 class DynamicsClient(MotionClient):
@@ -88,7 +88,7 @@ class DynamicsClient(MotionClient):
         names = {info.node_name for info in self._node.get_publishers_info_by_topic("/joint_states")}
         return {name for name in names if not name.startswith("_")}
 
-    def identify(self, side: Side, count: int, on_posture: Callable[[int, int], None]) -> Identified:
+    def identify(self, side: str, count: int, on_posture: Callable[[int, int], None]) -> Identified:
         """Identify the servos of an arm, and bring it back to its posture `home`.
 
         Args:
@@ -102,8 +102,8 @@ class DynamicsClient(MotionClient):
         """
         description, arm = self._description, self._arms[side]
         load, logs = ArmLoad(description, arm.names, description.tcp_link(side)), list[ServoLog]()
-        home = {n: q for s in SIDES for n, q in description.group_state(f"{s}_arm", "home").items()}
-        home |= {description.finger_joint(s): 0.0 for s in SIDES}
+        home = {n: q for s in description.arm_names for n, q in description.group_state(f"{s}_arm", "home").items()}
+        home |= {description.finger_joint(s): 0.0 for s in description.arm_names}
         collides = arm.scene(home, ()).collides
         lower, upper = description.limits(arm.names)
         chosen = postures(lower, upper, load, lambda q: not collides(q), count, np.random.default_rng(0))
@@ -117,7 +117,7 @@ class DynamicsClient(MotionClient):
         self.move_to_named(side, "home").raise_for_code()
         return identify(logs, load)
 
-    def _wave(self, side: Side, names: tuple[str, ...], t: Array, q: Array) -> list[ServoLog]:
+    def _wave(self, side: str, names: tuple[str, ...], t: Array, q: Array) -> list[ServoLog]:
         """Play a wave and return what the controller says of it."""
         action, states = self._controller.format(arm=side), list[JointTrajectoryControllerState]()
         topic = f"{action.rpartition('/')[0]}/controller_state"

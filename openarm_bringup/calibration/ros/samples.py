@@ -20,7 +20,6 @@ from openarm_common.config import parse_yaml
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import intrinsics_from_info, stamp_to_ns
-from openarm_common.ros.node import BASE_FRAME
 
 _IMAGES = "/color/image_raw"
 _INFOS = "/color/camera_info"
@@ -60,12 +59,13 @@ def samples_of(
         small = _small(bag, camera)
     optics = next(iter(small.optics.values()))
     configured = load_cameras()
-    base = BASE_FRAME if BASE_FRAME in small.robot.links else small.robot.root
+    ours = RobotDescription.load()
+    base = ours.base if ours.base in small.robot.links else small.robot.root
     parent = _parent(small, camera, base, configured)
     simulated = camera not in configured or configured[camera].mount_error
     seed = mount_seed if mount_seed is not None else _seed(bag)
     head = head_of(
-        camera, parent, small.robot, optics, board, carrier or CalibrationConfig().carrier,
+        camera, parent, small.robot, optics, board, carrier or ours.arm(CalibrationConfig().auto.arm).flange,
         base=base, mount_seed=seed if simulated else None,
     )  # fmt: skip
     samples = SampleSet(head, small.robot)

@@ -44,7 +44,7 @@ from openarm_common.ros.convert import (
     transform_to_matrix,
     xyz,
 )
-from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED, QOS_STATIC_TF
+from openarm_common.ros.node import QOS_LATCHED, QOS_STATIC_TF
 from openarm_common.ros.polled import Polled, Source
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
@@ -164,7 +164,7 @@ def _show_cloud(description: RobotDescription, camera: CameraConfig) -> Show:
         depth, color, info = newest
         if depth is None or color is None or info is None or depth.header.stamp != color.header.stamp:
             return  # the other half of the frame comes soon
-        T_base_optical = states.lookup(BASE_FRAME, camera.optical_frame, stamp_to_ns(depth.header.stamp))
+        T_base_optical = states.lookup(description.base, camera.optical_frame, stamp_to_ns(depth.header.stamp))
         optics = intrinsics_from_info(info)
         points, colors = wire.thin_cloud(deprojector, depth_image(depth), rgb_image(color), optics, T_base_optical)
         newest[0] = None  # shown

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from openarm_common.errors import Code
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene, SceneObject
 from openarm_evaluation.campaign.tasks.task import FaultPlan, Task, nominal
 
@@ -164,8 +165,9 @@ def _arm_in_the_way(task: Task, rng: np.random.Generator) -> Task:
     """Hold both arms over the table, between the camera and the objects, when the request arrives."""
     right = (0.14, 2.46, -1.17, 1.79, -0.3, -0.4, 0.71)
     posture: dict[str, float] = {}
-    for side, sign in (("right", (1,) * 7), ("left", (-1, -1, -1, 1, -1, -1, -1))):
-        posture |= {f"openarm_{side}_joint{i + 1}": s * q for i, (s, q) in enumerate(zip(sign, right, strict=True))}
+    robot = RobotDescription.load()
+    for arm, q in (("right", right), ("left", robot.mirrored(right).tolist())):
+        posture |= dict(zip(robot.arm_joints(arm), q, strict=True))
     return replace(task, posture=posture)
 
 

@@ -74,7 +74,7 @@ def push_task(seed: int) -> Task:
     rng = np.random.default_rng([seed, 5])
     while True:
         scene = _one_object(seed, rng)
-        if not any(_graspable(scene, arm) for arm in ("left", "right")):
+        if not any(_graspable(scene, arm) for arm in RobotDescription.load().arm_names):
             return Task("push", seed, scene, (scene.objects[0].label,), kind="push", route="push")
 
 
@@ -112,6 +112,6 @@ def _graspable(scene: Scene, arm: str) -> bool:
 def _home() -> Mapping[str, float]:
     robot = RobotDescription.load()
     state = dict.fromkeys(robot.joints, 0.0)
-    for side in ("left", "right"):
+    for side in robot.arm_names:
         state |= robot.group_state(f"{side}_arm", GraspConfig().home_state)
     return state

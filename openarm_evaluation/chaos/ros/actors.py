@@ -25,6 +25,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.client import BackgroundNode
 from openarm_common.ros.convert import point
 from openarm_common.ros.holds import TOPIC as HOLDS
@@ -37,7 +38,6 @@ _ANSWER_S, _ASKERS = 20.0, 4
 _COMMANDS_HZ, _INTRUDER_HZ = 1000.0, 50.0
 #: A hold that was announced so long ago counts no more, s; a refusal is in the log so soon.
 _HELD_S, _LOGGED_S = 0.6, 5.0
-_JOINT = "openarm_right_joint4"
 #: Of `mount(8)`, by the C library: Python offers neither unshare nor mount.
 _CLONE_NEWNS, _MS_REC_PRIVATE = 0x20000, 0x4000 | 0x40000
 
@@ -67,6 +67,9 @@ class Actors(BackgroundNode):
     def __init__(self, domain: int, pid: Callable[[str], int], run: Path) -> None:
         super().__init__("openarm_chaos", domain=domain)
         self._pid, self._run = pid, run
+        self._robot = RobotDescription.load()
+        self._arm = self._robot.arm_names[-1]
+        self._joint = self._robot.arm_joints(self._arm)[3]
         self._commands = self._node.create_publisher(JointState, "/joint_commands", reliable(10))
         self._holds: tuple[float, list[str]] = (0.0, [])
         self._refused = threading.Event()
@@ -136,7 +139,7 @@ class Actors(BackgroundNode):
         self._refused.clear()
         while time.monotonic() < end and holding():
             for arm in self._held(holding):
-                self._commands.publish(JointState(name=[f"openarm_{arm}_joint7"], position=[0.5]))
+                self._commands.publish(JointState(name=[self._robot.arm_joints(arm)[-1]], position=[0.5]))
                 sent += 1
             time.sleep(1.0 / _INTRUDER_HZ)
         if sent < _INTRUDER_HZ / 2.0 or self._refused.wait(_LOGGED_S):
@@ -170,10 +173,10 @@ class Actors(BackgroundNode):
 
     def _flood_commands(self, seconds: float) -> None:
         hostile = (
-            JointState(name=[_JOINT], position=[math.nan]),
-            JointState(name=[_JOINT], position=[]),
+            JointState(name=[self._joint], position=[math.nan]),
+            JointState(name=[self._joint], position=[]),
             JointState(name=["elbow\n\x1b[2J"], position=[1.0]),
-            JointState(name=[_JOINT], position=[math.inf]),
+            JointState(name=[self._joint], position=[math.inf]),
         )
         end, k = time.monotonic() + seconds, 0
         while time.monotonic() < end:
@@ -187,7 +190,7 @@ class Actors(BackgroundNode):
         pose = PoseStamped()
         pose.pose.position, pose.pose.orientation.w = point((0.3, -0.2, 0.5)), 1.0
         asks = (
-            (ComputeIK, "/motion/compute_ik", ComputeIK.Request(arm="right", pose=pose)),
+            (ComputeIK, "/motion/compute_ik", ComputeIK.Request(arm=self._arm, pose=pose)),
             (ComputeIK, "/motion/compute_ik", ComputeIK.Request(arm="third\n")),
             (Grasp, "/grasp", Grasp.Request(label="x" * 10_000)),
         )

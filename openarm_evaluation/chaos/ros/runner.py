@@ -27,6 +27,7 @@ from openarm_bringup.supervision.state import socket_path, state_dir
 from openarm_bringup.supervision.supervisor import Supervisor
 from openarm_common.domain import release_domain, reserve_domain
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene, SceneObject, random_scene
 from openarm_evaluation.chaos import judge
 from openarm_evaluation.chaos.judge import Violation
@@ -346,7 +347,7 @@ class _Work:
         path = self._folder / "scenes" / f"{number}.yaml"
         path.write_text(yaml.safe_dump(scene.model_dump(mode="json"), sort_keys=False), encoding="utf-8")
         after_ns = self._observer.reset_world(str(path), number)
-        for arm in ("left", "right"):
+        for arm in RobotDescription.load().arm_names:
             self._client.release(arm)
         wait_scene(self._observer, scene, after_ns)
         self._scene, self._left = scene, list(scene.objects)

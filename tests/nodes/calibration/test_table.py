@@ -21,11 +21,14 @@ from openarm_common import se3
 from openarm_common.camera.cameras import T_LINK_OPTICAL
 from openarm_common.errors import Code
 from openarm_common.records import default_folder
-from openarm_common.ros.node import BASE_FRAME, QOS_STATIC_TF
+from openarm_common.robot.description import RobotDescription
+from openarm_common.ros.node import QOS_STATIC_TF
 from openarm_common.ros.tf import table_height
 from openarm_perception.ros.detector_node import DetectNode
 from tests.nodes.detect_bench import TABLE as SEEN
 from tests.nodes.detect_bench import Bench, FakeCamera
+
+BASE_FRAME = RobotDescription.load().base
 
 #: 15 mm below what the camera sees.
 CONFIGURED = SEEN - 0.015

@@ -31,8 +31,10 @@ from visualization_msgs.msg import MarkerArray
 from openarm_common import se3
 from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, ns_to_stamp, pose_to_matrix, vector
-from openarm_common.ros.node import BASE_FRAME, QOS_COMMAND, QOS_LATCHED, reliable
+from openarm_common.ros.node import QOS_COMMAND, QOS_LATCHED, reliable
 from openarm_grasp.ros.node import GraspNode
+
+BASE_FRAME = RobotDescription.load().base
 
 ARMS = ("left", "right")
 CUBE = 0.05

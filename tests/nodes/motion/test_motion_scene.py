@@ -19,8 +19,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 from openarm_common import se3
 from openarm_common.octree.distance_field import CameraMoment, DistanceFieldWriter, field_path
 from openarm_common.octree.lattice import Lattice
+from openarm_common.robot.description import RobotDescription
 from openarm_common.ros.convert import matrix_to_pose, matrix_to_transform
-from openarm_common.ros.node import BASE_FRAME, QOS_LATCHED
+from openarm_common.ros.node import QOS_LATCHED
+
+BASE_FRAME = RobotDescription.load().base
 
 LATTICE = Lattice.from_bounds(0.02, (-0.48, -1.0, -0.08), (1.28, 1.0, 1.36))
 

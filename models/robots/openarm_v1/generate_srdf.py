@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write openarm.srdf: groups, postures, and the collisions that need no check.
 
-    python models/openarm/generate_srdf.py [--samples 60000] [--out FILE]
+    python models/robots/openarm_v1/generate_srdf.py [--samples 60000] [--out FILE]
 
 A pair of links is not checked for one of three reasons. *Adjacent*: joined by a joint. *Default*: the primitives touch
 where the parts do not, or by design (the fingers when closed). *Never*: not nearer than `MARGIN` in any of the random
@@ -18,7 +18,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from openarm_common.robot.description import BASE_LINK, SIDES, RobotDescription, Side, mirror
+from openarm_common.robot.description import RobotDescription
+
+BASE_LINK = RobotDescription.load().base
+SIDES = RobotDescription.load().arm_names
+mirror = RobotDescription.load().mirrored
 
 MARGIN = 0.01  # m
 SEED = 1
@@ -51,7 +55,7 @@ GRIPPER = {"open": 0.044, "half_closed": 0.022, "closed": 0.0}
 Pair = frozenset[str]
 
 
-def full_name(side: Side, link: str) -> str:
+def full_name(side: str, link: str) -> str:
     """Name of a link of one arm in the description."""
     return BASE_LINK if link == "body" else f"openarm_{side}_{link}"
 
@@ -181,9 +185,9 @@ def state_lines() -> list[str]:
         joints = [f'    <joint name="{joint}" value="{value:.9g}"/>' for joint, value in values.items()]
         return [f'  <group_state name="{name}" group="{group}">', *joints, "  </group_state>"]
 
-    def arm(side: Side, q: tuple[float, ...]) -> dict[str, float]:
+    def arm(side: str, q: tuple[float, ...]) -> dict[str, float]:
         own = q if side == "right" else tuple(float(v) + 0.0 for v in mirror(q))
-        return dict(zip(RobotDescription.arm_joints(side), own, strict=True))
+        return dict(zip(RobotDescription.load().arm_joints(side), own, strict=True))
 
     lines: list[str] = []
     for name, q in POSTURES.items():
@@ -193,7 +197,7 @@ def state_lines() -> list[str]:
     lines += state("right_arm", "wrist_look", arm("right", WRIST_LOOK))
     for side in SIDES:
         for name, opening in GRIPPER.items():
-            lines += state(f"{side}_gripper", name, {RobotDescription.finger_joint(side): opening})
+            lines += state(f"{side}_gripper", name, {RobotDescription.load().finger_joint(side): opening})
     return lines
 
 
