@@ -263,7 +263,7 @@ def test_masses_and_tensors_are_possible(description: RobotDescription) -> None:
 def test_questions_that_have_no_answer_list_what_there_is(description: RobotDescription) -> None:
     with pytest.raises(OpenArmError, match="no position of joint 'openarm_left_joint1'"):
         description.link_pose("openarm_left_link1", {"openarm_right_joint1": 0.0})
-    with pytest.raises(OpenArmError, match="no link 'hand' in robot 'openarm'; links: world"):
+    with pytest.raises(OpenArmError, match="no link 'hand' in robot 'openarm_v1'; links: world"):
         description.link_pose("hand", {})
     with pytest.raises(OpenArmError, match="right_arm/wrist_look"):
         description.group_state("right_arm", "dance")

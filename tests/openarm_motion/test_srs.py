@@ -132,4 +132,4 @@ def test_wrong_geometry_is_refused(description: RobotDescription) -> None:
     assert text != description.urdf
     bent = RobotDescription.from_urdf(text)
     with pytest.raises(OpenArmError, match="miss a common point"):
-        SrsArm(ArmKinematics(bent, bent.tcp_link("right")))
+        SrsArm(ArmKinematics(bent, description.tcp_link("right")))
