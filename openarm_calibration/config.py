@@ -42,7 +42,6 @@ class PlaceConfig(Config):
 class AutoConfig(Config):
     """Automatic calibration, with the arm moved by /motion/move."""
 
-    arm: str = Field(default="right", description="that carries the camera, or the board")
     poses: int = Field(default=15, ge=4, le=100, description="samples at most")
     fewest: int = Field(default=10, ge=4, le=100, description="samples at least, however certain the result is")
     sigma_translation: float = Field(default=1e-4, gt=0.0, description="predicted error that is enough, m")
@@ -68,7 +67,7 @@ class CalibrationConfig(StoreConfig):
         default="", description="keys of the board as YAML, such as {kind: circles, rows: 11}; empty: defaults"
     )
     carrier: str = Field(
-        default="", description="link that holds the board when the camera is fixed; empty: the flange of auto.arm"
+        default="", description="link that holds the board when the camera is fixed; empty: the last arm's flange"
     )
     algorithm: str = Field(default="REFINED", description="what compute_calibration uses at first")
     image_timeout: float = Field(default=2.0, gt=0.0, le=60.0, description="longest wait for an image, s of wall clock")

@@ -150,7 +150,6 @@ class NearLookConfig(Config):
 
     enabled: bool = Field(default=True, description="whether the camera on the hand is asked before the grasp")
     camera: str = Field(default="wrist", description="that is mounted on the hand")
-    arm: str = Field(default="right", min_length=1, description="whose hand")
     topic: str = Field(default="/wrist/detections_3d", description="what its detector finds")
     frames: int = Field(default=2, ge=1, le=10, description="that are averaged")
     least: float = Field(default=0.001, ge=0.0, le=0.01, description="smaller corrections are not made, m")

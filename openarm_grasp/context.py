@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from openarm_common.camera.cameras import load_cameras
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Table
 from openarm_grasp.config import GraspConfig
@@ -19,16 +20,20 @@ class GraspContext:
         config: Parameters.
         table: Where objects stand.
         shoulders: (x, y) of each arm's shoulder, base frame, m.
+        looks: The arm whose hand carries the camera of the second look; "": none.
     """
 
     config: GraspConfig
     table: Table
     shoulders: Shoulders
+    looks: str = ""
 
     @classmethod
     def of(cls, config: GraspConfig, table: Table, robot: RobotDescription) -> GraspContext:
         """That of a robot at a table."""
-        return cls(config, table, {arm: _shoulder(robot, arm) for arm in robot.arm_names})
+        camera = load_cameras().get(config.near.camera)
+        looks = robot.arm_of(camera.parent) if camera is not None and config.near.enabled else ""
+        return cls(config, table, {arm: _shoulder(robot, arm) for arm in robot.arm_names}, looks)
 
     def arm_order(self, arm: str, y: float) -> tuple[str, ...]:
         """Arms to try for an object; see `openarm_grasp.planning.arms.arm_order`."""

@@ -103,6 +103,8 @@ class _Run:
         self, node: CalibrationNode, mover: ActionClient, handle: ServerGoalHandle, result: AutoCalibrate.Result
     ) -> None:
         self._node, self._mover, self._handle, self._result = node, mover, handle, result
+        head = node.samples.head
+        self._arm = node.description.arm_of(head.parent if head.setup == "in_hand" else head.carrier)
         self._goal: AutoCalibrate.Goal = handle.request
         self._config = config = node.config.auto
         node.use(self._goal.camera or node.camera.name)
@@ -213,7 +215,7 @@ class _Run:
         """
         if not await wait_until(self._node, self._mover.server_is_ready, _ANSWER):
             raise OpenArmError(Code.NOT_READY, "no action /motion/move: is the graph up (openarm up calibrate)?")
-        goal = MoveArm.Goal(arm=self._config.arm, kind=MoveArm.Goal.JOINTS, joint_positions=q.tolist())
+        goal = MoveArm.Goal(arm=self._arm, kind=MoveArm.Goal.JOINTS, joint_positions=q.tolist())
         goal.velocity_scale = scale
         self._surround(goal)
         died = self._mover.watch()
@@ -259,7 +261,7 @@ class _Run:
             goal.obstacles = [box]
             return
         description = self._node.description
-        tool, carrier = description.tcp_link(self._config.arm), self._node.samples.head.carrier
+        tool, carrier = description.tcp_link(self._arm), self._node.samples.head.carrier
         anyhow = dict.fromkeys(description.joints, 0.0)  # the two are fixed to each other
         T_tool_carrier = se3.inverse(description.link_pose(tool, anyhow)) @ description.link_pose(carrier, anyhow)
         box.pose = matrix_to_pose(T_tool_carrier @ T_carrier_box)

@@ -50,7 +50,7 @@ class SessionHead(Config):
     setup: Literal["in_hand", "to_hand"] = Field(description="whether the arm carries the camera or the board")
     parent: str = Field(min_length=1, description="link that carries the camera")
     carrier: str = Field(min_length=1, description="link that moves: the camera's parent, or what carries the board")
-    base: str = Field(default="openarm_body_link0", min_length=1, description="base frame")
+    base: str = Field(default="", description="base frame; empty: the root of the robot")
     intrinsics: tuple[int, int, float, float, float, float] = Field(description="width, height, fx, fy, cx, cy")
     board: dict[str, Any] = Field(description="keys of the board")
     mount_seed: int | None = Field(default=None, description="of the simulated mounts")
@@ -107,6 +107,7 @@ class SampleSet:
     """
 
     def __init__(self, head: SessionHead, description: RobotDescription) -> None:
+        head = head.model_copy(update={"base": head.base or description.root})
         for what, link in (("parent", head.parent), ("carrier", head.carrier), ("base", head.base)):
             if link not in description.links:
                 links = ", ".join(description.links)

@@ -152,6 +152,10 @@ class RobotDescription:
         beyond = {base, *(link for link, chain in self._chains.items() if any(j.parent == base for j in chain))}
         return tuple(link for link in self.links if link in beyond)
 
+    def arm_of(self, link: str) -> str:
+        """Return the arm that a link belongs to; "": none."""
+        return next((name for name in self.arms if link in self.links_of(name)), "")
+
     def mirrored(self, q: Iterable[float]) -> Array:
         """Mirror joint positions (n,) of one arm: the other arm takes the pose with y negated.
 

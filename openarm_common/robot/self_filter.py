@@ -38,7 +38,7 @@ class SelfFilterConfig(Config):
 
     def paddings(self) -> dict[str, float]:
         """Return the paddings that differ, by link."""
-        return metres_by_name(self.link_padding, "link_padding", "openarm_left_hand=0.03", 0.0, 0.2)
+        return metres_by_name(self.link_padding, "link_padding", "hand=0.03", 0.0, 0.2)
 
 
 @dataclass(frozen=True, eq=False)

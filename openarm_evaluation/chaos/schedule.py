@@ -103,19 +103,20 @@ def known_kinds(kinds: Sequence[str]) -> tuple[str, ...]:
     return tuple(kinds) or tuple(KINDS)
 
 
-def rounds(seed: int, kinds: Sequence[str], nodes: Sequence[str]) -> Iterator[Round]:
+def rounds(seed: int, kinds: Sequence[str], nodes: Sequence[str], arms: Sequence[str]) -> Iterator[Round]:
     """Yield requests and their faults without end; every kind comes once before any comes again, and so does each node.
 
     Args:
         seed: Of all draws.
         kinds: Of faults; none: only requests.
         nodes: That may be killed and stopped.
+        arms: Of the robot; every other request or so is for a particular one.
     """
     rng = np.random.default_rng([seed, 18])
     bags = {name: _in_turn(rng, choices) for name, choices in (("", kinds), ("kill", nodes), ("stop", nodes))}
     number = 0
     while True:
-        arm = ("auto", "left", "right")[int(rng.choice(3, p=[0.6, 0.2, 0.2]))]
+        arm = ("auto", *arms)[int(rng.choice(1 + len(arms), p=[0.6, *[0.4 / len(arms)] * len(arms)]))]
         pick, worded = int(rng.integers(1_000)), bool(rng.integers(2))
         yield Round(number, pick, arm, worded, _fault(rng, bags) if kinds else None)
         number += 1

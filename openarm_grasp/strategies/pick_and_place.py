@@ -146,7 +146,7 @@ async def approach(run: Run, grasp: Grasp, plan: Planned, why: str) -> tuple[Gra
     run.tried += 1
     run.enter(State.MOVE_TO_PREGRASP, why)
     what, opening = "move to the pre-grasp", config.hand.opening
-    second = config.near.enabled and arm == config.near.arm
+    second = arm == run.context.looks
     if second:
         robot.expect_near()
     await robot.follow_and_grip(arm, plan.transfer, what, position=opening, how="open")

@@ -10,14 +10,15 @@ from hypothesis import strategies as st
 from openarm_common.errors import OpenArmError
 from openarm_evaluation.chaos.schedule import HOLDING, KINDS, STATES, known_kinds, rounds
 
+ARMS = ("left", "right")
 NODES = ["bridge", "motion", "grasp"]
 
 
 @given(seed=st.integers(0, 2**32), kinds=st.lists(st.sampled_from(sorted(KINDS)), unique=True, min_size=1))
 def test_a_seed_repeats_its_faults_and_every_kind_has_its_turn(seed: int, kinds: list[str]) -> None:
     number = 3 * len(kinds)
-    first = list(islice(rounds(seed, kinds, NODES), number))
-    assert first == list(islice(rounds(seed, kinds, NODES), number))
+    first = list(islice(rounds(seed, kinds, NODES, ARMS), number))
+    assert first == list(islice(rounds(seed, kinds, NODES, ARMS), number))
     drawn = [one.fault.kind for one in first if one.fault is not None]
     assert all(drawn.count(kind) == 3 for kind in kinds)
     for one in first:
@@ -31,8 +32,8 @@ def test_a_seed_repeats_its_faults_and_every_kind_has_its_turn(seed: int, kinds:
 
 
 def test_seeds_differ_and_without_kinds_nothing_goes_wrong() -> None:
-    assert list(islice(rounds(1, list(KINDS), NODES), 9)) != list(islice(rounds(2, list(KINDS), NODES), 9))
-    assert all(one.fault is None for one in islice(rounds(1, known_kinds(["none"]), NODES), 9))
+    assert list(islice(rounds(1, list(KINDS), NODES, ARMS), 9)) != list(islice(rounds(2, list(KINDS), NODES, ARMS), 9))
+    assert all(one.fault is None for one in islice(rounds(1, known_kinds(["none"]), NODES, ARMS), 9))
 
 
 def test_an_unknown_kind_is_refused_with_the_choices() -> None:

@@ -134,14 +134,9 @@ class World(Skills):
         self.stopped: Code | None = None
         self.on_report: Callable[[Status], None] = lambda status: None
         self.plans: list[Planned | OpenArmError] = []
-        self.session = GraspSession(
-            GraspContext(
-                GraspConfig.model_validate({"near": {"enabled": False}, **config}),
-                Table(),
-                {"left": (0.0, 0.15), "right": (0.0, -0.15)},
-            )
-        )
-        self._config = self.session.context.config
+        self._config = GraspConfig.model_validate({"near": {"enabled": False}, **config})
+        shoulders, looks = {"left": (0.0, 0.15), "right": (0.0, -0.15)}, "right" if self._config.near.enabled else ""
+        self.session = GraspSession(GraspContext(self._config, Table(), shoulders, looks))
         self.deadline_ns = 0
         self.robot = self  # type: ignore[assignment]
         self._target, self._label, self._line = np.zeros(3), "", np.zeros(3)

@@ -10,7 +10,6 @@ from typing import Any
 from openarm_bringup.bags.bag import Bag
 from openarm_bringup.bags.ros.messages import contents, message_of, messages_of
 from openarm_calibration.board.board import Board
-from openarm_calibration.config import CalibrationConfig
 from openarm_calibration.ros.image_capture import grey
 from openarm_calibration.sampling.gate import GateConfig
 from openarm_calibration.sampling.samples import SampleSet, head_of
@@ -65,7 +64,7 @@ def samples_of(
     simulated = camera not in configured or configured[camera].mount_error
     seed = mount_seed if mount_seed is not None else _seed(bag)
     head = head_of(
-        camera, parent, small.robot, optics, board, carrier or ours.arm(CalibrationConfig().auto.arm).flange,
+        camera, parent, small.robot, optics, board, carrier or ours.arm(ours.arm_names[-1]).flange,
         base=base, mount_seed=seed if simulated else None,
     )  # fmt: skip
     samples = SampleSet(head, small.robot)

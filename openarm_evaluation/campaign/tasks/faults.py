@@ -166,7 +166,7 @@ def _arm_in_the_way(task: Task, rng: np.random.Generator) -> Task:
     right = (0.14, 2.46, -1.17, 1.79, -0.3, -0.4, 0.71)
     posture: dict[str, float] = {}
     robot = RobotDescription.load()
-    for arm, q in (("right", right), ("left", robot.mirrored(right).tolist())):
+    for arm, q in zip(reversed(robot.arm_names), (right, robot.mirrored(right).tolist()), strict=True):
         posture |= dict(zip(robot.arm_joints(arm), q, strict=True))
     return replace(task, posture=posture)
 

@@ -166,7 +166,9 @@ async def _run(
 
                 def all_rounds() -> None:
                     began = time.monotonic()
-                    schedule = itertools.islice(rounds(report.seed, kinds, list(graph.nodes)), most)
+                    schedule = itertools.islice(
+                        rounds(report.seed, kinds, list(graph.nodes), RobotDescription.load().arm_names), most
+                    )
                     for one in schedule:
                         if work.ended.is_set() or time.monotonic() - began > seconds:
                             break
