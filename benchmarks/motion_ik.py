@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inverse kinematics compared with peers: pinocchio's kinematics with the loop in Python, ikpy and mink. rad, m."""
+"""Inverse kinematics compared with peers: pinocchio's kinematics with the loop in Python, ikpy and mink. rad, m.
+
+Targets are tool poses of random configurations within the limits: uniform ones, and such with each joint, at a
+probability of 1/3, within 0.02 rad of a limit. A UR5 and a Panda are measured where example-robot-data is installed.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.metadata
 import tempfile
 import time
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +25,8 @@ from benchmarks.report import Row
 from openarm_common.robot.description import RobotDescription
 from openarm_common.scene.scene import Scene, Table
 from openarm_common.types import Array
+from openarm_motion.kinematics.chain import ArmKinematics
+from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_motion.planning.arm import Arm
 from openarm_sim_bridge.world.model import compile_model
 
@@ -26,33 +34,95 @@ from openarm_sim_bridge.world.model import compile_model
 TOLERANCE = (1e-4, 1e-3)
 #: Seed of the poses.
 _SEED = 60_000
+#: Probability of a joint to be near a limit, and how near, rad.
+_NEAR = (1.0 / 3.0, 0.02)
+#: Files of other robots in example-robot-data, and their tool links.
+_OTHERS = {
+    "ur5": ("robots/ur_description/urdf/ur5_robot.urdf", "tool0"),
+    "panda": ("robots/panda_description/urdf/panda_collision.urdf", "panda_hand_tcp"),
+}
+#: Target of the 95th percentile, ms, by method.
+_P95 = {"closed form": 0.2, "numeric": 1.0}
+
+
+@dataclass(frozen=True, eq=False)
+class IkArm:
+    """What inverse kinematics is measured on."""
+
+    description: RobotDescription
+    inverse: InverseKinematics
+
+    @property
+    def kinematics(self) -> ArmKinematics:
+        """The chain."""
+        return self.inverse.kinematics
+
+    def targets(self, count: int, *, at_limits: bool) -> Array:
+        """Tool poses (count, 4, 4) of random configurations within the limits."""
+        chain, rng = self.kinematics, np.random.default_rng(_SEED)
+        shape = (count, chain.n)
+        states = rng.uniform(chain.lower, chain.upper, shape)
+        if at_limits:
+            near, depth = rng.random(shape) < _NEAR[0], rng.uniform(0.0, _NEAR[1], shape)
+            limit = np.where(rng.random(shape) < 0.5, chain.lower + depth, chain.upper - depth)
+            states = np.where(near, limit, states)
+        return chain.fk_many(states)
 
 
 def ik_rows(arms: Mapping[str, Arm], count: int, peer_count: int) -> list[Row]:
-    """Reachable poses: tool poses of random configurations within the limits."""
-    times: list[float] = []
-    solved = 0
-    targets: dict[str, Array] = {}
-    for name, arm in arms.items():
-        chain = arm.kinematics
-        targets[name] = chain.fk_many(np.random.default_rng(_SEED).uniform(chain.lower, chain.upper, (count, chain.n)))
-        chain.ik(targets[name][0], tolerance=TOLERANCE)
-        for target in targets[name]:
-            begin = time.perf_counter()
-            result = chain.ik(target, tolerance=TOLERANCE)
-            times.append(time.perf_counter() - begin)
-            solved += reached(chain.fk(result.q), target) and chain.margin(result.q) >= -1e-9
+    """Rows of the arms together, each beside one peer, then of each arm, kind of pose, and kind of answer."""
+    ours = {name: IkArm(arm.description, arm.inverse) for name, arm in arms.items()}
+    targets = {name: arm.targets(count, at_limits=False) for name, arm in ours.items()}
+    solved, times = _measure(ours, targets, _one, count)
     n, rows = len(times), []
-    share, p95 = 100.0 * solved / n, float(np.percentile(times, 95)) * 1e3
     for key, label, make, most in (
         ("", "pinocchio in Python, 20 restarts", PinocchioIk, peer_count),
         ("_ikpy", "ikpy", IkpyIk, max(peer_count // 5, 5)),
         ("_mink", "mink (daqp), 60 iterations", MinkIk, max(peer_count // 2, 5)),
     ):
-        found = _measure(arms, targets, make, most)
-        rows.append(Row(f"ik_success{key}", share, "%", "higher", 99.9, label + found[0], found[1], n))
-        rows.append(Row(f"ik_p95{key}_ms", p95, "ms", "lower", 0.2, label + found[0], found[2], n))
+        remark, peer_share, peer_p95 = _peer(ours, targets, make, most)
+        p95 = float(np.percentile(times, 95))
+        rows.append(Row(f"ik_success{key}", solved, "%", "higher", 99.9, label + remark, peer_share, n))
+        rows.append(Row(f"ik_p95{key}_ms", p95, "ms", "lower", 0.2, label + remark, peer_p95, n))
+    for name, arm in {**ours, **_others()}.items():
+        for kind in ("uniform", "limits"):
+            poses = arm.targets(count, at_limits=kind == "limits")
+            rows += _rows_of(f"ik_{name}_{kind}", arm, poses, peer_count)
     return rows
+
+
+def _rows_of(metric: str, arm: IkArm, poses: Array, peer_count: int) -> list[Row]:
+    """One configuration near the middle of the limits, beside pinocchio; then all that planning is given as goals."""
+    at, label = {"": poses}, "pinocchio in Python, 20 restarts"
+    solved, times = _measure({"": arm}, at, _one, len(poses))
+    peer_solved, peer_times = _measure({"": arm}, at, PinocchioIk, peer_count)
+    label += f", n={len(peer_times)}"
+    p50, p95 = (float(np.percentile(times, p)) for p in (50, 95))
+    peer_p50, peer_p95 = (float(np.percentile(peer_times, p)) for p in (50, 95))
+    most, n = _P95[arm.inverse.method.split(" (")[0]], len(times)
+    all_solved, all_times = _measure({"": arm}, at, _goals, len(poses))
+    return [
+        Row(f"{metric}_success", solved, "%", "higher", 99.9, label, peer_solved, n),
+        Row(f"{metric}_median_ms", p50, "ms", "lower", None, label, peer_p50, n),
+        Row(f"{metric}_p95_ms", p95, "ms", "lower", most, label, peer_p95, n),
+        Row(f"{metric}_goals_success", all_solved, "%", "higher", 99.9, n=n),
+        Row(f"{metric}_goals_median_ms", float(np.percentile(all_times, 50)), "ms", "lower", None, n=n),
+        Row(f"{metric}_goals_p95_ms", float(np.percentile(all_times, 95)), "ms", "lower", None, n=n),
+    ]
+
+
+def _others() -> dict[str, IkArm]:
+    """The arms of example-robot-data; none when it is not installed."""
+    try:
+        package = importlib.metadata.distribution("example-robot-data")
+    except importlib.metadata.PackageNotFoundError:
+        return {}
+    folder = Path(str(package.locate_file("cmeel.prefix/share/example-robot-data")))
+    out: dict[str, IkArm] = {}
+    for name, (path, tool) in _OTHERS.items():
+        description = RobotDescription.from_urdf((folder / path).read_text(encoding="utf-8"))
+        out[name] = IkArm(description, InverseKinematics(ArmKinematics(description, tool)))
+    return out
 
 
 def reached(pose: Array, target: Array) -> bool:
@@ -62,37 +132,72 @@ def reached(pose: Array, target: Array) -> bool:
     return near and float(np.linalg.norm(away)) <= TOLERANCE[1]
 
 
+def _one(arm: IkArm) -> Callable[[Array], list[Array]]:
+    """What solves one configuration as `/motion/compute_ik` does, from the middle of the limits."""
+
+    def solve(target: Array) -> list[Array]:
+        return [arm.inverse.nearest(target).q]
+
+    return solve
+
+
+def _goals(arm: IkArm) -> Callable[[Array], list[Array]]:
+    """What finds the goals of a plan to a pose."""
+
+    def solve(target: Array) -> list[Array]:
+        return [solution.q for solution in arm.inverse.solutions(target)]
+
+    return solve
+
+
 def _measure(
-    arms: Mapping[str, Arm], targets: Mapping[str, Array], make: Callable[[Arm], Any], count: int
-) -> tuple[str, float | None, float | None]:
-    """A remark, the share solved (%) and the 95th percentile (ms); none of a peer that is not installed."""
+    arms: Mapping[str, IkArm],
+    targets: Mapping[str, Array],
+    make: Callable[[IkArm], Callable[[Array], list[Array]]],
+    count: int,
+) -> tuple[float, list[float]]:
+    """The share solved (%), every configuration within limits and tolerance, and the times, ms."""
     times: list[float] = []
     solved = 0
     for name, arm in arms.items():
-        try:
-            peer = make(arm)
-        except ModuleNotFoundError as error:
-            return f": {error.name} is not installed", None, None
+        solve = make(arm)
+        solve(targets[name][0])
         for target in targets[name][:count]:
             begin = time.perf_counter()
-            q = peer.solve(target)
-            times.append(time.perf_counter() - begin)
-            solved += reached(arm.kinematics.fk(q), target) and arm.kinematics.margin(q) >= -1e-6
-    return f", n={len(times)}", 100.0 * solved / len(times), float(np.percentile(times, 95)) * 1e3
+            found = solve(target)
+            times.append((time.perf_counter() - begin) * 1e3)
+            solved += bool(found) and all(
+                reached(arm.kinematics.fk(q), target) and arm.kinematics.margin(q) >= -1e-6 for q in found
+            )
+    return 100.0 * solved / len(times), times
+
+
+def _peer(
+    arms: Mapping[str, IkArm],
+    targets: Mapping[str, Array],
+    make: Callable[[IkArm], Callable[[Array], list[Array]]],
+    count: int,
+) -> tuple[str, float | None, float | None]:
+    """A remark, the share solved (%) and the 95th percentile (ms); none of a peer that is not installed."""
+    try:
+        share, times = _measure(arms, targets, make, count)
+    except ModuleNotFoundError as error:
+        return f": {error.name} is not installed", None, None
+    return f", n={len(times)}", share, float(np.percentile(times, 95))
 
 
 class PinocchioIk:
     """Damped least squares with pinocchio's kinematics, the loop in Python."""
 
-    def __init__(self, arm: Arm) -> None:
+    def __init__(self, arm: IkArm) -> None:
         full = pin.buildModelFromXML(arm.description.urdf)
-        others = [i for i, name in enumerate(full.names) if i > 0 and name not in arm.names]
+        others = [i for i, name in enumerate(full.names) if i > 0 and name not in arm.kinematics.names]
         self._model = pin.buildReducedModel(full, others, pin.neutral(full))
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(arm.kinematics.tool_link)
         self._rng = np.random.default_rng(0)
 
-    def solve(self, target: Array, restarts: int = 20, iterations: int = 100) -> Array:
+    def __call__(self, target: Array, restarts: int = 20, iterations: int = 100) -> list[Array]:
         """The best configuration found."""
         model, data = self._model, self._data
         lower, upper = model.lowerPositionLimit, model.upperPositionLimit
@@ -103,18 +208,18 @@ class PinocchioIk:
                 here = pin.updateFramePlacement(model, data, self._frame)
                 error = pin.log6(here.actInv(goal)).vector
                 if reached(here.homogeneous, target):
-                    return q
+                    return [q]
                 J = pin.getFrameJacobian(model, data, self._frame, pin.LOCAL)
                 step = J.T @ np.linalg.solve(J @ J.T + (0.5 * error @ error + 1e-6) * np.eye(6), error)
                 q = np.clip(q + np.clip(step, -0.6, 0.6), lower, upper)
             q = self._rng.uniform(lower, upper)
-        return q
+        return [q]
 
 
 class IkpyIk:
     """ikpy's own optimisation over the chain from the root to the tool."""
 
-    def __init__(self, arm: Arm) -> None:
+    def __init__(self, arm: IkArm) -> None:
         chains: Any = importlib.import_module("ikpy.chain")
         elements = [arm.description.root]
         for joint in arm.description.chain(arm.kinematics.tool_link):
@@ -125,34 +230,34 @@ class IkpyIk:
             path.write_text(arm.description.urdf, encoding="utf-8")
             self._chain = chains.Chain.from_urdf_file(str(path), base_elements=elements)
         links = self._chain.links
-        self._columns = [i for i, link in enumerate(links) if link.name in arm.names]
+        self._columns = [i for i, link in enumerate(links) if link.name in arm.kinematics.names]
         self._chain.active_links_mask[:] = [i in self._columns for i in range(len(links))]
         middle = 0.5 * (arm.kinematics.lower + arm.kinematics.upper)
         self._start = np.zeros(len(links))
         self._start[self._columns] = middle
 
-    def solve(self, target: Array) -> Array:
+    def __call__(self, target: Array) -> list[Array]:
         """What it finds from the middle of the limits."""
         found = self._chain.inverse_kinematics_frame(target, initial_position=self._start, orientation_mode="all")
-        return np.asarray(found)[self._columns]
+        return [np.asarray(found)[self._columns]]
 
 
 class MinkIk:
     """mink's differential inverse kinematics on the MuJoCo model, from the middle of the limits."""
 
-    def __init__(self, arm: Arm) -> None:
+    def __init__(self, arm: IkArm) -> None:
         self._mink: Any = importlib.import_module("mink")
         importlib.import_module("daqp")
         model = compile_model(RobotDescription.load(), Scene(name="bench", table=Table(), objects=()), {})
-        self._columns = [int(model.joint(name).qposadr[0]) for name in arm.names]
-        self._dofs = [int(model.joint(name).dofadr[0]) for name in arm.names]
+        self._columns = [int(model.joint(name).qposadr[0]) for name in arm.kinematics.names]
+        self._dofs = [int(model.joint(name).dofadr[0]) for name in arm.kinematics.names]
         self._configuration = self._mink.Configuration(model)
         self._task = self._mink.FrameTask(arm.kinematics.tool_link, "body", position_cost=1.0, orientation_cost=0.2)
         self._limits = [self._mink.ConfigurationLimit(model)]
         self._middle = 0.5 * (arm.kinematics.lower + arm.kinematics.upper)
         self._rest = np.zeros(model.nq)
 
-    def solve(self, target: Array, iterations: int = 60) -> Array:
+    def __call__(self, target: Array, iterations: int = 60) -> list[Array]:
         """Where it is after so many steps, or when it is there."""
         q = self._rest.copy()
         q[self._columns] = self._middle
@@ -166,4 +271,4 @@ class MinkIk:
             still = np.zeros_like(speed)
             still[self._dofs] = speed[self._dofs]
             self._configuration.integrate_inplace(still, 1.0)
-        return np.array(self._configuration.q[self._columns])
+        return [np.array(self._configuration.q[self._columns])]

@@ -57,7 +57,7 @@ class PlanningConfig(Config):
         description="corners of free paths: rounded where that is proven free, with a stop, or quintic with a stop",
     )
     joint_margin: float = Field(
-        default=0.05, ge=0.0, le=0.5, description="kept from joint limits at goals and on lines, rad"
+        default=0.05, ge=0.0, le=0.5, description="kept from joint limits on lines, and at poses that allow it, rad"
     )
     swivels: int = Field(default=48, ge=4, le=720, description="elbow angles tried a turn")
     time_limit: float = Field(default=5.0, gt=0.0, le=120.0, description="of a search, s of wall clock")

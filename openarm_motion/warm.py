@@ -30,7 +30,9 @@ def warm() -> None:
     inverse.position_solutions(pose, near=q)
     inverse.solutions(pose, near=q)
     away = pose.copy()
-    away[2, 3] += 0.01
+    away[2, 3] += 9.0
+    inverse.solutions(away)  # what is out of reach has kernels of its own
+    away[2, 3] = pose[2, 3] + 0.01
     scene = CollisionScene(CollisionRobot(description, kinematics), CollisionContext(home))
     warm_search(FastScene([scene]), q)
     OccupancyMap(np.zeros((1, 3), np.int64), Lattice(0.02, (KEY_ZERO, KEY_ZERO, KEY_ZERO), (4, 4, 4)), 1).distances  # noqa: B018

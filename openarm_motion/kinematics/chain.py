@@ -40,6 +40,19 @@ class IkResult:
     position_error: float
     orientation_error: float
 
+    @property
+    def cost(self) -> float:
+        """Both errors as one, m²."""
+        return self.position_error**2 + (kernels.ROTATION_LENGTH * self.orientation_error) ** 2
+
+    def away(self, *, position_only: bool) -> str:
+        """How far from the target, with as many digits as it takes: what is not zero never reads so."""
+        turn = math.degrees(self.orientation_error)
+        parts = [] if position_only or turn < 1e-3 else [f"{digits(turn)}°"]
+        if self.position_error > 1e-6 or not parts:
+            parts.insert(0, f"{digits(self.position_error * 1e3)} mm")
+        return " and ".join(parts)
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -138,6 +151,14 @@ class ArmKinematics:
             f" (limits less a margin of {margin:g})" if margin else ""
         )
 
+    def closest(self, q: ArrayLike) -> str:
+        """Sentence about the joint that is nearest to one of its limits."""
+        values = np.asarray(q, dtype=np.float64)
+        room = np.minimum(values - self.lower, self.upper - values)
+        i = int(np.argmin(room))
+        limit = self.lower[i] if values[i] - self.lower[i] < self.upper[i] - values[i] else self.upper[i]
+        return f"{self.names[i]} would be at {values[i]:.3f} rad, {room[i]:.3f} rad from its limit {limit:.3f}"
+
     def ik(
         self,
         target: Array,
@@ -146,7 +167,7 @@ class ArmKinematics:
         position_only: bool = False,
         margin: float = 0.0,
         tolerance: tuple[float, float] = (1e-5, 1e-4),
-        restarts: int = 60,
+        restarts: int = 200,
     ) -> IkResult:
         """Solve for a tool pose; never raises for one that is out of reach but returns the nearest found.
 
@@ -156,7 +177,7 @@ class ArmKinematics:
             position_only: The orientation of the target is ignored.
             margin: Kept from every joint limit, rad.
             tolerance: Position (m) and orientation (rad).
-            restarts: Random guesses after the first, the same each time.
+            restarts: Random guesses after the first, the same each time; every other one near the limits.
         """
         middle = 0.5 * (self.lower + self.upper)
         first = middle if seed is None else np.asarray(seed, dtype=np.float64)
@@ -238,3 +259,8 @@ class ArmLinks:
 def _after(joints: Sequence[Joint], name: str) -> list[Joint]:
     """The joints of a chain that come after that of a name."""
     return list(itertools.dropwhile(lambda joint: joint.name != name, joints))[1:]
+
+
+def digits(value: float) -> str:
+    """A figure that only reads 0 when it is: whole from 1 on, else with two digits."""
+    return f"{value:.0f}" if value >= 1.0 else f"{value:.2g}"

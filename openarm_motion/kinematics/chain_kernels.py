@@ -24,7 +24,7 @@ _MAX_STEP = 0.6
 _ITERATIONS = 100
 _PULL = 0.05
 #: An attempt is given up after this many iterations that hardly improve.
-_STALL = 8
+_STALL = 5
 
 
 @njit(cache=True, nogil=True)
@@ -158,6 +158,16 @@ def _solve_spd(h: Array, g: Array, x: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _draw(lower: Array, upper: Array, at_limits: bool, x: Array) -> None:
+    """Draw a guess, uniform within the limits; `at_limits` puts about two joints of three on one of theirs."""
+    for i in range(x.shape[0]):
+        u = np.random.random()
+        if at_limits:
+            u = min(1.0, max(0.0, 3.0 * u - 1.0))
+        x[i] = lower[i] + (upper[i] - lower[i]) * u
+
+
+@njit(cache=True, nogil=True)
 def solve_ik(
     target: Array,
     start: Array,
@@ -193,7 +203,6 @@ def solve_ik(
         Solved, position error (m) and rotation error (rad) of `best`.
     """
     n = start.shape[0]
-    np.random.seed(0)
     x = np.empty(n)
     pose = np.empty((4, 4))
     origins = np.empty((n, 3))
@@ -209,7 +218,11 @@ def solve_ik(
     for i in range(n):
         x[i] = min(upper[i], max(lower[i], start[i]))
         best[i] = x[i]
-    for _ in range(restarts + 1):
+    for attempt in range(restarts + 1):
+        if attempt == 1:
+            np.random.seed(0)
+        if attempt > 0:
+            _draw(lower, upper, attempt % 2 == 0, x)
         least, stall = np.inf, 0
         for _ in range(_ITERATIONS):
             forward(x, placements, axes, prismatic, tip, origins, directions, pose)
@@ -217,11 +230,12 @@ def solve_ik(
             error_p = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
             error_r = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
             cost = error_p * error_p + w * w * error_r * error_r
-            if cost < best_cost:
+            solved = error_p < tolerance[0] and (position_only or error_r < tolerance[1])
+            if solved or cost < best_cost:
                 best_cost, best_p, best_r = cost, error_p, error_r
                 for i in range(n):
                     best[i] = x[i]
-            if error_p < tolerance[0] and (position_only or error_r < tolerance[1]):
+            if solved:
                 return True, error_p, error_r
             if cost < 0.98 * least:
                 least, stall = cost, 0
@@ -235,7 +249,7 @@ def solve_ik(
                 for i in range(n):
                     jac[row, i] *= w
             damping = 0.5 * cost + 1e-7
-            pull = _PULL * cost
+            pull = _PULL * cost if attempt == 0 else 0.0
             for i in range(n):
                 s = pull * (start[i] - x[i])
                 for row in range(6):
@@ -260,6 +274,4 @@ def solve_ik(
             scale = _MAX_STEP / largest if largest > _MAX_STEP else 1.0
             for i in range(n):
                 x[i] = min(upper[i], max(lower[i], x[i] + scale * dx[i]))
-        for i in range(n):
-            x[i] = lower[i] + (upper[i] - lower[i]) * np.random.random()
     return False, best_p, best_r

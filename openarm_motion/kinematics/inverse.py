@@ -7,7 +7,7 @@ The rest of the package asks only here, so an arm of any build behaves the same,
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,18 @@ from openarm_motion.kinematics.srs import SrsArm, SrsMiss
 
 #: Numeric solutions nearer to each other than this in every joint count as one.
 _SAME = 0.05
+#: Guesses for several solutions of a numeric arm; random ones of a pose that the closed form finds nothing for.
 _GUESSES = 24
+_RESTARTS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """What was found at a pose; where nothing was, the nearest that is within the limits, and what is in the way."""
+
+    found: list[Solution]
+    nearest: IkResult | None = None
+    miss: SrsMiss | None = None
 
 
 class InverseKinematics:
@@ -48,22 +59,29 @@ class InverseKinematics:
             margin: Kept from the limits, rad.
             near: (n,) A first guess where solving is numeric, and one more swivel angle to try where it is not.
         """
-        if self._closed is not None:
-            swivels = self._swivels
-            if near is not None:
-                swivels = np.concatenate([[self._closed.classify(near).swivel], swivels])
-            return self._closed.sweep(pose, swivels, margin)[0]
-        return self._numeric(pose, margin, near, position_only=False)
+        return self._search(pose, margin, near).found
 
     def position_solutions(self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None) -> list[Solution]:
         """Configurations whose tool origin is at the position of `pose`, in whatever orientation."""
-        return [self.classify(s.q) for s in self._numeric(pose, margin, near, position_only=True)]
+        return self._search(pose, margin, near, position_only=True).found
 
     def nearest(
         self, pose: Array, seed: ArrayLike | None = None, *, position_only: bool = False, margin: float = 0.0
     ) -> IkResult:
-        """Numeric solution from one guess: near to it when there is one, and the nearest pose when there is none."""
-        return self.kinematics.ik(pose, seed, position_only=position_only, margin=margin)
+        """One solution: near to the seed when there is one, and the nearest pose when there is none."""
+        arm = self.kinematics
+        if self._closed is None or position_only:
+            first = arm.ik(pose, seed, position_only=position_only, margin=margin)
+            found = [] if first.success else self._several(pose, margin, seed, position_only=position_only)
+        else:
+            first = arm.ik(pose, seed, margin=margin, restarts=0)
+            search = _Search([]) if first.success else self._closed_form(self._closed, pose, margin, seed)
+            first, found = search.nearest or first, search.found
+        if first.success or not found:
+            return first
+        here = 0.5 * (arm.lower + arm.upper) if seed is None else np.asarray(seed, dtype=np.float64)
+        best = min(found, key=lambda solution: float(np.max(np.abs(solution.q - here))))
+        return arm.ik(pose, best.q, position_only=position_only, margin=margin, restarts=0)
 
     def classify(self, q: ArrayLike) -> Solution:
         """Swivel angle and branch of a configuration."""
@@ -73,14 +91,19 @@ class InverseKinematics:
     def why_not(
         self, pose: Array, margin: float = 0.0, near: ArrayLike | None = None, *, position_only: bool = False
     ) -> str:
-        """Sentences about why a pose has no configuration: what binds, and what `nearest` finds with that guess."""
+        """Sentences about why a pose has no configuration: the margin, or what binds, and the nearest pose."""
+        search = self._search(pose, 0.0, near, position_only=position_only)
+        if search.found:
+            best = max(search.found, key=lambda solution: self.kinematics.margin(solution.q))
+            return f"only nearer to a joint limit than the margin of {margin:g} rad: {self.kinematics.closest(best.q)}"
         reasons: list[str] = []
-        if self._closed is not None and not position_only:
-            reasons.append(self._binding(self._closed.sweep(pose, self._swivels, margin)[1], self._closed, margin))
-        best = self.nearest(pose, near, position_only=position_only, margin=margin)
-        p = ", ".join(f"{x:.3f}" for x in self.kinematics.fk(best.q)[:3, 3])
-        turn = "" if position_only else f" and {math.degrees(best.orientation_error):.0f}°"
-        reasons.append(f"the nearest reachable pose is {best.position_error * 1e3:.0f} mm{turn} away, at ({p}) m")
+        if self._closed is not None and search.miss is not None:
+            reasons.append(self._binding(search.miss, self._closed))
+        if search.nearest is not None:
+            p = ", ".join(f"{x:.3f}" for x in self.kinematics.fk(search.nearest.q)[:3, 3])
+            reasons.append(
+                f"the nearest reachable pose is {search.nearest.away(position_only=position_only)} away, at ({p}) m"
+            )
         return "; ".join(reason for reason in reasons if reason)
 
     def follow(
@@ -107,7 +130,7 @@ class InverseKinematics:
             result = self.kinematics.ik(pose, q, margin=margin, restarts=0)
             path[k] = result.q
             if not result.success:
-                return path, k, f"no configuration on this branch: {result.position_error * 1e3:.1f} mm off the line"
+                return path, k, f"no configuration on this branch: {result.away(position_only=False)} off the line"
             step = np.abs(result.q - q)
             if k > 0 and float(step.max()) > max_step:
                 name = self.kinematics.names[int(step.argmax())]
@@ -115,7 +138,38 @@ class InverseKinematics:
             q = result.q
         return path, poses.shape[0], ""
 
-    def _numeric(self, pose: Array, margin: float, near: ArrayLike | None, *, position_only: bool) -> list[Solution]:
+    def _search(self, pose: Array, margin: float, near: ArrayLike | None, *, position_only: bool = False) -> _Search:
+        if self._closed is not None and not position_only:
+            return self._closed_form(self._closed, pose, margin, near)
+        search = self._numeric(pose, margin, near, position_only=position_only)
+        return replace(search, found=[self.classify(solution.q) for solution in search.found])
+
+    def _closed_form(self, closed: SrsArm, pose: Array, margin: float, near: ArrayLike | None) -> _Search:
+        """Closed form; where it finds nothing, numeric from what comes nearest: within the tolerance there may be more.
+
+        A singular pose, or one rounded at a joint limit, has a configuration that only an inexact solver finds.
+        """
+        swivels = self._swivels if near is None else np.concatenate([[closed.swivel(near)], self._swivels])
+        found = closed.sweep(pose, swivels, margin)
+        if found:
+            return _Search(found)
+        miss = closed.miss(pose, swivels, margin)
+        arm = self.kinematics
+        results = [arm.ik(pose, guess, margin=margin, restarts=0) for guess in miss.nearest]
+        if not any(result.success for result in results):
+            results.append(arm.ik(pose, near, margin=margin, restarts=_RESTARTS))
+        best = min(results, key=lambda result: result.cost)
+        return _Search([closed.classify(result.q) for result in results if result.success], best, miss)
+
+    def _numeric(self, pose: Array, margin: float, near: ArrayLike | None, *, position_only: bool) -> _Search:
+        found = self._several(pose, margin, near, position_only=position_only)
+        if found:
+            return _Search(found)
+        result = self.kinematics.ik(pose, near, position_only=position_only, margin=margin)
+        return _Search([Solution(result.q)] if result.success else [], result)
+
+    def _several(self, pose: Array, margin: float, near: ArrayLike | None, *, position_only: bool) -> list[Solution]:
+        """What a few guesses lead to, each once."""
         rng = np.random.default_rng(0)
         arm = self.kinematics
         seeds = [] if near is None else [np.asarray(near, dtype=np.float64)]
@@ -125,12 +179,10 @@ class InverseKinematics:
             result = arm.ik(pose, seed, position_only=position_only, margin=margin, restarts=0)
             if result.success and all(float(np.max(np.abs(result.q - s.q))) > _SAME for s in found):
                 found.append(Solution(result.q))
-        if not found:
-            result = arm.ik(pose, near, position_only=position_only, margin=margin)
-            found = [Solution(result.q)] if result.success else []
         return found
 
-    def _binding(self, miss: SrsMiss, closed: SrsArm, margin: float) -> str:
+    def _binding(self, miss: SrsMiss, closed: SrsArm) -> str:
         if miss.too_far:
             return closed.distance_text(miss.too_far)
-        return "at best " + self.kinematics.outside(miss.nearest, margin) if miss.excess > -margin else ""
+        excess = self.kinematics.outside(miss.nearest[0])
+        return f"at best {excess}" if excess else ""

@@ -15,12 +15,14 @@ from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.kinematics import srs_kernels
-from openarm_motion.kinematics.chain import ArmKinematics, Solution
+from openarm_motion.kinematics import srs_intervals, srs_kernels
+from openarm_motion.kinematics.chain import ArmKinematics, Solution, digits
 
 #: How far the axes may miss each other: a rounded rpy in the URDF costs 4e-6 m.
 _MEET = 2e-5
 _PERPENDICULAR = 1e-4
+#: A wrist out of reach by less is brought into reach for a first guess, m.
+_NEAR_REACH = 1e-3
 
 
 @dataclass(frozen=True)
@@ -29,12 +31,11 @@ class SrsMiss:
 
     Attributes:
         too_far: How much further than the arm reaches the wrist would be, m; negative: how much too near; else 0.
-        excess: How far outside its limit the joint that binds would be, when the distance is not the reason, rad.
-        nearest: (7,) that configuration; empty when the distance is the reason.
+        nearest: (k, 7) of each branch the configuration that exceeds its limits the least, the best first; at the
+            nearest pose within reach where the distance is the reason, and empty when that is far away.
     """
 
     too_far: float
-    excess: float
     nearest: Array
 
 
@@ -65,18 +66,34 @@ class SrsArm:
         status = srs_kernels.solve(_c(pose), swivel, branch, self._geometry, self._tool, self._lower, self._upper, q)
         return q if status == 0 else None
 
-    def sweep(self, pose: Array, swivels: Array, margin: float = 0.0) -> tuple[list[Solution], SrsMiss]:
-        """All configurations at `swivels` (k,) within the limits less `margin`, and what is in the way when none is."""
-        rows = srs_kernels.BRANCHES * swivels.size
+    def sweep(self, pose: Array, swivels: Array, margin: float = 0.0) -> list[Solution]:
+        """Configurations within the limits less `margin`: all at `swivels` (k,), and one in each interval between."""
+        rows = srs_kernels.BRANCHES * (swivels.size + srs_intervals.MOST)
         found, at, branch = np.empty((rows, 7)), np.empty(rows), np.empty(rows, dtype=np.int64)
-        nearest = np.empty(7)
-        count, status, excess = srs_kernels.sweep(
-            _c(pose), swivels, self._geometry, self._tool, self._lower, self._upper, margin, found, at, branch, nearest
-        )
-        solutions = [Solution(found[i].copy(), float(at[i]), int(branch[i])) for i in range(count)]
+        lower, upper = self._lower + margin, self._upper - margin
+        count, _ = srs_intervals.sweep(_c(pose), swivels, self._geometry, self._tool, lower, upper, found, at, branch)
+        if count:
+            return [Solution(*of) for of in zip(found[:count].copy(), at.tolist(), branch.tolist(), strict=False)]
+        # what is left are intervals that are points
+        best, at, least, status = self._nearest(pose, swivels, margin)
         if status:
-            return solutions, SrsMiss(self._distance_excess(pose), 0.0, np.empty(0))
-        return solutions, SrsMiss(0.0, float(excess), nearest)
+            return []
+        kept = np.flatnonzero(least <= srs_intervals.ROUNDING)
+        return [Solution(np.clip(best[i], lower, upper), float(at[i]), int(i)) for i in kept]
+
+    def miss(self, pose: Array, swivels: Array, margin: float = 0.0) -> SrsMiss:
+        """What is in the way of a pose that `sweep` finds nothing for."""
+        best, _, least, status = self._nearest(pose, swivels, margin)
+        excess = 0.0
+        if status:
+            excess, outwards = self._distance_excess(pose)
+            if abs(excess) > _NEAR_REACH:
+                return SrsMiss(excess, np.empty((0, 7)))
+            brought = pose.copy()
+            brought[:3, 3] -= (excess + np.copysign(1e-9, excess)) * outwards
+            best, _, least, _ = self._nearest(brought, swivels, margin)
+        order = np.argsort(least)
+        return SrsMiss(excess, best[order[np.isfinite(least[order])]])
 
     def follow(
         self, poses: Array, swivels: Array, branch: int, margin: float, max_step: float
@@ -100,7 +117,7 @@ class SrsArm:
         )
         why = ""
         if status in (srs_kernels.TOO_FAR, srs_kernels.TOO_NEAR):
-            why = self.distance_text(self._distance_excess(poses[index]))
+            why = self.distance_text(self._distance_excess(poses[index])[0])
         elif status == srs_kernels.LIMIT:
             why = self.kinematics.outside(path[index], margin)
         elif status == srs_kernels.JUMP:
@@ -108,10 +125,14 @@ class SrsArm:
             why = f"{self.kinematics.names[joint]} would jump by {step:.2f} rad between neighbouring points"
         return path, int(index), why
 
+    def swivel(self, q: ArrayLike) -> float:
+        """Swivel angle of a configuration (7,), rad."""
+        return float(srs_kernels.swivel_of(_c(q), self._geometry))
+
     def classify(self, q: ArrayLike) -> Solution:
         """Swivel angle and branch of a configuration."""
         values = np.ascontiguousarray(q, dtype=np.float64)
-        swivel = float(srs_kernels.swivel_of(values, self._geometry))
+        swivel = self.swivel(values)
         pose = self.kinematics.fk(values)
         best, least = 0, np.inf
         for branch in range(srs_kernels.BRANCHES):
@@ -129,22 +150,31 @@ class SrsArm:
         if excess >= 0.0:
             return (
                 f"the wrist would be {longest + excess:.3f} m from the shoulder, the arm reaches {longest:.3f} m"
-                f" ({excess * 1e3:.0f} mm short)"
+                f" ({digits(excess * 1e3)} mm short)"
             )
         return (
             f"the wrist would be {shortest + excess:.3f} m from the shoulder, the arm folds to {shortest:.3f} m"
-            f" ({-excess * 1e3:.0f} mm too near)"
+            f" ({digits(-excess * 1e3)} mm too near)"
         )
 
     def _reach(self) -> tuple[float, float]:
         upper, fore = (float(np.linalg.norm(self._geometry[i])) for i in (8, 9))
         return upper + fore, abs(upper - fore)
 
-    def _distance_excess(self, pose: Array) -> float:
-        wrist = pose[:3, 3] - pose[:3, :3] @ self._tool.T @ self._geometry[10]
-        distance = float(np.linalg.norm(wrist - self._geometry[7]))
+    def _nearest(self, pose: Array, swivels: Array, margin: float) -> tuple[Array, Array, Array, int]:
+        """What `srs_intervals.nearest` fills and returns."""
+        best, at, least = np.empty((8, 7)), np.empty(8), np.empty(8)
+        lower, upper = self._lower + margin, self._upper - margin
+        status = srs_intervals.nearest(_c(pose), swivels, self._geometry, self._tool, lower, upper, best, at, least)
+        return best, at, least, int(status)
+
+    def _distance_excess(self, pose: Array) -> tuple[float, Array]:
+        """How much too far (> 0) or too near (< 0) the wrist would be, m, and the direction (3,) out to it."""
+        out = pose[:3, 3] - pose[:3, :3] @ self._tool.T @ self._geometry[10] - self._geometry[7]
+        distance = float(np.linalg.norm(out))
         longest, shortest = self._reach()
-        return distance - longest if distance > shortest + 0.5 * (longest - shortest) else distance - shortest
+        nearer = longest if distance > 0.5 * (shortest + longest) else shortest
+        return distance - nearer, out / max(distance, 1e-12)
 
     def _verify(self) -> None:
         """Solve a few poses and compare with forward kinematics: a wrong assumption must not pass as a wrong grasp."""
@@ -152,7 +182,7 @@ class SrsArm:
         for _ in range(8):
             q = rng.uniform(self._lower, self._upper)
             pose = self.kinematics.fk(q)
-            solution = self.solve(pose, float(srs_kernels.swivel_of(q, self._geometry)), self.classify(q).branch)
+            solution = self.solve(pose, self.swivel(q), self.classify(q).branch)
             error = np.inf if solution is None else float(np.max(np.abs(self.kinematics.fk(solution) - pose)))
             if error > 5.0 * _MEET:
                 raise OpenArmError(Code.INVALID_ARGUMENT, f"closed form misses forward kinematics by {error:.2g}")
@@ -206,5 +236,5 @@ def _not_srs(why: str) -> OpenArmError:
     return OpenArmError(Code.INVALID_ARGUMENT, f"not a spherical-revolute-spherical arm: {why}")
 
 
-def _c(values: Array) -> Array:
+def _c(values: ArrayLike) -> Array:
     return np.ascontiguousarray(values, dtype=np.float64)

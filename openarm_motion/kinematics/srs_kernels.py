@@ -24,7 +24,6 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from openarm_common.types import Array
 
@@ -62,38 +61,11 @@ def _turn(w: Array, angle: float, v: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _angle_about(w: Array, a: Array, b: Array) -> float:
-    """Angle that turns `a` to `b` about `w`, seen along `w`; 0 when either is parallel to it."""
-    wa, wb = _dot(w, a), _dot(w, b)
-    s = _dot(w, _cross(a, b))
-    c = _dot(a, b) - wa * wb
-    if s * s + c * c < 1e-20:
-        return 0.0
-    return math.atan2(s, c)
-
-
-@njit(cache=True, nogil=True)
 def _apply(r: Array, v: Array) -> Array:
     out = np.empty(3)
     for i in range(3):
         out[i] = r[i, 0] * v[0] + r[i, 1] * v[1] + r[i, 2] * v[2]
     return out
-
-
-@njit(cache=True, nogil=True)
-def _three_angles(r: Array, w1: Array, w2: Array, w3: Array, other: bool, out: Array) -> None:
-    """Angles of ``R = exp(w1 a) exp(w2 b) exp(w3 c)``, consecutive axes perpendicular; `other` picks the second b."""
-    v = _apply(r, w3)
-    target = _dot(w1, v)
-    p, q = _dot(w1, w3), _dot(w1, _cross(w2, w3))
-    size = math.sqrt(p * p + q * q)
-    half = math.acos(min(1.0, max(-1.0, target / size)))
-    b = math.atan2(q, p) + (half if other else -half)
-    a = _angle_about(w1, _turn(w2, b, w3), v)
-    # any vector perpendicular to w3 shows the last angle
-    x = _cross(w3, w1) if abs(p) < 0.9 else _cross(w3, w2)
-    y = _turn(w2, -b, _turn(w1, -a, _apply(r, x)))
-    out[0], out[1], out[2] = a, b, _angle_about(w3, x, y)
 
 
 @njit(cache=True, nogil=True)
@@ -118,12 +90,50 @@ def _swivel_frame(n: Array) -> tuple[Array, Array]:
 
 
 @njit(cache=True, nogil=True)
-def solve(
-    pose: Array, swivel: float, branch: int, geometry: Array, tool: Array, lower: Array, upper: Array, q: Array
-) -> int:
-    """Configuration `q` (7,) of one branch, whatever the limits; returns 0, TOO_FAR or TOO_NEAR.
+def _turning(u: Array, n: Array, x: Array, out: Array) -> None:
+    """Fill `out` (3,) with the c, a, b of ``u . exp(n s) x = c + a cos s + b sin s``."""
+    out[0] = _dot(u, n) * _dot(n, x)
+    out[1] = _dot(u, x) - out[0]
+    out[2] = _dot(u, _cross(n, x))
 
-    Each angle is given in the turn nearest to the middle of its limits.
+
+@njit(cache=True, nogil=True)
+def _turnings(n: Array, r: Array, w1: Array, w2: Array, w3: Array, out: Array) -> None:
+    """Fill `out` (9, 3) with the coefficients of all that the angles of three joints with ``R = exp(n s) r`` need."""
+    across, after = _cross(w1, w2), _cross(w2, w3)
+    second, third, normal = _apply(r, w2), _apply(r, w3), _apply(r, after)
+    _turning(w1, n, third, out[0])
+    _turning(w2, n, third, out[1])
+    _turning(across, n, third, out[2])
+    _turning(w1, n, second, out[3])
+    _turning(w1, n, normal, out[4])
+    _turning(w2, n, second, out[5])
+    _turning(across, n, second, out[6])
+    _turning(w2, n, normal, out[7])
+    _turning(across, n, normal, out[8])
+
+
+@njit(cache=True, nogil=True)
+def reduce_pose(
+    pose: Array, bent: bool, geometry: Array, tool: Array, lower: Array, upper: Array, turnings: Array
+) -> tuple[int, float]:
+    """Solve a pose for joint 4, and for what tells the other angles at a swivel angle s (Shimizu et al. 2008).
+
+    With axes w1, w2, w3 of shoulder or wrist and its rotation R, a row of `turnings` holds the c, a, b of
+    ``c + a cos s + b sin s``, which is: 0 to 2, w1, w2 and w1 x w2 times R w3; 3 and 4, w1 times R w2 and R (w2 x w3);
+    5 and 6, w2 and w1 x w2 times R w2; 7 and 8, the same times R (w2 x w3).
+
+    Args:
+        pose: (4, 4) of the tool.
+        bent: The elbow bends the other way.
+        geometry: See the module's head.
+        tool: See the module's head.
+        lower: (7,) joint limits.
+        upper: (7,) joint limits.
+        turnings: (2, 9, 3) output: of shoulder and wrist.
+
+    Returns:
+        0, TOO_FAR or TOO_NEAR; joint 4, whatever its limits.
     """
     m = np.empty((3, 3))
     for i in range(3):
@@ -140,16 +150,15 @@ def solve(
     size = math.sqrt(c * c + s * s)
     ratio = (nn - uu - ff) / (2.0 * size)
     if ratio > 1.0 + 1e-12:
-        return TOO_FAR
-    if ratio < -1.0:
-        return TOO_NEAR
-    half = math.acos(min(1.0, ratio))
-    q[3] = _into(math.atan2(s, c) + (-half if branch & 1 else half), lower[3], upper[3])
-    fore = _turn(w4, q[3], fore_arm)
-    v = upper_arm + fore
+        return TOO_FAR, 0.0
+    if ratio < -1.0 - 1e-12:
+        return TOO_NEAR, 0.0
+    half = math.acos(min(1.0, max(-1.0, ratio)))
+    q4 = _into(math.atan2(s, c) + (-half if bent else half), lower[3], upper[3])
+    v = upper_arm + _turn(w4, q4, fore_arm)
     length = math.sqrt(_dot(v, v))
     if length < 1e-9:
-        return TOO_NEAR
+        return TOO_NEAR, 0.0
     size = math.sqrt(nn)
     for i in range(3):
         v[i] /= length
@@ -157,36 +166,101 @@ def solve(
     side = _cross(w4, v)
     bend = _dot(upper_arm, side)
     if abs(bend) < 1e-9:  # a straight elbow bends where this branch would bend it
-        bend = -geometry[11, 0] if branch & 1 else geometry[11, 0]
-    down, across = _swivel_frame(n)
-    cs, sn = math.cos(swivel), math.sin(swivel)
-    elbow = np.empty(3)
-    for i in range(3):
-        elbow[i] = cs * down[i] + sn * across[i]
-        if bend < 0.0:
-            elbow[i] = -elbow[i]
-    # R123 takes (v, side, w4) to (n, elbow, n x elbow)
+        bend = -geometry[11, 0] if bent else geometry[11, 0]
+    elbow, _ = _swivel_frame(n)
+    if bend < 0.0:
+        elbow = -elbow
+    # at swivel 0 R123 takes (v, side, w4) to (n, elbow, n x elbow)
     normal = _cross(n, elbow)
-    r = np.empty((3, 3))
+    r, wrist, column = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for i in range(3):
         for j in range(3):
             r[i, j] = n[i] * v[j] + elbow[i] * side[j] + normal[i] * w4[j]
-    angles = np.empty(3)
-    _three_angles(r, geometry[0], geometry[1], geometry[2], (branch & 2) != 0, angles)
-    for i in range(3):
-        q[i] = _into(angles[i], lower[i], upper[i])
-    wrist = np.empty((3, 3))
     for j in range(3):
-        column = np.empty(3)
         for i in range(3):
             column[i] = r[0, i] * m[0, j] + r[1, i] * m[1, j] + r[2, i] * m[2, j]
-        column = _turn(w4, -q[3], column)
-        for i in range(3):
-            wrist[i, j] = column[i]
-    _three_angles(wrist, geometry[4], geometry[5], geometry[6], (branch & 4) != 0, angles)
-    for i in range(3):
-        q[4 + i] = _into(angles[i], lower[4 + i], upper[4 + i])
-    return 0
+        wrist[:, j] = _turn(w4, -q4, column)
+    _turnings(n, r, geometry[0], geometry[1], geometry[2], turnings[0])
+    # seen from the forearm the hand turns the other way about the same line
+    _turnings(-_turn(w4, -q4, v), wrist, geometry[4], geometry[5], geometry[6], turnings[1])
+    return 0, q4
+
+
+@njit(cache=True, nogil=True)
+def middle_zero(w1: Array, w2: Array, w3: Array) -> float:
+    """Angle of the middle joint of three at which the outer axes w1 and w3 are parallel, rad."""
+    return math.atan2(_dot(w1, _cross(w2, w3)), _dot(w1, w3))
+
+
+@njit(cache=True, nogil=True)
+def _at(row: Array, cs: float, sn: float) -> float:
+    return row[0] + row[1] * cs + row[2] * sn
+
+
+@njit(cache=True, nogil=True)
+def fold(
+    turnings: Array,
+    swivel: float,
+    first: int,
+    other: bool,
+    geometry: Array,
+    lower: Array,
+    upper: Array,
+    q: Array,
+) -> float:
+    """Fill three joints of `q` (7,) at a swivel angle: R is ``exp(w1 a) exp(w2 b) exp(w3 c)``, of which there are two.
+
+    Args:
+        turnings: (9, 3), see `reduce_pose`.
+        swivel: rad.
+        first: 0 for the shoulder, 4 for the wrist.
+        other: The middle joint is folded to the other side.
+        geometry: See the module's head.
+        lower: (7,) limits.
+        upper: (7,) limits.
+        q: Output; each angle in the turn nearest to the middle of its limits.
+
+    Returns:
+        How far the worst of the three is outside its limits, rad; negative inside.
+    """
+    cs, sn = math.cos(swivel), math.sin(swivel)
+    sign = 1.0 if other else -1.0
+    y, x = sign * _at(turnings[1], cs, sn), -sign * _at(turnings[2], cs, sn)
+    size = math.sqrt(x * x + y * y)
+    half = math.atan2(size, _at(turnings[0], cs, sn))
+    # a is free where the outer axes are parallel; c makes up for whatever it is
+    if size > 1e-14:
+        x, y = x / size, y / size
+    else:
+        x, y = 1.0, 0.0
+    q[first] = math.atan2(y, x)
+    q[first + 1] = middle_zero(geometry[first], geometry[first + 1], geometry[first + 2]) + sign * half
+    q[first + 2] = math.atan2(
+        x * _at(turnings[7], cs, sn) + y * _at(turnings[8], cs, sn),
+        x * _at(turnings[5], cs, sn) + y * _at(turnings[6], cs, sn),
+    )
+    worst = -np.inf
+    for i in range(first, first + 3):
+        q[i] = _into(q[i], lower[i], upper[i])
+        worst = max(worst, lower[i] - q[i], q[i] - upper[i])
+    return worst
+
+
+@njit(cache=True, nogil=True)
+def solve(
+    pose: Array, swivel: float, branch: int, geometry: Array, tool: Array, lower: Array, upper: Array, q: Array
+) -> int:
+    """Configuration `q` (7,) of one branch, whatever the limits; returns 0, TOO_FAR or TOO_NEAR.
+
+    Each angle is given in the turn nearest to the middle of its limits.
+    """
+    turnings = np.empty((2, 9, 3))
+    status, q4 = reduce_pose(pose, (branch & 1) != 0, geometry, tool, lower, upper, turnings)
+    if status == 0:
+        q[3] = q4
+        fold(turnings[0], swivel, 0, (branch & 2) != 0, geometry, lower, upper, q)
+        fold(turnings[1], swivel, 4, (branch & 4) != 0, geometry, lower, upper, q)
+    return status
 
 
 @njit(cache=True, nogil=True)
@@ -219,60 +293,6 @@ def _excess(q: Array, lower: Array, upper: Array) -> tuple[float, int]:
         if e > worst:
             worst, joint = e, i
     return worst, joint
-
-
-@njit(cache=True, nogil=True)
-def sweep(
-    pose: Array,
-    swivels: Array,
-    geometry: Array,
-    tool: Array,
-    lower: Array,
-    upper: Array,
-    margin: float,
-    found: Array,
-    found_swivel: Array,
-    found_branch: NDArray[np.int64],
-    nearest: Array,
-) -> tuple[int, int, float]:
-    """All branches at all swivel angles.
-
-    Args:
-        pose: (4, 4) of the tool.
-        swivels: (k,) rad.
-        geometry: See the module's head.
-        tool: See the module's head.
-        lower: (7,) joint limits.
-        upper: (7,) joint limits.
-        margin: Kept from the limits, rad.
-        found: (8 k, 7) output: configurations within the limits.
-        found_swivel: (8 k,) output.
-        found_branch: (8 k,) output.
-        nearest: (7,) output: the configuration that exceeds its limits the least.
-
-    Returns:
-        Number of configurations found; 0, TOO_FAR or TOO_NEAR; by how much the joint that binds exceeds its limit
-        in `nearest`, rad.
-    """
-    count, status, least = 0, 0, np.inf
-    q = np.empty(7)
-    for k in range(swivels.shape[0]):
-        for branch in range(BRANCHES):
-            status = solve(pose, swivels[k], branch, geometry, tool, lower, upper, q)
-            if status != 0:
-                return count, status, least
-            worst, _ = _excess(q, lower, upper)
-            if worst < least:
-                least = worst
-                for i in range(7):
-                    nearest[i] = q[i]
-            if worst <= -margin:
-                for i in range(7):
-                    found[count, i] = q[i]
-                found_swivel[count] = swivels[k]
-                found_branch[count] = branch
-                count += 1
-    return count, 0, least
 
 
 @njit(cache=True, nogil=True)

@@ -305,7 +305,7 @@ class _Checks:
         planning = arm.config.planning
         solutions = arm.inverse.solutions(target.pose, planning.joint_margin, self._now.start)
         if not solutions:
-            why = arm.inverse.why_not(target.pose, planning.joint_margin)
+            why = arm.inverse.why_not(target.pose, planning.joint_margin, self._now.start)
             return [], Refused(target.id, Code.UNREACHABLE, f"{target.id}: {why}")
         self._arrange(target.pose)
         limits = arm.limits(self._now.scale)

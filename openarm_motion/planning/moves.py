@@ -63,7 +63,7 @@ def to_named(arm: Arm, now: StartState, posture: str, around: RequestBoxes) -> T
 
 
 def to_pose(arm: Arm, now: StartState, pose: Array, around: RequestBoxes, *, position_only: bool = False) -> Trajectory:
-    """Free path to the tool pose (4, 4), in whichever configuration is nearest.
+    """Free path to the tool pose (4, 4), in the nearest configuration; the joint margin is kept where that can be.
 
     Raises:
         OpenArmError: UNREACHABLE, with the nearest reachable pose; IN_COLLISION, naming the pair; NO_PLAN; CANCELLED.
@@ -173,10 +173,13 @@ def goal_configurations(arm: Arm, now: StartState, start: Array, pose: Array, *,
 
 
 def _configurations(arm: Arm, scale: float, start: Array, pose: Array, *, position_only: bool) -> list[Array]:
-    """All configurations with the tool at a pose, those that are reached first come first; UNREACHABLE without one."""
+    """All configurations with the tool at a pose, those that are reached first come first; UNREACHABLE without one.
+
+    Where none keeps the margin from the joint limits, those within the limits are taken.
+    """
     solve = arm.inverse.position_solutions if position_only else arm.inverse.solutions
-    solutions = solve(pose, arm.config.planning.joint_margin, start)
+    solutions = solve(pose, arm.config.planning.joint_margin, start) or solve(pose, 0.0, start)
     if not solutions:
-        raise unreachable(arm, pose, position_only=position_only)
+        raise unreachable(arm, pose, position_only=position_only, near=start)
     limits = arm.limits(scale)
     return sorted((s.q for s in solutions), key=lambda q: segment_time(start, q, limits))

@@ -13,41 +13,53 @@ from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.arm import Arm
 
-SIX_JOINTS = """
-<robot name="six">
-<link name="base"><collision><geometry><cylinder radius="0.08" length="0.1"/></geometry></collision></link>
-{links}
-</robot>
-"""
-# an arm of another build: six joints, an offset wrist, names of its own
-_CHAIN = [
-    ("waist", (0, 0, 0.10), (0, 0, 1), 2.9),
-    ("shoulder", (0, 0, 0.20), (0, 1, 0), 1.9),
-    ("elbow", (0, 0, 0.40), (0, 1, 0), 2.4),
-    ("forearm", (0, 0.03, 0.20), (0, 0, 1), 2.9),
-    ("bend", (0, 0, 0.20), (0, 1, 0), 2.0),
-    ("flange", (0.02, 0, 0.08), (0, 0, 1), 3.0),
+# arms of other builds: name, origin and axis in the frame before, lower and upper limit
+_SIX = [  # an offset wrist
+    ("waist", (0, 0, 0.10), (0, 0, 1), -2.9, 2.9),
+    ("shoulder", (0, 0, 0.20), (0, 1, 0), -1.9, 1.9),
+    ("elbow", (0, 0, 0.40), (0, 1, 0), -2.4, 2.4),
+    ("forearm", (0, 0.03, 0.20), (0, 0, 1), -2.9, 2.9),
+    ("bend", (0, 0, 0.20), (0, 1, 0), -2.0, 2.0),
+    ("flange", (0.02, 0, 0.08), (0, 0, 1), -3.0, 3.0),
+]
+_SEVEN = [  # offsets at elbow and wrist: no closed form
+    ("j1", (0, 0, 0.30), (0, 0, 1), -2.8, 2.8),
+    ("j2", (0, 0, 0), (0, 1, 0), -1.7, 1.7),
+    ("j3", (0, 0, 0.32), (0, 0, 1), -2.8, 2.8),
+    ("j4", (0.08, 0, 0), (0, -1, 0), -3.0, -0.1),
+    ("j5", (-0.08, 0, 0.38), (0, 0, 1), -2.8, 2.8),
+    ("j6", (0, 0, 0), (0, -1, 0), 0.0, 3.7),
+    ("j7", (0.09, 0, 0), (0, 0, -1), -2.8, 2.8),
+]
+_SRS = [  # a straight arm with the roll axes in one line at zero, limits on both sides of the straight elbow
+    ("a1", (0, 0, 0.34), (0, 0, 1), -2.9, 2.9),
+    ("a2", (0, 0, 0), (0, 1, 0), -2.0, 2.0),
+    ("a3", (0, 0, 0.40), (0, 0, 1), -2.9, 2.9),
+    ("a4", (0, 0, 0), (0, -1, 0), -2.0, 2.0),
+    ("a5", (0, 0, 0.40), (0, 0, 1), -2.9, 2.9),
+    ("a6", (0, 0, 0), (0, 1, 0), -2.0, 2.0),
+    ("a7", (0, 0, 0.10), (0, 0, 1), -3.0, 3.0),
 ]
 
 
-def six_joint_urdf() -> str:
-    """URDF of a six-joint arm that has nothing in common with OpenArm."""
-    parts = []
-    parent = "base"
-    for name, xyz, axis, limit in _CHAIN:
+def _serial(name: str, chain: list[tuple[str, tuple[float, ...], tuple[float, ...], float, float]]) -> str:
+    """URDF of an arm that has nothing in common with OpenArm; the tool link is `tool`."""
+    base = '<collision><geometry><cylinder radius="0.08" length="0.1"/></geometry></collision>'
+    parts, parent = [f'<link name="base">{base}</link>'], "base"
+    for joint, xyz, axis, lower, upper in chain:
         shape = '<collision><origin xyz="0 0 0.03"/><geometry><box size="0.06 0.06 0.06"/></geometry></collision>'
-        parts.append(f'<link name="{name}_link">{shape}</link>')
+        parts.append(f'<link name="{joint}_link">{shape}</link>')
         parts.append(
-            f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{name}_link"/>'
+            f'<joint name="{joint}" type="revolute"><parent link="{parent}"/><child link="{joint}_link"/>'
             f'<origin xyz="{xyz[0]} {xyz[1]} {xyz[2]}"/><axis xyz="{axis[0]} {axis[1]} {axis[2]}"/>'
-            f'<limit lower="-{limit}" upper="{limit}" effort="10" velocity="2"/></joint>'
+            f'<limit lower="{lower}" upper="{upper}" effort="10" velocity="2"/></joint>'
         )
-        parent = f"{name}_link"
+        parent = f"{joint}_link"
     parts.append(
-        '<link name="tool"/><joint name="tool_joint" type="fixed"><parent link="flange_link"/>'
+        f'<link name="tool"/><joint name="tool_joint" type="fixed"><parent link="{parent}"/>'
         '<child link="tool"/><origin xyz="0 0 0.1"/></joint>'
     )
-    return SIX_JOINTS.format(links="\n".join(parts))
+    return f'<robot name="{name}">{"".join(parts)}</robot>'
 
 
 @pytest.fixture(scope="session")
@@ -80,8 +92,20 @@ def right(arms: dict[str, Arm]) -> Arm:
 
 @pytest.fixture(scope="session")
 def six() -> RobotDescription:
-    """Another robot."""
-    return RobotDescription.from_urdf(six_joint_urdf())
+    """Another robot, with six joints."""
+    return RobotDescription.from_urdf(_serial("six", _SIX))
+
+
+@pytest.fixture(scope="session")
+def seven() -> RobotDescription:
+    """Another robot, with seven joints and no closed form."""
+    return RobotDescription.from_urdf(_serial("seven", _SEVEN))
+
+
+@pytest.fixture(scope="session")
+def straight() -> RobotDescription:
+    """Another robot with a spherical shoulder and wrist."""
+    return RobotDescription.from_urdf(_serial("straight", _SRS))
 
 
 def down(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:

@@ -31,7 +31,7 @@ def test_every_solution_of_every_branch_is_at_the_pose(solvers: dict[str, SrsArm
     seen = set()
     for q in rng.uniform(arm.lower, arm.upper, (200, 7)):
         pose = arm.fk(q)
-        solutions, _ = solver.sweep(pose, SWIVELS)
+        solutions = solver.sweep(pose, SWIVELS)
         for solution in solutions:
             np.testing.assert_allclose(arm.fk(solution.q), pose, atol=1e-9)
             assert arm.margin(solution.q) >= 0.0
@@ -63,7 +63,7 @@ def test_branches_are_all_configurations_at_a_swivel_angle(solvers: dict[str, Sr
             if not result.success:
                 continue
             swivel = solver.classify(result.q).swivel
-            solutions, _ = solver.sweep(pose, np.array([swivel]), margin=-1e-6)
+            solutions = solver.sweep(pose, np.array([swivel]), margin=-1e-6)
             assert min(np.max(np.abs(s.q - result.q)) for s in solutions) < 1e-5
 
 
@@ -75,8 +75,8 @@ def test_left_arm_mirrors_the_right_one(solvers: dict[str, SrsArm]) -> None:
         pose = right.kinematics.fk(q)
         # a reflection on both sides of a rotation is a rotation; the hand is mirrored in its own y
         mirrored = se3.make(flip @ pose[:3, :3] @ flip, flip @ pose[:3, 3])
-        ours = {tuple(np.round(mirror(s.q), 6) + 0.0) for s in right.sweep(pose, SWIVELS)[0]}
-        theirs = {tuple(np.round(s.q, 6) + 0.0) for s in left.sweep(mirrored, -SWIVELS)[0]}
+        ours = {tuple(np.round(mirror(s.q), 6) + 0.0) for s in right.sweep(pose, SWIVELS)}
+        theirs = {tuple(np.round(s.q, 6) + 0.0) for s in left.sweep(mirrored, -SWIVELS)}
         assert ours == theirs
 
 
@@ -97,7 +97,8 @@ def test_lengths_are_those_of_the_table(solvers: dict[str, SrsArm]) -> None:
     solver = solvers["right"]
     np.testing.assert_allclose(solver.shoulder, [0.0, -0.1535, 0.698], atol=1e-9)
     far = se3.make(np.diag([1.0, -1.0, -1.0]), (0.0, -0.1535, 0.698 - 0.1801 - 0.5))
-    _, miss = solver.sweep(far, SWIVELS)
+    assert solver.sweep(far, SWIVELS) == []
+    miss = solver.miss(far, SWIVELS)
     assert miss.too_far == pytest.approx(0.5 - 0.436, abs=1e-9)
     assert "arm reaches 0.436 m (64 mm short)" in solver.distance_text(miss.too_far)
 
