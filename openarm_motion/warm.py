@@ -14,7 +14,9 @@ from openarm_motion.collision.robot import CollisionRobot
 from openarm_motion.kinematics.chain import ArmKinematics
 from openarm_motion.kinematics.inverse import InverseKinematics
 from openarm_motion.kinematics.line import solve_line
+from openarm_motion.planning.arm import segment_time
 from openarm_motion.planning.rrt import warm_search
+from openarm_motion.timing.trajectory import JointLimits, time_polyline
 
 
 def warm() -> None:
@@ -36,6 +38,9 @@ def warm() -> None:
     scene = CollisionScene(CollisionRobot(description, kinematics), CollisionContext(home))
     warm_search(FastScene([scene]), q)
     OccupancyMap(np.zeros((1, 3), np.int64), Lattice(0.02, (KEY_ZERO, KEY_ZERO, KEY_ZERO), (4, 4, 4)), 1).distances  # noqa: B018
+    limits = JointLimits(*np.ones((3, q.size)))
+    segment_time(q, q + 0.01, limits)
+    time_polyline(kinematics.names, np.stack([q, q + 0.01, q]), limits)
     solve_line(inverse, inverse.classify(q), pose, away, margin=0.0)
 
 

@@ -8,11 +8,9 @@ frame (the description's root), held boxes in the frame of the tool centre point
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import coal
 import numpy as np
@@ -23,6 +21,7 @@ from pydantic import Field
 from openarm_common.config import Config
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
+from openarm_motion.collision.line_checks import LineChecks
 from openarm_motion.collision.occupancy import MAP, DistanceMap, OccupancyMap
 from openarm_motion.collision.robot import CollisionRobot
 from openarm_motion.collision.solids import Box, Solid
@@ -103,67 +102,10 @@ class Contact:
         )
 
 
-@lru_cache(maxsize=512)
-def spread(n: int) -> tuple[float, ...]:
-    """0, 1/n, ..., 1 with the ends and far-apart points first, so that a collision is found early."""
-    order: list[int] = [n, 0]
-    gap = n
-    seen = {0, n}
-    while len(seen) <= n:
-        gap = max(gap // 2, 1)
-        for k in range(gap, n, gap):
-            if k not in seen:
-                seen.add(k)
-                order.append(k)
-    return tuple(k / n for k in order)
-
-
 #: A pair that may stay as near as it is may come nearer by this, m.
 _LESS = 1e-3
 #: Two shapes further apart than this in a report are not worth a number.
 _REPORT_RANGE = 1.0
-
-
-class LineChecks(ABC):
-    """Checks of straight joint lines by single configurations."""
-
-    #: (n,) how far the points that a joint moves are from its axis, at most, m.
-    levers: Array
-
-    @property
-    @abstractmethod
-    def arms(self) -> Sequence[CollisionScene]:
-        """The scene of each arm, in the order of their joints."""
-
-    @abstractmethod
-    def contacts(self, q: ArrayLike) -> list[Contact]:
-        """All pairs that are nearer than they may be, the deepest first."""
-
-    @abstractmethod
-    def collides(self, q: ArrayLike) -> bool:
-        """Whether some pair is nearer than it may be at a configuration (n,)."""
-
-    @abstractmethod
-    def lenient(self, share: float, arms: float | None = None) -> AbstractContextManager[None]:
-        """Ask for only a share of each positive distance meanwhile, `arms` of that between the arms."""
-
-    def edge_free(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.04) -> bool:
-        """Whether the straight joint line between two configurations is free, the ends included.
-
-        Args:
-            a: (n,) rad.
-            b: (n,) rad.
-            step: No joint turns further than this between two checks, rad.
-            travel: No point moves further than this between two checks, m; travels of two arms add up.
-        """
-        return self.first_hit(a, b, step, travel) is None
-
-    def first_hit(self, a: Array, b: Array, step: float = 0.05, travel: float = 0.04) -> Array | None:
-        """Some colliding configuration on the line between two, or None; far-apart points are checked first."""
-        difference = b - a
-        size = np.abs(difference)
-        n = int(np.ceil(max(float(size.max()) / step, float(size @ self.levers) / travel, 1.0)))
-        return next((q for q in (a + u * difference for u in spread(n)) if self.collides(q)), None)
 
 
 class CollisionScene(LineChecks):
@@ -185,14 +127,14 @@ class CollisionScene(LineChecks):
     def _build(self, around: CollisionContext) -> None:
         robot = self._robot
         self._around = around
-        self._geometry = robot.geometry.copy()
+        self._geometry, known = robot.checked(around.own)
         self._names = [*robot.links]
         self._boxes: dict[str, int] = {}
         self._solids: dict[str, Solid] = {}
         self._balls: dict[int, tuple[Array, float]] = {}
         self._towards: dict[frozenset[str], NDArray[np.int64]] = {}
-        pairs, required = self._pairs()
-        for i, j in pairs:
+        pairs, required = self._pairs(known)
+        for i, j in pairs[len(known) :]:
             self._geometry.addCollisionPair(pin.CollisionPair(i, j))
         self._pair_index = pairs
         self._required = np.array(required)
@@ -201,7 +143,7 @@ class CollisionScene(LineChecks):
         self._arms = np.array([self._names[j] in others and self._names[j] not in own for _, j in pairs])
         self._data = robot.model.createData()
         self._geometry_data = pin.GeometryData(self._geometry)
-        self._set_margins()
+        self._set = False
 
     @property
     def arms(self) -> Sequence[CollisionScene]:
@@ -272,6 +214,7 @@ class CollisionScene(LineChecks):
     def collides(self, q: ArrayLike) -> bool:
         """Whether some pair is nearer than it may be at the arm's configuration (n,)."""
         self._robot.put(self._q, q)
+        self._set_margins()
         return bool(pin.computeCollisions(self._robot.model, self._data, self._manager, self._q, True))
 
     def contacts(self, q: ArrayLike) -> list[Contact]:
@@ -290,6 +233,8 @@ class CollisionScene(LineChecks):
         Returns:
             A pair that overlaps deeper than that (nothing is relaxed then), or None.
         """
+        if not self.collides(q):
+            return None
         colliding = self._colliding(q)
         contacts = [self._contact(k) for k in colliding]
         guessed = ({box.id for box in self._around.boxes} | {MAP}) - self._around.fixed
@@ -305,8 +250,7 @@ class CollisionScene(LineChecks):
             return self.relax(q, allowance, estimates)
         for k, contact in zip(colliding, contacts, strict=True):
             self._required[k] = contact.distance - _LESS
-        if colliding:
-            self._set_margins()
+        self._set = False
         return None
 
     def passing(self, q: ArrayLike, nearer: float) -> AbstractContextManager[None]:
@@ -326,13 +270,11 @@ class CollisionScene(LineChecks):
     @contextmanager
     def _asking(self, required: Array) -> Iterator[None]:
         asked = self._required
-        self._required = required
-        self._set_margins()
+        self._required, self._set = required, False
         try:
             yield
         finally:
-            self._required = asked
-            self._set_margins()
+            self._required, self._set = asked, False
 
     def place(self, id: str, T: Array) -> None:
         """Move a box: `T` in the base frame, or in the tool frame for a held one."""
@@ -388,6 +330,7 @@ class CollisionScene(LineChecks):
 
     def _colliding(self, q: ArrayLike) -> list[int]:
         self._robot.put(self._q, q)
+        self._set_margins()
         pin.computeCollisions(self._robot.model, self._data, self._geometry, self._geometry_data, self._q, False)
         results = self._geometry_data.collisionResults
         return [k for k in range(len(self._pair_index)) if results[k].isCollision()]
@@ -414,18 +357,47 @@ class CollisionScene(LineChecks):
             where = f" at ({x:.2f}, {y:.2f}, {z:.2f})"
         return Contact(self._names[i], self._names[j], distance, float(self._required[k]), where)
 
+    @property
+    def pairs(self) -> int:
+        """How many pairs are checked."""
+        return len(self._pair_index)
+
+    def swings(self) -> Array:
+        """See `LineChecks`."""
+        return self.swings_of([self._robot])
+
+    def swings_of(self, robots: Sequence[CollisionRobot]) -> Array:
+        """As `swings`, of the joints of several arms of the same robot one after the other."""
+        pairs = np.array(self._pair_index, np.int64).reshape(-1, 2)
+        out: list[Array] = []
+        for robot in robots:
+            more = [robot.levers_of(o) for o in self._geometry.geometryObjects.tolist()[len(robot.links) :]]
+            levers = np.concatenate([robot.shape_levers, np.array(more).reshape(-1, robot.kinematics.n)])
+            one, two = levers[pairs[:, 0]], levers[pairs[:, 1]]
+            # a joint that moves both moves them as one body
+            out.append(np.where((one > 0.0) & (two > 0.0), 0.0, one + two))
+        return np.hstack(out)
+
+    def further(self, by: Array) -> AbstractContextManager[None]:
+        """See `LineChecks`."""
+        return self._asking(self._required + by)
+
     def _set_margins(self) -> None:
+        """Tell coal the distances that pairs must keep, where they have changed since."""
+        if self._set:
+            return
+        self._set = True
         for request, margin in zip(self._geometry_data.collisionRequests, self._required.tolist(), strict=True):
             request.security_margin = margin
         self._manager = pin.BroadPhaseManager_NaiveCollisionManager(
             self._robot.model, self._geometry, self._geometry_data
         )
 
-    def _pairs(self) -> tuple[list[tuple[int, int]], list[float]]:
-        """Add the boxes to the geometry; all pairs to check and the distance that each must keep."""
+    def _pairs(self, known: Sequence[tuple[int, int]]) -> tuple[list[tuple[int, int]], list[float]]:
+        """Add the boxes to the geometry; all pairs to check, the known ones first, and the distance of each."""
         robot, around, keep = self._robot, self._around, self._around.clearance
         own = robot.arm.fixed | robot.arm.moving
-        pairs = [pair for pair in robot.pairs if around.own or robot.links[pair[1]] not in own]
+        pairs = [*known]
         required = [keep.own if robot.links[j] in own else keep.arms for _, j in pairs]
         tool = robot.joints[-1]
         held = [self._add(self._held_name(box.id), tool, robot.kinematics.tip @ box.T, box) for box in around.held]

@@ -42,13 +42,21 @@ class CollisionRobot:
         if not self.moving:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no link moved by {kinematics.names} has a collision shape")
         self.pairs: tuple[tuple[int, int], ...] = tuple(self._enabled(description))
+        # pinocchio searches all pairs for each that it is given: once is enough
+        fixed_or_moving = self.arm.fixed | self.arm.moving
+        others = tuple(pair for pair in self.pairs if self.links[pair[1]] not in fixed_or_moving)
+        self._checked = {own: self._with_pairs(pairs) for own, pairs in ((True, self.pairs), (False, others))}
         self._joint_of = {name: self.model.joints[i] for i, name in enumerate(self.model.names) if i > 0}
         self.joints: tuple[int, ...] = tuple(self.model.getJointId(name) for name in kinematics.names)
         self._columns = np.array([self._joint_of[name].idx_q for name in kinematics.names])
         self._endless = any(self._joint_of[name].nq != 1 for name in kinematics.names)
-        self.levers: Array = np.zeros(kinematics.n)
-        for shape in self.geometry.geometryObjects:
-            self.levers = np.maximum(self.levers, self.levers_of(shape))
+        self.shape_levers: Array = np.array([self.levers_of(shape) for shape in self.geometry.geometryObjects])
+        self.levers: Array = self.shape_levers.max(axis=0)
+
+    def checked(self, own: bool) -> tuple[pin.GeometryModel, list[tuple[int, int]]]:
+        """A copy of the shapes with the pairs to check; `own` as in `CollisionContext`."""
+        geometry, pairs = self._checked[own]
+        return geometry.copy(), [*pairs]
 
     def configuration(self, state: Mapping[str, float]) -> Array:
         """Full configuration of the model; joints that `state` does not name are at 0, followers follow."""
@@ -70,6 +78,12 @@ class CollisionRobot:
         """Boxes in the tool frame as `CollisionContext.carried` of the other arm."""
         name = self.kinematics.tool_link
         return [(self.joints[-1], replace(b, id=f"{b.id} at {name}", T=self.kinematics.tip @ b.T)) for b in boxes]
+
+    def _with_pairs(self, pairs: Sequence[tuple[int, int]]) -> tuple[pin.GeometryModel, Sequence[tuple[int, int]]]:
+        geometry = self.geometry.copy()
+        for i, j in pairs:
+            geometry.addCollisionPair(pin.CollisionPair(i, j))
+        return geometry, pairs
 
     def _set(self, full: Array, name: str, value: float) -> None:
         joint = self._joint_of[name]

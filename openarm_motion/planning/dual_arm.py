@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
-from openarm_motion.collision.exact import CollisionScene, Contact, LineChecks
+from openarm_motion.collision.exact import CollisionScene, Contact
+from openarm_motion.collision.line_checks import LineChecks
 from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.solids import Box
 from openarm_motion.planning.arm import Arm, PlanningGroup, StartState
@@ -69,6 +70,18 @@ class DualArmScene(LineChecks):
     def lenient(self, share: float, arms: float | None = None) -> Iterator[None]:
         """Ask for only a share of each positive distance meanwhile, `arms` of that between the arms."""
         with self.first.lenient(share, arms), self.second.lenient(share, arms):
+            yield
+
+    def swings(self) -> Array:
+        """See `LineChecks`."""
+        robots = [scene.robot for scene in self.arms]
+        return np.vstack([scene.swings_of(robots) for scene in self.arms])
+
+    @contextmanager
+    def further(self, by: Array) -> Iterator[None]:
+        """See `LineChecks`."""
+        first = self.first.pairs
+        with self.first.further(by[:first]), self.second.further(by[first:]):
             yield
 
     def separation(self, q: ArrayLike) -> float:

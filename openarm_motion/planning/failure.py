@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -41,6 +42,7 @@ class PlanFailedError(OpenArmError):
         stage: How far planning got.
         contact: The pair in the way, where there is one.
         alternative: The nearest goal that works, where one was searched and found.
+        at: Moment of a trajectory, s; NaN where it is about none.
     """
 
     def __init__(
@@ -50,8 +52,10 @@ class PlanFailedError(OpenArmError):
         stage: Stage,
         contact: Contact | None = None,
         alternative: Alternative | None = None,
+        at: float = math.nan,
     ) -> None:
         super().__init__(code, message)
         self.stage: Stage = stage
         self.contact = contact
         self.alternative = alternative
+        self.at = at

@@ -117,11 +117,16 @@ def test_ten_hertz_serve_an_arm_at_rest_and_not_one_that_accelerates(measured: b
 def test_a_hundred_hertz_serve_the_fastest_motions_of_the_planner(measured: bool) -> None:
     config, rng = LimitsConfig(), np.random.default_rng(0)
     limits = JointLimits(*(np.array(values) for values in (config.velocity, config.acceleration, config.jerk)))
+    refused = 0
     for _ in range(5):
         path = time_polyline(ARM, rng.uniform(LOW, HIGH, (2, 7)), limits)
         buffer = fill(path.states, 100.0, path.duration + 0.05, measured)
         for t_ns in rng.integers(0, int(path.duration * 1e9), 30).tolist():
-            assert off(buffer, path.states, t_ns) < 0.3e-3
+            try:
+                assert off(buffer, path.states, t_ns) < 0.3e-3
+            except OpenArmError:  # the bound without velocities is coarser: about one moment in a thousand is refused
+                refused += 1
+    assert refused <= (0 if measured else 2)
 
 
 @pytest.mark.requirement("A-44", "A-72")

@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+import ruckig
+from scipy.interpolate import BPoly
 
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
@@ -12,6 +16,7 @@ from openarm_common.robot.description import RobotDescription
 from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.config import MotionConfig
 from openarm_motion.planning.arm import Arm
+from openarm_motion.timing.trajectory import JointLimits, Trajectory
 
 # arms of other builds: name, origin and axis in the frame before, lower and upper limit
 _SIX = [  # an offset wrist
@@ -113,3 +118,40 @@ def down(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
     from openarm_common import se3
 
     return se3.make(se3.rotation_from_z_y((0, 0, -1), (np.cos(yaw), np.sin(yaw), 0)), (x, y, z))
+
+
+def shares_of_limits(trajectory: Trajectory, limits: JointLimits) -> list[float]:
+    """Greatest velocity, acceleration and jerk over their limits, of the polynomials that a controller interpolates.
+
+    A polynomial lies within its Bernstein coefficients; where those exceed a limit, its extremes are computed.
+    """
+    t = trajectory.t
+    curve = BPoly.from_derivatives(t, np.stack([trajectory.q, trajectory.v, trajectory.a], axis=1))
+    found: list[float] = []
+    for k, limit in enumerate(limits, 1):
+        rate = curve.derivative(k)
+        shares = np.abs(rate.c).max(axis=0) / limit
+        for i, joint in np.argwhere(shares > 1.0):
+            c = BPoly(rate.c[:, i : i + 1, joint], [0.0, 1.0])
+            power = np.polynomial.Polynomial(_powers(c.c[:, 0]))
+            turns = power.deriv().roots()
+            inner = turns.real[(np.abs(turns.imag) < 1e-9) & (turns.real > 0.0) & (turns.real < 1.0)]
+            shares[i, joint] = np.abs(power(np.concatenate([[0.0, 1.0], inner]))).max() / limit[joint]
+        found.append(float(shares.max()))
+    return found
+
+
+def _powers(bernstein: np.ndarray) -> np.ndarray:
+    """Factors of the powers of u of a polynomial in Bernstein form."""
+    u = np.polynomial.Polynomial([0.0, 1.0])
+    n = len(bernstein) - 1
+    return sum(float(c) * math.comb(n, k) * u**k * (1 - u) ** (n - k) for k, c in enumerate(bernstein)).coef
+
+
+def ruckig_duration(length: float, most: np.ndarray) -> float:
+    """Time that Ruckig takes from rest to rest with a greatest velocity, acceleration and jerk (3,), s."""
+    query, answer = ruckig.InputParameter(1), ruckig.Trajectory(1)
+    query.current_position, query.target_position = [0.0], [length]
+    query.max_velocity, query.max_acceleration, query.max_jerk = most[:, None].tolist()
+    assert ruckig.Ruckig(1).calculate(query, answer) >= 0
+    return float(answer.duration)

@@ -22,7 +22,7 @@ from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.ompl_planner import OmplPlanner
 from openarm_motion.planning.planner import PlannedPath, PlanQuery
 from openarm_motion.timing.trajectory import Trajectory
-from openarm_motion.timing.validation import validate_trajectory
+from openarm_motion.timing.validation import keeps_clear, validate_trajectory
 
 TABLE_Z = 0.40
 UP = np.array([0.0, 0.0, 0.12])
@@ -127,9 +127,14 @@ def test_both_lines_carry_a_certificate_and_one_that_fails_it_is_not_handed_out(
         validate_trajectory(scene, trajectory)
         validated.append(trajectory)
 
+    def clear(scene: CollisionScene, trajectory: Trajectory) -> bool:
+        validated.append(trajectory)
+        return keeps_clear(scene, trajectory)
+
     with monkeypatch.context() as recorded:
         recorded.setattr(approach_module, "validate_trajectory", validate)
         recorded.setattr(arm_module, "validate_trajectory", validate)
+        recorded.setattr(arm_module, "keeps_clear", clear)
         plan = plan_approach(right, right.start_state(home), request)
     assert {id(part) for part in plan.parts} <= {id(part) for part in validated}
 

@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from openarm_common.errors import OpenArmError
 from openarm_motion.kinematics.line import solve_line
 from openarm_motion.planning.arm import Arm
+from openarm_motion.timing.speed_kernels import SPACING
 from openarm_motion.timing.trajectory import JointLimits, Trajectory, profile, time_path, time_polyline
+from tests.openarm_motion.conftest import ruckig_duration, shares_of_limits
 
 NAMES = tuple(f"j{i}" for i in range(7))
 LIMITS = JointLimits(
@@ -24,21 +26,15 @@ LIMITS = JointLimits(
 
 
 def assert_within_limits(trajectory: Trajectory, limits: JointLimits) -> None:
-    """At the samples and between them, by quintic interpolation and by finite differences of it."""
-    assert np.all(np.abs(trajectory.v) <= limits.velocity * 1.001)
-    assert np.all(np.abs(trajectory.a) <= limits.acceleration * 1.001)
+    """By the polynomials themselves, and by finite differences of what is interpolated."""
+    assert max(shares_of_limits(trajectory, limits)) <= 1.0 + 1e-6
     assert np.all(trajectory.v[[0, -1]] == 0.0)
     assert np.all(np.abs(trajectory.a[[0, -1]]) < 1e-9)
     t = np.linspace(0.0, trajectory.duration, max(2000, int(trajectory.duration / 5e-4)))
     q, v, a = trajectory.at(t)
     h = t[1] - t[0]
-    assert np.all(np.abs(v) <= limits.velocity * 1.001)
-    assert np.all(np.abs(a) <= limits.acceleration * 1.005)
     np.testing.assert_allclose(np.diff(q, axis=0) / h, 0.5 * (v[1:] + v[:-1]), atol=2e-4)
     np.testing.assert_allclose(np.diff(v, axis=0) / h, 0.5 * (a[1:] + a[:-1]), atol=0.05)
-    jerk = np.abs(np.diff(a, axis=0)) / h
-    # a difference that straddles the border of two pieces sees both jerks, and never more than the larger
-    assert np.all(jerk <= limits.jerk * 1.02)
 
 
 @settings(max_examples=40)
@@ -68,7 +64,7 @@ def test_a_single_segment_is_as_fast_as_the_limits_allow() -> None:
     goal = np.array([1.0, 0.2, 0, 0, 0, 0, 0])
     trajectory = time_polyline(NAMES, np.stack([np.zeros(7), goal]), LIMITS)
     # v 2, a 6, j 60: ramp of v/a + a/j = 0.433 s, so 1 rad takes 1/2 + 0.433 s
-    assert trajectory.duration == pytest.approx(0.5 + 2.0 / 6.0 + 6.0 / 60.0, abs=1e-6)
+    assert trajectory.duration == pytest.approx(0.5 + 2.0 / 6.0 + 6.0 / 60.0, abs=2e-5)
     assert np.max(np.abs(trajectory.v[:, 0])) == pytest.approx(2.0, abs=1e-6)
 
 
@@ -120,12 +116,15 @@ def test_no_way_is_a_rest() -> None:
 def test_a_profile_goes_its_length_within_its_limits(length: float, v: float, a: float, j: float) -> None:
     way = profile(length, v, a, j)
     t = np.linspace(0.0, way.duration, 200)
-    s, ds, dds, ddds = way.at(t)
+    s, ds, dds, ddds = (x[:, 0] for x in way.at(t))
     assert s[-1] == pytest.approx(length, rel=1e-6, abs=1e-9)
     assert np.abs(ds).max() <= v * (1 + 1e-6)
     assert np.abs(dds).max() <= a * (1 + 1e-6)
     assert np.abs(ddds).max() <= j * (1 + 1e-6)
     assert np.all(np.diff(s) >= -1e-9)
+    # no piece is shorter than 1 ms: that costs two of them at most
+    best = ruckig_duration(length, np.array([v, a, j]))
+    assert best - 1e-9 <= way.duration <= best + 2 * SPACING
 
 
 def test_impossible_limits_are_refused() -> None:
