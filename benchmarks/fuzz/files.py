@@ -315,7 +315,7 @@ def _onnx(folder: Path) -> list[Reader]:
 
 
 def _robots(folder: Path) -> list[Reader]:
-    from openarm_motion.collision.mesh_boxes import load_robot
+    from openarm_motion.collision.robot_meshes import load_robot
 
     robot = RobotDescription.load()
     mesh = (

@@ -40,6 +40,8 @@ class Primitive:
 
     Attributes:
         size: box: full edges x, y, z; cylinder: radius, length; sphere: radius.
+        corners: (n, 3) in the frame of the shape, None for most. The shape is their convex hull, and what `kind` and
+            `size` say is the box about it: all that a reader needs who can do with a larger shape.
         material: Name of the material of a visual, "" without one.
         rgba: Colour of a visual, None without one.
     """
@@ -50,6 +52,7 @@ class Primitive:
     T_link_primitive: Array
     material: str = ""
     rgba: Rgba | None = None
+    corners: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +175,8 @@ def _joint(element: ET.Element) -> Joint:
     if kind not in get_args(JointType):
         raise fault(f"joint {name!r} has type {kind!r}; supported: {', '.join(get_args(JointType))}")
     axis_element, limit, mimic = element.find("axis"), element.find("limit"), element.find("mimic")
+    if kind == "fixed":  # neither says anything about a joint that does not move
+        axis_element = mimic = None
     axis = np.array(
         floats(axis_element.get("xyz", "1 0 0"), 3, axis_element) if axis_element is not None else (1.0, 0.0, 0.0)
     )

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numba kernels of the fast collision layer: where bodies are, and which of their shapes are near to others or the map.
 
-The answer "apart" is a proof while the answer "near" may be wrong. Shapes are boxes, cylinders and spheres on bodies;
-body 0 is the base, bodies 1..n follow the joints. Shapes of one body are a cluster with a ball about it; two clusters
-whose shapes are to be checked are a group. m, rad, base frame. The kernels release the GIL.
+The answer "apart" is a proof while the answer "near" may be wrong. Shapes are boxes, cylinders, spheres and convex
+hulls on bodies; of a hull, the capsule about it is asked first, and its corners where that does not decide. Body 0 is
+the base, bodies 1..n follow the joints. Shapes of one body are a cluster with a ball about it; two clusters whose
+shapes are to be checked are a group. m, rad, base frame. The kernels release the GIL.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from openarm_common.types import Array, Ints
-from openarm_motion.collision.shape_kernels import BOX, separation
+from openarm_motion.collision.hull_kernels import hull_separation
+from openarm_motion.collision.shape_kernels import BOX, HULL, separation
 
 #: Numbers that a list of groups or intervals of a line has room for.
 _ROOM = 1 << 15
@@ -30,8 +32,10 @@ class Model(NamedTuple):
         placements: (n, 4, 4) of each joint in its parent body at zero.
         axes: (n, 3) unit, in the joint's frame.
         prismatic: (n,) bool.
-        kinds: (s,) BOX, CYLINDER or SPHERE.
-        sizes: (s, 3) half edges; radius, half length; radius.
+        kinds: (s,) BOX, CYLINDER, SPHERE or HULL.
+        sizes: (s, 3) half edges; radius, half length; radius; of a hull, those of its capsule.
+        corners: (v, 3) of hulls, in the frames of their shapes.
+        firsts: (s + 1,) the first corner of each shape.
         radii: (s,) of the ball about the shape's centre that holds it.
         bodies: (s,) body of each shape.
         poses: (s, 3, 4) of each shape in its body.
@@ -64,6 +68,8 @@ class Model(NamedTuple):
     prismatic: NDArray[np.bool_]
     kinds: Ints
     sizes: Array
+    corners: Array
+    firsts: Ints
     radii: Array
     bodies: Ints
     poses: Array
@@ -101,6 +107,7 @@ class Work(NamedTuple):
         lists: Numbers of groups.
         spans: (k, 4) intervals of a line: first and last point, where the list of its groups begins, its length.
         q: (n,) a state.
+        simplex: (6, 3) see `hull_separation`.
     """
 
     frames: Array
@@ -112,6 +119,7 @@ class Work(NamedTuple):
     lists: Ints
     spans: Ints
     q: Array
+    simplex: Array
 
 
 @njit(cache=True, nogil=True)
@@ -132,6 +140,7 @@ def workspace(model: Model) -> Work:
         np.empty(_ROOM, np.int64),
         np.empty((_ROOM, 4), np.int64),
         np.empty(n),
+        np.empty((6, 3)),
     )
     for k in range(s):  # what does not move is where it is
         if model.bodies[k] == 0:
@@ -160,7 +169,8 @@ def map_room(m: int, enough: float, model: Model, work: Work) -> float:
     groups, spheres, shapes, keeps = model.sphere_groups, model.spheres, model.sphere_shapes, model.sphere_keep
     field, corner, edge = model.field, model.corner, model.edge
     kinds, sizes, bodies, poses = model.kinds, model.sizes, model.bodies, model.poses
-    frames, done, world = work.frames, work.done, work.world
+    frames, done, world, simplex = work.frames, work.done, work.world, work.simplex
+    corners, firsts = model.corners, model.firsts
     frame = frames[groups[m, 0]]
     least, cell, width = enough, kinds.shape[0] - 1, edge[0]
     for k in range(groups[m, 1], groups[m, 2]):
@@ -187,7 +197,11 @@ def map_room(m: int, enough: float, model: Model, work: Work) -> float:
                     world[cell, 0, 3] = corner[0] + (x + 0.5) * width
                     world[cell, 1, 3] = corner[1] + (y + 0.5) * width
                     world[cell, 2, 3] = corner[2] + (z + 0.5) * width
-                    if separation(i, cell, keep, kinds, sizes, world) < keep:
+                    if separation(i, cell, keep, kinds, sizes, world) >= keep:
+                        continue
+                    if kinds[i] != HULL:
+                        return -1.0
+                    if hull_separation(i, cell, keep, keep, kinds, sizes, corners, firsts, world, simplex) < keep:
                         return -1.0
     return least
 
@@ -293,7 +307,7 @@ def check_listed(start: int, count: int, end: int, share: float, model: Model, w
     bodies, poses, frames, done = model.bodies, model.poses, work.frames, work.done
     lists, sways, kept = work.lists, work.sways, 0
     balls, about, field = model.sphere_groups, model.sphere_bounds, model.field
-    corner, edge = model.corner, model.edge
+    corner, edge, corners, firsts, simplex = model.corner, model.edge, model.corners, model.firsts, work.simplex
     for at in range(start, start + count):
         g = lists[at]
         enough = float(share * sways[g])
@@ -335,7 +349,11 @@ def check_listed(start: int, count: int, end: int, share: float, model: Model, w
                 reach = max(radii[i] + radii[j] + keep + least, 0.0)
                 if x * x + y * y + z * z > reach * reach:
                     continue
-                least = min(least, separation(i, j, keep + least, kinds, sizes, world) - keep)
+                proven, need = separation(i, j, keep + least, kinds, sizes, world), keep + least
+                if proven < need and (kinds[i] == HULL or kinds[j] == HULL):
+                    more = hull_separation(i, j, keep, need, kinds, sizes, corners, firsts, world, simplex)
+                    proven = max(proven, more)
+                least = min(least, proven - keep)
                 if least < 0.0:
                     return -1
         if least < 0.0:

@@ -160,21 +160,14 @@ class CollisionScene(LineChecks):
         """What is around the arm."""
         return self._around
 
-    def shapes(self) -> list[tuple[int, Array, coal.ShapeBase]]:
-        """Joint, pose (4, 4) in that joint's frame, and geometry of every shape but the map; the robot's come first.
-
-        Geometry is a box, a cylinder or a sphere; what has another shape is in the box about it.
-        """
-        found: list[tuple[int, Array, coal.ShapeBase]] = []
-        for o in self._geometry.geometryObjects:
+    def shapes(self) -> list[tuple[int, Array, Solid]]:
+        """Joint, pose (4, 4) in that joint's frame, and body of every shape but the map; the robot's come first."""
+        found: list[tuple[int, Array, Solid]] = []
+        for k, o in enumerate(self._geometry.geometryObjects):
             if o.name == MAP:
                 continue
-            T, shape = np.array(o.placement.homogeneous), o.geometry
-            solid = self._solids.get(o.name)
-            if not isinstance(shape, coal.Box | coal.Cylinder | coal.Sphere) and solid is not None:
-                T[:3, 3] += T[:3, :3] @ solid.centre
-                shape = coal.Box(*solid.extents.tolist())
-            found.append((o.parentJoint, T, shape))
+            solid = self._robot.solids[k] if k < len(self._robot.solids) else self._solids[o.name]
+            found.append((o.parentJoint, np.array(o.placement.homogeneous), solid))
         return found
 
     @property

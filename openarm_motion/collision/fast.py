@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,13 +23,15 @@ from openarm_motion.collision.clearance_kernels import Model, workspace
 from openarm_motion.collision.exact import CollisionScene
 from openarm_motion.collision.line_kernels import line_free
 from openarm_motion.collision.occupancy import DistanceMap
-from openarm_motion.collision.shape_kernels import BOX, CYLINDER, SPHERE
+from openarm_motion.collision.shape_kernels import BOX, CYLINDER, HULL, SPHERE
+from openarm_motion.collision.solids import Box, Cylinder, Mesh, Solid, Sphere
 
 #: Added to distances, so that rounding does not decide, m.
 _ROUNDING = 1e-6
 #: Edge of the cells that shapes are cut into before each is put into a sphere, m.
 _CELL = 0.045
 #: Of one cell, with nothing near to it.
+_NO_CORNERS = np.empty((0, 3))
 _NO_MAP = DistanceMap(np.full((1, 1, 1), np.inf, np.float32), np.zeros(3), 1.0, np.inf)
 
 
@@ -114,6 +115,7 @@ class _Packer:
         self._scenes, self._field = scenes, field
         self._kinds: list[int] = []
         self._sizes: list[Array] = []
+        self._corners: list[Array] = []
         self._radii: list[float] = []
         self._bodies: list[int] = []
         self._poses: list[Array] = []
@@ -143,23 +145,26 @@ class _Packer:
         self,
         joint: int,
         T: Array,
-        shape: coal.ShapeBase,
+        shape: Solid,
         places: list[Array],
         parents: Sequence[int],
         joints: dict[int, int],
     ) -> None:
-        kind, size = _kind(shape)
+        kind, size, corners = _kind(shape)
+        if isinstance(shape, Mesh):
+            T = T @ shape.hull.T
         mover = joint
         while mover > 0 and mover not in joints:
             mover = parents[mover]
         body = joints.get(mover, 0)
         pose = places[joint] @ T if body == 0 else se3.inverse(places[mover]) @ places[joint] @ T
-        self._put(kind, size, body, pose)
+        self._put(kind, size, body, pose, corners)
 
-    def _put(self, kind: int, size: Array, body: int, pose: Array) -> None:
+    def _put(self, kind: int, size: Array, body: int, pose: Array, corners: Array = _NO_CORNERS) -> None:
         self._kinds.append(kind)
         self._sizes.append(size)
-        self._radii.append(_radius(kind, size))
+        self._corners.append(corners)
+        self._radii.append(_radius(kind, size, corners))
         self._bodies.append(body)
         self._poses.append(pose[:3])
 
@@ -200,6 +205,8 @@ class _Packer:
             prismatic=prismatic,
             kinds=np.array(self._kinds, np.int64),
             sizes=np.array(self._sizes),
+            corners=np.concatenate(self._corners),
+            firsts=np.cumsum([0, *(len(corners) for corners in self._corners)]).astype(np.int64),
             radii=np.array(self._radii),
             bodies=np.array(self._bodies, np.int64),
             poses=np.array(self._poses),
@@ -298,27 +305,32 @@ def cover(kind: int, size: tuple[float, float, float]) -> Array:
     """Spheres (m, 4), centre and radius, that together hold a shape, in its frame."""
     if kind == SPHERE:
         return np.array([[0.0, 0.0, 0.0, size[0]]])
-    half = np.array(size if kind == BOX else (size[0], size[0], size[1]))
+    half = np.array(size if kind == BOX else (size[0], size[0], size[1] + (size[0] if kind == HULL else 0.0)))
     counts = np.maximum(np.ceil(2.0 * half / _CELL), 1).astype(int)
     cell = 2.0 * half / counts
     centres = -half + (np.indices(counts.tolist()).reshape(3, -1).T + 0.5) * cell
-    if kind == CYLINDER:  # without corners that the cylinder does not reach
+    if kind != BOX:  # without corners that the shape does not reach
         beyond = np.maximum(np.abs(centres[:, :2]) - 0.5 * cell[:2], 0.0)
         centres = centres[np.hypot(beyond[:, 0], beyond[:, 1]) <= size[0]]
     return np.column_stack([centres, np.full(len(centres), 0.5 * float(np.linalg.norm(cell)) + 1e-9)])
 
 
-def _kind(shape: coal.ShapeBase) -> tuple[int, Array]:
-    if isinstance(shape, coal.Box):
-        return BOX, np.array(shape.halfSide, np.float64)
-    if isinstance(shape, coal.Cylinder):
-        return CYLINDER, np.array([shape.radius, shape.halfLength, 0.0])
-    if isinstance(shape, coal.Sphere):
-        return SPHERE, np.array([shape.radius, 0.0, 0.0])
-    raise OpenArmError(Code.INVALID_ARGUMENT, f"shape {type(shape).__name__}; valid: box, cylinder, sphere")
+def _kind(shape: Solid) -> tuple[int, Array, Array]:
+    """Kind, sizes (3,) and corners (n, 3) of a body as the kernels take them."""
+    if isinstance(shape, Box):
+        return BOX, 0.5 * shape.size, _NO_CORNERS
+    if isinstance(shape, Cylinder):
+        return CYLINDER, np.array([shape.radius, 0.5 * shape.length, 0.0]), _NO_CORNERS
+    if isinstance(shape, Sphere):
+        return SPHERE, np.array([shape.radius, 0.0, 0.0]), _NO_CORNERS
+    if isinstance(shape, Mesh):
+        return HULL, np.array([shape.hull.radius, shape.hull.half, 0.0]), shape.hull.corners
+    raise OpenArmError(Code.INVALID_ARGUMENT, f"shape {type(shape).__name__}; valid: box, cylinder, sphere, mesh")
 
 
-def _radius(kind: int, size: Array) -> float:
+def _radius(kind: int, size: Array, corners: Array) -> float:
     if kind == CYLINDER:
         return float(np.hypot(size[0], size[1]))
+    if kind == HULL:
+        return float(np.linalg.norm(corners, axis=1).max())
     return float(np.linalg.norm(size)) if kind == BOX else float(size[0])

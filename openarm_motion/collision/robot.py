@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Collision shapes of a robot as one of its arms sees them: what moves, and which pairs are worth a check.
 
-Shapes are the primitives of the URDF; pairs that may touch come from the SRDF. m, rad.
+Shapes are the primitives of the URDF and the hulls of its meshes; pairs that may touch come from the SRDF, or are
+found. m, rad.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -17,12 +19,18 @@ from numpy.typing import ArrayLike
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
-from openarm_motion.collision.solids import Box, solid_from
+from openarm_motion.collision.solids import Box, Solid, solid_from
 from openarm_motion.kinematics.chain import ArmKinematics, ArmLinks
+
+_LOG = logging.getLogger(__name__)
+#: Random states in which links that always touch must do so.
+_SAMPLES = 1000
 
 
 class CollisionRobot:
     """Collision shapes of a robot as seen by one of its arms; built once, shared by all queries.
+
+    `pairs` are those of shapes to check; `touching` names the links that are not checked since they always touch.
 
     Args:
         description: The robot.
@@ -37,19 +45,19 @@ class CollisionRobot:
         self.arm = ArmLinks.of(description, kinematics)
         self.model = pin.buildModelFromXML(description.urdf, True)
         self.geometry = pin.GeometryModel()
-        self.links: tuple[str, ...] = tuple(self._add_shapes(description))
+        self.links, self.solids = self._add_shapes(description)
         self.moving: tuple[int, ...] = tuple(i for i, link in enumerate(self.links) if link in self.arm.moving)
         if not self.moving:
             raise OpenArmError(Code.INVALID_ARGUMENT, f"no link moved by {kinematics.names} has a collision shape")
-        self.pairs: tuple[tuple[int, int], ...] = tuple(self._enabled(description))
-        # pinocchio searches all pairs for each that it is given: once is enough
-        fixed_or_moving = self.arm.fixed | self.arm.moving
-        others = tuple(pair for pair in self.pairs if self.links[pair[1]] not in fixed_or_moving)
-        self._checked = {own: self._with_pairs(pairs) for own, pairs in ((True, self.pairs), (False, others))}
         self._joint_of = {name: self.model.joints[i] for i, name in enumerate(self.model.names) if i > 0}
         self.joints: tuple[int, ...] = tuple(self.model.getJointId(name) for name in kinematics.names)
         self._columns = np.array([self._joint_of[name].idx_q for name in kinematics.names])
         self._endless = any(self._joint_of[name].nq != 1 for name in kinematics.names)
+        self.pairs, self.touching = self._pairs_to_check(description)
+        # pinocchio searches all pairs for each that it is given: once is enough
+        fixed_or_moving = self.arm.fixed | self.arm.moving
+        others = tuple(pair for pair in self.pairs if self.links[pair[1]] not in fixed_or_moving)
+        self._checked = {own: self._with_pairs(pairs) for own, pairs in ((True, self.pairs), (False, others))}
         self.shape_levers: Array = np.array([self.levers_of(shape) for shape in self.geometry.geometryObjects])
         self.levers: Array = self.shape_levers.max(axis=0)
 
@@ -106,25 +114,31 @@ class CollisionRobot:
             joint = self.model.parents[joint]
         return levers
 
-    def _add_shapes(self, description: RobotDescription) -> Iterable[str]:
+    def _add_shapes(self, description: RobotDescription) -> tuple[tuple[str, ...], tuple[Solid, ...]]:
+        """Link and body of each shape; bodies in the frames of their links."""
         self._travel = {
             joint.name: max(abs(joint.lower), abs(joint.upper))
             for joint in description.joints.values()
             if joint.type == "prismatic"
         }
+        links: list[str] = []
+        solids: list[Solid] = []
         for link in description.links.values():
             if link.meshes and link.name in self.arm.moving:
                 raise OpenArmError(
                     Code.INVALID_ARGUMENT,
-                    f"link {link.name!r} has meshes ({', '.join(link.meshes)}); give it boxes, cylinders or spheres",
+                    f"link {link.name!r} has meshes ({', '.join(link.meshes)}); read the robot with `load_robot`, or"
+                    " give it boxes, cylinders or spheres",
                 )
             frame = self.model.frames[self.model.getFrameId(link.name, pin.FrameType.BODY)]
             for shape in link.collision:
                 placement = frame.placement * pin.SE3(shape.T_link_primitive)
-                geometry = solid_from(shape.name, shape.T_link_primitive, shape).geometry
-                item = pin.GeometryObject(shape.name, frame.parentJoint, placement, geometry)
+                solid = solid_from(shape.name, shape.T_link_primitive, shape)
+                item = pin.GeometryObject(shape.name, frame.parentJoint, placement, solid.geometry)
                 self.geometry.addGeometryObject(item)
-                yield link.name
+                links.append(link.name)
+                solids.append(solid)
+        return tuple(links), tuple(solids)
 
     def _enabled(self, description: RobotDescription) -> Iterable[tuple[int, int]]:
         """Pairs of shapes to check: what the SRDF allows to touch is left out; without an SRDF, neighbours are."""
@@ -137,6 +151,38 @@ class CollisionRobot:
                 if not description.srdf and frozenset((body[a], body[b])) in self.arm.neighbours:
                     continue
                 yield i, j
+
+    def _pairs_to_check(
+        self, description: RobotDescription
+    ) -> tuple[tuple[tuple[int, int], ...], frozenset[frozenset[str]]]:
+        """Pairs of shapes to check, and the pairs of links that are left out since they touch in every sample.
+
+        A pair that is apart in a single sample stays: it is then for the SRDF to say that it may touch.
+        """
+        pairs: dict[frozenset[str], list[tuple[int, int]]] = {}
+        for i, j in self._enabled(description):
+            pairs.setdefault(frozenset((self.links[i], self.links[j])), []).append((i, j))
+        movable = [j for j in description.joints.values() if j.type != "fixed" and j.mimic is None]
+        names = [joint.name for joint in movable]
+        ends = np.array([(max(j.lower, -np.pi), min(j.upper, np.pi)) for j in movable]).reshape(-1, 2)
+        rng, touching = np.random.default_rng(0), dict(pairs)
+        data, placed = self.model.createData(), pin.GeometryData(self.geometry)
+        for _ in range(_SAMPLES):
+            if not touching:
+                break
+            state = dict(zip(names, rng.uniform(ends[:, 0], ends[:, 1]).tolist(), strict=True))
+            pin.updateGeometryPlacements(self.model, data, self.geometry, placed, self.configuration(state))
+            touching = {k: v for k, v in touching.items() if any(self._touch(i, j, placed) for i, j in v)}
+        if touching:
+            text = ", ".join(sorted(" and ".join(sorted(pair)) for pair in touching))
+            _LOG.warning("links that touch in each of %d random states are not checked: %s", _SAMPLES, text)
+        kept = [pair for link, found in pairs.items() if link not in touching for pair in found]
+        return tuple(sorted(kept)), frozenset(touching)
+
+    def _touch(self, i: int, j: int, placed: pin.GeometryData) -> bool:
+        first, second = (self.geometry.geometryObjects[k].geometry for k in (i, j))
+        places = [coal.Transform3s(placed.oMg[k].rotation, placed.oMg[k].translation) for k in (i, j)]
+        return coal.collide(first, places[0], second, places[1], coal.CollisionRequest(), coal.CollisionResult()) > 0
 
 
 def _half_diagonal(shape: coal.CollisionGeometry) -> float:

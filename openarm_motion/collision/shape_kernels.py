@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numba kernel of two shapes: how far apart some axis proves them to be. m.
 
-A shape is a box (half edges), a cylinder (radius, half length, axis z) or a sphere (radius) at a pose. Only axes that
-are worth it are tried, so what is returned is proven while the true distance may be larger.
+A shape is a box (half edges), a cylinder (radius, half length, axis z), a sphere (radius) or a convex hull at a pose;
+the hull counts as the capsule about it (radius, half length, axis z) here. Only axes that are worth it are tried, so
+what is returned is proven while the true distance may be larger.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from numba import njit
 
 from openarm_common.types import Array, Ints
 
-BOX, CYLINDER, SPHERE = 0, 1, 2
+BOX, CYLINDER, SPHERE, HULL = 0, 1, 2, 3
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -23,19 +24,27 @@ def _extent(kind: int, s0: float, s1: float, s2: float, x: float, y: float, z: f
         return s0 * abs(x) + s1 * abs(y) + s2 * abs(z)
     if kind == CYLINDER:
         return s1 * abs(z) + s0 * math.sqrt(max(0.0, 1.0 - z * z))
-    return s0
+    return s0 + s1 * abs(z) if kind == HULL else s0
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _outside(kind: int, s0: float, s1: float, s2: float, x: float, y: float, z: float) -> float:
-    """Distance of a point from a shape of sizes s, in its frame; 0 inside."""
+    """Distance of a point from a shape of sizes s, in its frame; < 0 inside."""
     if kind == BOX:
-        dx, dy, dz = max(abs(x) - s0, 0.0), max(abs(y) - s1, 0.0), max(abs(z) - s2, 0.0)
+        dx, dy, dz = abs(x) - s0, abs(y) - s1, abs(z) - s2
+        if dx <= 0.0 and dy <= 0.0 and dz <= 0.0:
+            return max(dx, dy, dz)
+        dx, dy, dz = max(dx, 0.0), max(dy, 0.0), max(dz, 0.0)
         return math.sqrt(dx * dx + dy * dy + dz * dz)
     if kind == CYLINDER:
-        dr, dz = max(math.sqrt(x * x + y * y) - s0, 0.0), max(abs(z) - s1, 0.0)
+        dr, dz = math.sqrt(x * x + y * y) - s0, abs(z) - s1
+        if dr <= 0.0 and dz <= 0.0:
+            return max(dr, dz)
+        dr, dz = max(dr, 0.0), max(dz, 0.0)
         return math.sqrt(dr * dr + dz * dz)
-    return max(math.sqrt(x * x + y * y + z * z) - s0, 0.0)
+    if kind == HULL:
+        z = max(abs(z) - s1, 0.0)
+    return math.sqrt(x * x + y * y + z * z) - s0
 
 
 @njit(cache=True, nogil=True)
@@ -48,10 +57,18 @@ def separation(i: int, j: int, enough: float, kinds: Ints, sizes: Array, world: 
     a0, a1, a2 = sizes[i, 0], sizes[i, 1], sizes[i, 2]
     b0, b1, b2 = sizes[j, 0], sizes[j, 1], sizes[j, 2]
     dx, dy, dz = world[j, 0, 3] - world[i, 0, 3], world[j, 1, 3] - world[i, 1, 3], world[j, 2, 3] - world[i, 2, 3]
-    # all in the frame of the first: where the second is (t), and its axes (columns of c)
+    # where the first is seen from the second (-u), and the second from the first (t), whose frame all else is in
+    ux = world[j, 0, 0] * dx + world[j, 1, 0] * dy + world[j, 2, 0] * dz
+    uy = world[j, 0, 1] * dx + world[j, 1, 1] * dy + world[j, 2, 1] * dz
+    uz = world[j, 0, 2] * dx + world[j, 1, 2] * dy + world[j, 2, 2] * dz
+    if ka == SPHERE:
+        return _outside(kb, b0, b1, b2, ux, uy, uz) - a0
     tx = world[i, 0, 0] * dx + world[i, 1, 0] * dy + world[i, 2, 0] * dz
     ty = world[i, 0, 1] * dx + world[i, 1, 1] * dy + world[i, 2, 1] * dz
     tz = world[i, 0, 2] * dx + world[i, 1, 2] * dy + world[i, 2, 2] * dz
+    if kb == SPHERE:
+        return _outside(ka, a0, a1, a2, tx, ty, tz) - b0
+    # the axes of the second are columns of c
     c00 = world[i, 0, 0] * world[j, 0, 0] + world[i, 1, 0] * world[j, 1, 0] + world[i, 2, 0] * world[j, 2, 0]
     c01 = world[i, 0, 0] * world[j, 0, 1] + world[i, 1, 0] * world[j, 1, 1] + world[i, 2, 0] * world[j, 2, 1]
     c02 = world[i, 0, 0] * world[j, 0, 2] + world[i, 1, 0] * world[j, 1, 2] + world[i, 2, 0] * world[j, 2, 2]
@@ -72,7 +89,6 @@ def separation(i: int, j: int, enough: float, kinds: Ints, sizes: Array, world: 
         best = max(best, abs(ty) - a1 - _extent(kb, b0, b1, b2, c10, c11, c12))
         if best >= enough:
             return best
-    ux, uy, uz = tx * c00 + ty * c10 + tz * c20, tx * c01 + ty * c11 + tz * c21, tx * c02 + ty * c12 + tz * c22
     best = max(best, abs(uz) - _extent(kb, b0, b1, b2, 0.0, 0.0, 1.0) - _extent(ka, a0, a1, a2, c02, c12, c22))
     if best >= enough:
         return best
@@ -90,7 +106,7 @@ def separation(i: int, j: int, enough: float, kinds: Ints, sizes: Array, world: 
         best = max(best, gap - _extent(kb, b0, b1, b2, ux / norm, uy / norm, uz / norm))
         if best >= enough:
             return best
-    if ka == CYLINDER:
+    if ka != BOX:
         norm = math.sqrt(tx * tx + ty * ty)
         if norm > 1e-6:
             x, y = tx / norm, ty / norm
@@ -98,7 +114,7 @@ def separation(i: int, j: int, enough: float, kinds: Ints, sizes: Array, world: 
             best = max(best, gap)
             if best >= enough:
                 return best
-    if kb == CYLINDER:
+    if kb != BOX:
         norm = math.sqrt(ux * ux + uy * uy)
         if norm > 1e-6:
             x, y = ux / norm, uy / norm
@@ -106,13 +122,9 @@ def separation(i: int, j: int, enough: float, kinds: Ints, sizes: Array, world: 
             best = max(best, gap)
             if best >= enough:
                 return best
-    if kb == SPHERE:
-        return max(best, _outside(ka, a0, a1, a2, tx, ty, tz) - b0)
-    if ka == SPHERE:
-        return max(best, _outside(kb, b0, b1, b2, ux, uy, uz) - a0)
     # across an edge of each
-    for m in range(2 if ka == CYLINDER else 0, 3):
-        for n in range(2 if kb == CYLINDER else 0, 3):
+    for m in range(0 if ka == BOX else 2, 3):
+        for n in range(0 if kb == BOX else 2, 3):
             vx, vy, vz = (c00, c10, c20) if n == 0 else (c01, c11, c21) if n == 1 else (c02, c12, c22)
             x, y, z = (0.0, -vz, vy) if m == 0 else (vz, 0.0, -vx) if m == 1 else (-vy, vx, 0.0)
             norm = math.sqrt(x * x + y * y + z * z)

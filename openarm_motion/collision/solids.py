@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import Primitive
 from openarm_common.types import Array
+from openarm_motion.collision.hulls import Hull
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +151,11 @@ class Mesh(Solid):
             raise self._refuse("vertices in one plane", "some that span a volume") from error
 
     @cached_property
+    def hull(self) -> Hull:
+        """Corners and fast shapes about it."""
+        return Hull.of(self._hull[0])
+
+    @cached_property
     def _hull(self) -> tuple[Array, NDArray[np.int64]]:
         """Vertices of the hull, and its triangles turned outwards."""
         hull = ConvexHull(self.vertices)
@@ -194,6 +200,8 @@ def box_from(id: str, p: ArrayLike, size: ArrayLike, R: Array | None = None) -> 
 
 def solid_from(id: str, T: Array, shape: Primitive) -> Solid:
     """Body of a shape of the robot description; `T` (4, 4) is its pose."""
+    if shape.corners is not None:
+        return Mesh(id, T, shape.corners)
     if shape.kind == "box":
         return Box(id, T, np.array(shape.size))
     if shape.kind == "cylinder":

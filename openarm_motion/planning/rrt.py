@@ -27,8 +27,9 @@ _ROOM = 20_000
 _CHUNK = 500
 #: Way points that a path may grow by while it is shortened.
 _SPARE = 8
-#: How many times longer the steps of the first search are than those of the final check.
-_COARSE = 3.0
+#: How many times longer the steps of a first search are than those of the final check, and how long the turns of the
+#: joints in it are at least, rad.
+_COARSE, _ROUGH = 3.0, 0.15
 #: Share of the time after which the exact layer gets its turn.
 _SHARE = 0.5
 
@@ -50,7 +51,7 @@ class FastPlanner:
                 return PlannedPath(np.stack([query.start, goal]), i, i + 1)
         end = begin + _SHARE * query.time_limit
         # a coarse search first; what it finds counts only when a fine check agrees
-        for factor in (_COARSE, 1.0):
+        for factor in sorted({1.0, _COARSE, max(_COARSE, _ROUGH / step)}, reverse=True):
             found = self._search(query, scene, (step * factor, travel * factor), end)
             if found is None:
                 break

@@ -16,6 +16,10 @@ from openarm_motion.collision.line_kernels import between_free, line_free
 _SAME = 1e-6
 #: Attempts in a row without success after which a path counts as short.
 _IDLE = 20
+#: Share of samples that are uniform, and how far away others are drawn, rad.
+_UNIFORM, _FAR = 0.05, 6.0
+#: One sample in so many is for the larger tree.
+_TURNS = 20
 
 
 @njit(cache=True, nogil=True)
@@ -29,6 +33,27 @@ def _nearest(tree: Array, count: int, q: Array) -> tuple[int, float]:
         if d < best:
             best, at = d, k
     return at, math.sqrt(best)
+
+
+@njit(cache=True, nogil=True)
+def _draw(tree: Array, count: int, bounds: Array, sample: Array) -> None:
+    """Draw a sample: mostly far away from a configuration of the tree in a random direction, cut off at the bounds.
+
+    Uniform samples pull each configuration towards the middle of the bounds, and those in a narrow place hardly ever
+    along it.
+    """
+    n, square = sample.shape[0], 0.0
+    if np.random.random() < _UNIFORM:
+        for i in range(n):
+            sample[i] = bounds[0, i] + (bounds[1, i] - bounds[0, i]) * np.random.random()
+        return
+    k = int(np.random.random() * count)
+    for i in range(n):
+        sample[i] = np.random.normal()
+        square += sample[i] * sample[i]
+    far = _FAR / math.sqrt(square)
+    for i in range(n):
+        sample[i] = min(max(tree[k, i] + far * sample[i], bounds[0, i]), bounds[1, i])
 
 
 @njit(cache=True, nogil=True)
@@ -46,6 +71,9 @@ def grow(
     seed: int,
 ) -> tuple[int, int, int]:
     """RRT-Connect: grow two trees for a while; call again with another seed to go on.
+
+    Kuffner and LaValle, "RRT-Connect: an efficient approach to single-query path planning", 2000, with the balanced
+    trees of their "An efficient approach to path planning using balanced bidirectional RRT search", 2005.
 
     Args:
         trees: (2, m, n) configurations of the tree from the start and of the one from the goals.
@@ -68,12 +96,12 @@ def grow(
     step, travel = resolution[0], resolution[1]
     sample, new = np.empty(n), np.empty(n)
     for iteration in range(iterations):
-        a = iteration % 2
+        # the smaller tree is the one that is stuck; the other has a turn in case it never comes out
+        a = int(counts[0] > counts[1]) if iteration % _TURNS else int(counts[0] <= counts[1])
         b = 1 - a
         if counts[0] >= room - 1 or counts[1] >= room - 1:
             break
-        for i in range(n):
-            sample[i] = bounds[0, i] + (bounds[1, i] - bounds[0, i]) * np.random.random()
+        _draw(trees[a], counts[a], bounds, sample)
         at, d = _nearest(trees[a], counts[a], sample)
         if d < _SAME:
             continue

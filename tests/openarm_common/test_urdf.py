@@ -58,3 +58,18 @@ def test_faulty_descriptions_are_refused_by_name(find: str, replace: str, words:
     with pytest.raises(OpenArmError, match=words) as caught:
         RobotDescription.from_urdf(MINI.replace(find, replace, 1))
     assert caught.value.code is Code.CONFIG_INVALID
+
+
+@pytest.mark.requirement("A-11")
+def test_a_fixed_joint_has_no_axis_and_follows_nothing() -> None:
+    """As exporters write them: a zero axis, and a mimic of another fixed joint."""
+    text = MINI.replace("</robot>", '<link name="tip"/><link name="tail"/>')
+    for name, parent, child in (("f1", "follow", "tip"), ("f2", "tip", "tail")):
+        text += (
+            f'<joint name="{name}" type="fixed"><parent link="{parent}"/><child link="{child}"/><axis xyz="0 0 0"/>'
+            '<origin xyz="0 0 1"/><mimic joint="f1"/></joint>'
+        )
+    robot = RobotDescription.from_urdf(text + "</robot>")
+    assert robot.joints["f2"].mimic is None
+    follow, tail = (robot.link_pose(link, {"j1": 0.25}) for link in ("follow", "tail"))
+    np.testing.assert_allclose(tail, follow @ se3.make(None, (0, 0, 2)))

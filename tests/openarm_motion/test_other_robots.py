@@ -3,58 +3,31 @@
 
 from __future__ import annotations
 
-import sysconfig
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.robot_models import ABSENT, ROBOTS, TrueMeshes, example_robots, load_arm, states_of
+from benchmarks.robot_problems import FAMILIES, problems
 from openarm_common import se3
 from openarm_common.errors import Code, OpenArmError
 from openarm_motion.collision.fast import FastScene
-from openarm_motion.collision.mesh_boxes import boxes_about, load_robot
+from openarm_motion.collision.robot_meshes import load_robot
 from openarm_motion.collision.solids import box_from
-from openarm_motion.config import LimitsConfig, MotionConfig
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.moves import RequestBoxes, to_pose, to_pose_on_line
+from openarm_motion.planning.rrt import FastPlanner
 from openarm_motion.timing.validation import validate_trajectory
-
-DATA = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix" / "share" / "example-robot-data"
-
-ROBOTS = {
-    "ur5": (
-        "robots/ur_description/urdf/ur5_robot.urdf",
-        "robots/ur_description/srdf/ur5.srdf",
-        MotionConfig(
-            arms=("ur5",),
-            tool_link="tool0",
-            group="manipulator",
-            limits=LimitsConfig(velocity=(3.1,) * 6, acceleration=(8.0,) * 6, jerk=(80.0,) * 6),
-        ),
-        (0.0, -1.2, 1.6, -1.9, -1.6, 0.3),
-    ),
-    "panda": (
-        "robots/panda_description/urdf/panda_collision.urdf",
-        "robots/panda_description/srdf/panda.srdf",
-        MotionConfig(
-            arms=("panda",),
-            tool_link="panda_hand_tcp",
-            group="panda_arm",
-            limits=LimitsConfig(velocity=(2.1,) * 7, acceleration=(7.0,) * 7, jerk=(100.0,) * 7),
-        ),
-        (0.0, -0.6, 0.0, -2.2, 0.0, 1.6, 0.8),
-    ),
-}
 
 
 @pytest.fixture(scope="module", params=list(ROBOTS))
 def robot(request: pytest.FixtureRequest) -> tuple[Arm, np.ndarray]:
     """The arm and a configuration to start from."""
-    if not DATA.is_dir():
-        pytest.skip("example-robot-data is not installed")
-    urdf, srdf, config, start = ROBOTS[request.param]
-    description = load_robot(DATA / urdf, DATA / srdf, {"example-robot-data": DATA})
-    return Arm(request.param, description, config), np.array(start)
+    folder = example_robots()
+    if folder is None:
+        pytest.skip(ABSENT)
+    return load_arm(folder, request.param), np.array(ROBOTS[request.param].start)
 
 
 @pytest.mark.requirement("B-13")
@@ -112,22 +85,21 @@ def test_a_straight_line_stays_on_it(robot: tuple[Arm, np.ndarray]) -> None:
     np.testing.assert_allclose(p[-1], there[:3, 3], atol=1e-4)
 
 
-def test_boxes_hold_every_point_of_a_mesh() -> None:
-    """An L of thin triangles: smaller than one box, and no point is outside."""
-    rng = np.random.default_rng(3)
-    a, b = (
-        rng.uniform((0.0, 0.0, 0.0), (1.0, 0.1, 0.1), (60, 3, 3)),
-        rng.uniform((0, 0, 0), (0.1, 0.1, 0.8), (60, 3, 3)),
-    )
-    triangles = np.concatenate([a, b])
-    boxes = boxes_about(triangles)
-    weights = rng.dirichlet((1.0, 1.0, 1.0), (120, 200))
-    points = np.einsum("nkc,ncd->nkd", weights, triangles).reshape(-1, 3)
-    inside = np.zeros(len(points), np.bool_)
-    for low, high in boxes:
-        inside |= np.all((points >= low - 1e-9) & (points <= high + 1e-9), axis=1)
-    assert inside.all()
-    assert sum(float(np.prod(high - low)) for low, high in boxes) < 0.5 * float(np.prod(np.ptp(points, axis=0)))
+@pytest.mark.requirement("B-07")
+@pytest.mark.parametrize("name", list(ROBOTS))
+def test_problems_are_solved_and_no_path_touches_the_triangles_of_the_meshes(name: str) -> None:
+    folder = example_robots()
+    if folder is None:
+        pytest.skip(ABSENT)
+    arm = load_arm(folder, name, touching=True)
+    judge = TrueMeshes(folder, name, arm.names)
+    for family in FAMILIES:
+        for problem in problems(name, family, 1, 2, arm.kinematics, judge):
+            scene = arm.scene({}, problem.obstacles)  # pyright: ignore[reportArgumentType]
+            now = StartState({}, problem.start)
+            path = FastPlanner().plan(arm.query(scene, now, problem.goals, 20.0)).waypoints
+            hits = judge.around(problem.obstacles)
+            assert not any(hits(q) for q in states_of(path, 0.02)), family
 
 
 def test_a_mesh_of_an_unknown_package_is_refused_by_name(tmp_path: Path) -> None:

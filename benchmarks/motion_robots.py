@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A Panda and a UR5 by their meshes, among shelves, boxes, cages and tables: seven families, 50 problems each.
+
+    python benchmarks/motion_robots.py [--quick] [--only PREFIX] [--json PATH] [--tuning]
+
+Problems are drawn from seeds that nothing was tuned on (`--tuning` takes those that were); see `robot_problems`. The
+peer is OMPL's RRTConnect on the same problems in the same run, with every check made by coal on the same convex hulls,
+along lines at the default steps, which are four times ours.
+A problem counts as feasible when we solve it, or the peer does, or, where both fail, OMPL with coal on the triangles of
+the meshes does within a minute. Every path of both is checked on the triangles, in states so near to each other that no
+joint turns by more than 0.01 rad between them, by code that shares nothing with the collision layers: a state that
+touches is a hit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+
+from benchmarks.report import Row, write_report
+from benchmarks.robot_models import ABSENT, ROBOTS, TrueMeshes, example_robots, load_arm, states_of
+from benchmarks.robot_problems import FAMILIES, RobotProblem, problems
+from openarm_common.errors import Code, OpenArmError
+from openarm_common.types import Array
+from openarm_motion.planning.arm import Arm, StartState
+from openarm_motion.planning.ompl_planner import OmplPlanner
+from openarm_motion.planning.planner import Planner, PlanQuery
+from openarm_motion.planning.rrt import FastPlanner
+
+#: Seeds of problems that steps of the search were chosen on, and of those that figures are reported of.
+_TUNING, _REPORTED = 1, 64_000
+#: Time that each planner has, and that decides whether a problem is feasible, s.
+_LIMIT, _LONG = 5.0, 60.0
+#: Targets over all families, ms.
+_MEDIAN, _P95 = 2.0, 20.0
+_PEER = "OMPL RRTConnect, coal on the same hulls"
+
+
+@dataclass
+class Tally:
+    """What came of the problems of a robot in a family; times in s."""
+
+    robot: str
+    family: str
+    ours: list[float]
+    peer: list[float]
+    solved: int = 0
+    peer_solved: int = 0
+    feasible: int = 0
+    hits: int = 0
+    peer_hits: int = 0
+
+    def line(self) -> str:
+        """A row of the table."""
+        n, (m, p), (pm, pp) = len(self.ours), _percentiles(self.ours), _percentiles(self.peer)
+        return (
+            f"{self.robot:6s} {self.family:17s} {self.solved:4d} {self.peer_solved:5d} {self.feasible:4d}/{n:<4d}"
+            f" {m:8.2f} {p:8.2f} {pm:9.1f} {pp:9.1f} {pm / m:7.1f} {self.hits:5d} {self.peer_hits:6d}"
+        )
+
+    def rows(self) -> list[Row]:
+        """The same for a report."""
+        n, (m, p), (pm, pp) = len(self.ours), _percentiles(self.ours), _percentiles(self.peer)
+        name, whole = f"{self.robot}_{self.family}", self.family == "all"
+        share, peer = (100.0 * k / max(self.feasible, 1) for k in (self.solved, self.peer_solved))
+        return [
+            Row(f"{name}_median_ms", m, "ms", "lower", _MEDIAN if whole else None, _PEER, pm, n),
+            Row(f"{name}_p95_ms", p, "ms", "lower", _P95 if whole else None, _PEER, pp, n),
+            Row(f"{name}_success", share, "%", "higher", 100.0, _PEER, peer, self.feasible),
+            Row(f"{name}_hits", self.hits, "", "lower", 0.0, _PEER, self.peer_hits, n),
+        ]
+
+
+def family_tally(robot: str, family: str, arm: Arm, judge: TrueMeshes, drawn: Sequence[RobotProblem]) -> Tally:
+    """Let both planners solve the problems of a family."""
+    tally = Tally(robot, family, [], [])
+    for problem in drawn:
+        scene = arm.scene({}, problem.obstacles)  # pyright: ignore[reportArgumentType]
+        query = arm.query(scene, StartState({}, problem.start), problem.goals, _LIMIT)
+        if query.fast is None:
+            raise RuntimeError("the query has no fast layer")
+        query.fast()  # a scene is made once and serves all plans in it
+        hits = judge.around(problem.obstacles)
+        path, seconds = _timed(FastPlanner(), query)
+        other, peer_seconds = _timed(OmplPlanner(), replace(query, edge_free=scene.edge_free, fast=None))
+        tally.ours.append(seconds)
+        tally.peer.append(peer_seconds)
+        touched, peer_touched = (_touches(way, hits) for way in (path, other))
+        tally.hits += touched
+        tally.peer_hits += peer_touched
+        tally.solved += path is not None and not touched
+        tally.peer_solved += other is not None and not peer_touched
+        solvable = path is not None or other is not None
+        tally.feasible += solvable or _timed(OmplPlanner(), _on_triangles(query, hits))[0] is not None
+    return tally
+
+
+def _touches(path: Array | None, hits: Callable[[Array], bool]) -> bool:
+    return path is not None and any(hits(q) for q in states_of(path, 0.01))
+
+
+def _on_triangles(query: PlanQuery, hits: Callable[[Array], bool]) -> PlanQuery:
+    """The same problem, with checks on the triangles in place of ours and more time."""
+    goals = np.array([q for q in query.goals if not hits(q)])
+
+    def edge_free(a: Array, b: Array) -> bool:
+        return not any(hits(q) for q in states_of(np.stack([a, b]), 0.05))
+
+    return replace(query, fast=None, goals=goals, collides=hits, edge_free=edge_free, time_limit=_LONG)
+
+
+def _timed(planner: Planner, query: PlanQuery) -> tuple[Array | None, float]:
+    """Way points, None without a plan, and seconds."""
+    begin = time.perf_counter()
+    try:
+        path = planner.plan(query).waypoints
+    except OpenArmError as error:
+        if error.code != Code.NO_PLAN:
+            raise
+        return None, time.perf_counter() - begin
+    return path, time.perf_counter() - begin
+
+
+def _percentiles(seconds: Sequence[float]) -> tuple[float, float]:
+    """Median and p95, ms."""
+    median, p95 = np.percentile(seconds, (50, 95))
+    return float(median) * 1e3, float(p95) * 1e3
+
+
+def _together(robot: str, tallies: Sequence[Tally]) -> Tally:
+    """All families of a robot."""
+    both = Tally(robot, "all", [s for t in tallies for s in t.ours], [s for t in tallies for s in t.peer])
+    for name in ("solved", "peer_solved", "feasible", "hits", "peer_hits"):
+        setattr(both, name, sum(getattr(t, name) for t in tallies))
+    return both
+
+
+def main() -> None:
+    """Run it all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="5 problems a family instead of 50")
+    parser.add_argument("--only", default="", help=f"ROBOT or ROBOT_FAMILY that begins so: {', '.join(FAMILIES)}")
+    parser.add_argument("--tuning", action="store_true", help="the problems that steps of the search were chosen on")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    folder = example_robots()
+    if folder is None:
+        sys.exit(ABSENT)
+    count, seed = 5 if args.quick else 50, _TUNING if args.tuning else _REPORTED
+    print(
+        "robot  family            ours  OMPL feasible   median      p95 OMPL med. OMPL p95   ratio  hits OMPL's   (ms)"
+    )
+    rows: list[Row] = []
+    for robot in ROBOTS:
+        families = [family for family in FAMILIES if f"{robot}_{family}".startswith(args.only)]
+        if not families:
+            continue
+        arm = load_arm(folder, robot, touching=True)
+        judge = TrueMeshes(folder, robot, arm.names)
+        # one problem first, so that everything is compiled
+        family_tally(robot, "", arm, judge, problems(robot, families[0], 1, 0, arm.kinematics, judge))
+        tallies: list[Tally] = []
+        for family in families:
+            drawn = problems(robot, family, count, seed, arm.kinematics, judge)
+            tallies.append(family_tally(robot, family, arm, judge, drawn))
+            print(tallies[-1].line(), flush=True)
+        tallies.append(_together(robot, tallies))
+        print(tallies[-1].line(), flush=True)
+        rows += [row for tally in tallies for row in tally.rows()]
+    write_report(rows, args.json)
+
+
+if __name__ == "__main__":
+    main()
