@@ -16,6 +16,8 @@ cycle is one update from the images of both cameras.
     self_filter_ms         of that: the labels of both images
     flying_ms              of that: the pixels between surfaces in both images
     voxel_mismatch         cells that differ from liboctomap's after all frames, cleared ones among them
+    octree_memory_mb       of the map with all that an update needs; peer: the tree of liboctomap alone
+    hall_...               the same of scans of a hall, see benchmarks/map_hall.py
     map_iou, map_ghosts, map_missed   the map against the geometry of the simulator, true mounts, noisy depth
     clear_ms, mark_ms      simulated time from an object's removal (arrival) to the map without (with) it, worst phase
 
@@ -28,10 +30,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import subprocess
 import sys
-import sysconfig
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -39,10 +39,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.liboctomap import THEIRS, insert
 from benchmarks.map_accuracy import compare
+from benchmarks.map_hall import hall_rows
 from benchmarks.map_scene import MapScene
 from benchmarks.report import Row, write_report
 from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
+from openarm_common.octree.blocks import VoxelBlocks
 from openarm_common.octree.codec import read_file, write_file
 from openarm_common.robot.self_filter import SelfFilter
 from openarm_common.scene.scene import load_scene, random_scene
@@ -54,15 +57,6 @@ from openarm_octomap.mapper import Frame, Mapper
 from openarm_perception.geometry.depth import Deprojector, DepthLimits
 
 PERIOD_NS = 500_000_000
-#: liboctomap's numbers, so that its map and ours can be compared cell by cell.
-THEIRS = {
-    "hit": float(np.float32(np.log(0.7 / 0.3))),
-    "miss": float(np.float32(np.log(0.4 / 0.6))),
-    "clamp_min": float(np.float32(np.log(0.1192 / 0.8808))),
-    "clamp_max": float(np.float32(np.log(0.971 / 0.029))),
-    "max_range": -1.0,
-    "clear_without_return": False,
-}
 
 
 def cpu_ms(work: Callable[[], object], repeats: int) -> float:
@@ -129,13 +123,15 @@ def octree_rows(pairs: Sequence[Sequence[Frame]], repeats: int, python: str) -> 
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         clouds = [frame.scan for pair in pairs for frame in pair]
-        cpp = liboctomap(clouds, Path(folder))
-        if cpp is not None:
-            cycle, states = cpp[0] / len(pairs), read_file(Path(folder) / "peer.bt").on(grid.lattice)[0]
+        peer = insert([(scan.points(), scan.T_base_camera[:3, 3]) for scan in clouds], Path(folder), 0.02, every=2)
+        if peer is not None:
+            cycle, states = peer.ms / len(pairs), read_file(peer.map).on(grid.lattice)[0]
             theirs = np.where(np.isnan(states), UNKNOWN, np.where(states > 0, OCCUPIED, FREE))
-            different = int(np.count_nonzero(theirs != grid.states))
+            different = int(np.count_nonzero(theirs != grid.blocks.states()))
             rows.append(Row("octree_cycle_ms", ours, "ms", "lower", 25.0, "liboctomap C++", cycle, len(times)))
             rows.append(Row("voxel_mismatch", different, "", "lower", 0.0, n=int(np.count_nonzero(theirs))))
+            memory = grid.nbytes / 1e6
+            rows.append(Row("octree_memory_mb", memory, "MB", "lower", None, "liboctomap C++", peer.memory_mb))
         else:
             rows.append(Row("octree_cycle_ms", ours, "ms", "lower", 25.0, n=len(times)))
         write_file(Path(folder) / "ours.bt", grid.binary(), grid.lattice.resolution)
@@ -144,30 +140,6 @@ def octree_rows(pairs: Sequence[Sequence[Frame]], repeats: int, python: str) -> 
             rows.append(Row(f"{key}_ratio", theirs / ours, "x", "higher", None, f"{name} ms", theirs, len(pairs)))
             rows.append(Row(f"{key}_round_trip", int(answer["same"]), "", "higher", 1.0))
     return rows
-
-
-def liboctomap(scans: Sequence[DepthScan], folder: Path) -> tuple[float, float] | None:
-    """Insert frames with liboctomap; CPU time of insertion and encoding together and of encoding, ms."""
-    prefix = Path(sysconfig.get_paths()["purelib"]) / "cmeel.prefix"
-    system = Path("/usr/include/octomap/octomap.h").is_file()
-    if shutil.which("g++") is None or not (system or (prefix / "include/octomap/octomap.h").is_file()):
-        print("liboctomap: no g++ or no headers (Debian: apt-get install g++ liboctomap-dev); left out")
-        return None
-    where = [] if system else [f"-I{prefix}/include", f"-L{prefix}/lib", f"-Wl,-rpath,{prefix}/lib"]
-    source, program = Path(__file__).with_name("liboctomap_peer.cpp"), folder / "peer"
-    # without contraction to fused operations, which make liboctomap differ from itself by a few cells
-    flags = ["-O3", "-march=native", "-ffp-contract=off", "-std=c++17"]
-    subprocess.run(["g++", *flags, str(source), "-o", str(program), *where, "-loctomap", "-loctomath"], check=True)
-    with (folder / "frames").open("wb") as file:
-        np.array([len(scans)], np.int32).tofile(file)
-        for scan in scans:
-            points = scan.points()
-            scan.T_base_camera[:3, 3].astype(np.float32).tofile(file)
-            np.array([len(points)], np.int32).tofile(file)
-            points.tofile(file)
-    arguments = [str(program), str(folder / "frames"), str(folder / "peer.bt"), "1"]
-    answer = subprocess.run(arguments, check=True, capture_output=True, text=True).stdout.split()
-    return float(answer[0]) + float(answer[1]), float(answer[1])
 
 
 def bindings(scans: Sequence[DepthScan], folder: Path, python: str) -> dict[str, dict[str, float]]:
@@ -194,9 +166,10 @@ def full_rows(scene: MapScene, pairs: Sequence[Sequence[Frame]], repeats: int) -
             begin = time.process_time()
             report = mapper.update(pair, distances=distances, wanted={"states"})
             times += [time.process_time() - begin] if turn else []
-    states = report.snapshot.states
-    if states is None:
+    if report.snapshot.states is None:
         raise TypeError("the states were asked for")
+    blocks = VoxelBlocks(mapper.lattice)
+    blocks.set_states(report.snapshot.states, np.array([np.nan, -1.0, 1.0], np.float32))
     transform = DistanceTransform(mapper.lattice, FieldConfig().reach)
     robot = SelfFilter(scene.body, FilterConfig())
 
@@ -213,7 +186,7 @@ def full_rows(scene: MapScene, pairs: Sequence[Sequence[Frame]], repeats: int) -
     return [
         Row("octree_cycle_full_ms", float(np.median(times)) * 1e3, "ms", "lower", 40.0, n=n),
         Row(
-            "distance_field_ms", cpu_ms(lambda: transform.compute(states, distances), repeats), "ms", "lower", 13.0, n=n
+            "distance_field_ms", cpu_ms(lambda: transform.compute(blocks, distances), repeats), "ms", "lower", 13.0, n=n
         ),
         Row("self_filter_ms", cpu_ms(label, repeats), "ms", "lower", None, n=n),
         Row("flying_ms", cpu_ms(drop_flying, repeats), "ms", "lower", 1.0, n=n),
@@ -275,7 +248,7 @@ def main() -> None:
     pairs = record(args.quick)
     scene = MapScene(load_scene("demo"))
     rows = cloud_rows(pairs[0], repeats) + octree_rows(pairs, repeats, args.bindings)
-    rows += full_rows(scene, pairs, repeats)
+    rows += full_rows(scene, pairs, repeats) + hall_rows(1 if args.quick else 3)
     scene.close()
     rows += accuracy_rows(args.quick)
     write_report(rows, args.json)

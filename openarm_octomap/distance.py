@@ -8,8 +8,10 @@ import math
 import numpy as np
 
 from openarm_common.octree import distance_kernels as kernels
+from openarm_common.octree.block_kernels import EDGE
+from openarm_common.octree.blocks import VoxelBlocks
 from openarm_common.octree.lattice import Lattice
-from openarm_common.types import Bytes, Floats
+from openarm_common.types import Floats
 from openarm_octomap.config import UnknownPolicy
 from openarm_octomap.kernels import OCCUPIED, UNKNOWN
 
@@ -30,16 +32,17 @@ class DistanceTransform:
         self._cells = min(math.ceil(reach / lattice.resolution), max(lattice.shape))
         self._cap = np.float32((reach / lattice.resolution) ** 2)
         self._unknown: UnknownPolicy = unknown
-        self._squares = np.empty(lattice.shape, np.float32)
         self._plane = np.empty(lattice.shape[1:], np.float32)
+        # planes along x that were overwritten and are within reach
+        self._ring = np.empty((self._cells, *lattice.shape[1:]), np.float32)
         self._line = np.empty(lattice.shape[2], np.float32)
 
-    def compute(self, states: Bytes, out: Floats) -> None:
-        """Fill `out` (nx, ny, nz), m, from states (nx, ny, nz)."""
-        if self._unknown == "occupied":
-            obstacles = (states == UNKNOWN) | (states == OCCUPIED)
-            kernels.along_z(obstacles.view(np.uint8), 1, 1, self._cap, self._squares)
-        else:
-            kernels.along_z(states, OCCUPIED, OCCUPIED, self._cap, self._squares)
-        kernels.along_y(self._squares, self._cap, self._cells, self._plane)
-        kernels.along_x(self._squares, self._cap, self._cells, self._edge, self._line, out)
+    def compute(self, blocks: VoxelBlocks, out: Floats) -> None:
+        """Fill `out` (nx, ny, nz), m, from cells of the box."""
+        for layer in range(int(blocks.shape[0])):
+            states = blocks.states(slice(layer, layer + 1))
+            if self._unknown == "occupied":
+                states[states == UNKNOWN] = OCCUPIED
+            kernels.along_z(states, OCCUPIED, self._cap, out[EDGE * layer : EDGE * (layer + 1)])
+        kernels.along_y(out, self._cap, self._cells, self._plane)
+        kernels.along_x(out, self._cap, self._cells, self._edge, self._line, self._ring)

@@ -1,28 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map: a bounded box of cells with log-odds, fed with scans.
 
-`OccupancyGrid` is the one mutable object of the package. Coordinates are in the base frame, m. Cells are dense arrays:
-a workspace of 2 × 2 × 1.5 m at 2 cm is 3 MB, and no tree is walked to update it.
+`OccupancyGrid` is the one mutable object of the package. Coordinates are in the base frame, m. Cells are in blocks that
+take memory where something was seen (`openarm_common.octree.blocks`), and what a scan marks are bits: the cells
+of a workspace of 2 × 2 × 1.5 m at 2 cm take 1 MB, and no tree is walked to update it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from openarm_common.camera.cameras import Intrinsics
 from openarm_common.camera.depth_view import DepthView
 from openarm_common.errors import Code, OpenArmError
-from openarm_common.octree.codec import Leaves, OctreeEncoder, Payload
+from openarm_common.octree.block_kernels import CELLS
+from openarm_common.octree.blocks import CellSet, VoxelBlocks, empty_rows, more_rows
+from openarm_common.octree.codec import Leaves, Payload, encode_binary, encode_full
 from openarm_common.octree.lattice import DEPTH, Lattice
 from openarm_common.robot.self_filter import Shapes
-from openarm_common.types import Array, Bytes, Floats
-from openarm_octomap import kernels
+from openarm_common.types import Array, Bytes, Floats, Ints
+from openarm_octomap import cell_kernels, kernels
 from openarm_octomap.config import GridConfig
-from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN, reset_cells
+from openarm_octomap.kernels import FREE, OCCUPIED, UNKNOWN
 
 #: Keys outside of the box that one scan may end in.
 _TABLE = 1 << 20
@@ -65,17 +69,17 @@ class Update:
         ends: Cells that rays ended in.
         valid: Pixels or points that were valid.
         cleared: Rays without a return that cleared.
-        changed: Flat indices of the cells whose state changed.
+        changed: Cells whose state changed.
     """
 
     ends: int
     valid: int
     cleared: int
-    changed: NDArray[np.int32]
+    changed: CellSet
 
 
 class OccupancyGrid:
-    """Cells of a workspace; NaN log-odds are unknown.
+    """Cells of a workspace.
 
     Args:
         config: Workspace, resolution and how fast cells change their state.
@@ -83,20 +87,14 @@ class OccupancyGrid:
 
     def __init__(self, config: GridConfig) -> None:
         self.config = config
-        # eight cells: whole coarse cells at three further depths, and rows of whole words
+        # whole blocks, and so whole coarse cells at three further depths
         self.lattice = Lattice.from_bounds(config.resolution, config.lower, config.upper, align=8)
-        shape = self.lattice.shape
-        self.log_odds: Floats = np.full(shape, np.nan, np.float32)
-        self.states: Bytes = np.zeros(shape, np.uint8)
-        self.seen: NDArray[np.int32] = np.zeros(shape, np.int32)  # ms of the newest observation
-        self._marks = np.zeros(shape, np.uint8)
-        self._ticks = np.zeros(shape, np.uint16)
-        self._tick = 0
+        self.blocks = VoxelBlocks(self.lattice)
+        number = self.lattice.cells // CELLS
+        self._never_seen()
+        self._through, self._hits, self._ended = (np.zeros((number, CELLS // 64), np.uint64) for _ in range(3))
         self._table = np.full(_TABLE, -1, np.int64)
         self._ends = np.empty((0, 3), np.int32)
-        self._changed = np.empty(self.lattice.cells, np.int32)
-        self._key_min = np.array(self.lattice.key_min, np.int64)
-        self._encoder = OctreeEncoder(self.lattice)
         self._epoch_ns: int | None = None
 
     def integrate(self, scans: Sequence[DepthScan | CloudScan], t_ns: int) -> Update:
@@ -110,45 +108,54 @@ class OccupancyGrid:
         ends, valid, cleared = counts.sum(axis=0).tolist()
         return Update(ends, valid, cleared, self._apply(self._milliseconds(t_ns)))
 
-    def decay(self, t_ns: int) -> NDArray[np.int32]:
-        """Make occupied cells unknown that were not observed for `decay_s`; flat indices of those."""
-        if self.config.decay_s <= 0.0:
-            return np.empty(0, np.int32)
-        limit = self._milliseconds(t_ns) - round(self.config.decay_s * 1e3)
-        old = (self.states == OCCUPIED) & (self.seen < limit)
-        self.states[old], self.log_odds[old] = UNKNOWN, np.nan
-        return np.flatnonzero(old).astype(np.int32)
+    def decay(self, t_ns: int) -> CellSet:
+        """Make occupied cells unknown that were not observed for `decay_s`; returns those."""
+        changed, blocks = self.blocks.cell_set(), self.blocks
+        if self.config.decay_s > 0.0:
+            limit = self._milliseconds(t_ns) - round(self.config.decay_s * 1e3)
+            blocks.repeat(
+                lambda: cell_kernels.forget_unseen(blocks.rows, blocks.palette, self._seen, limit, changed.words)
+            )
+        return changed
 
-    def forget(self, shapes: Shapes, padding: float) -> NDArray[np.int32]:
-        """Make the occupied cells unknown that padded shapes fill; flat indices of those.
+    def forget(self, shapes: Shapes, padding: float) -> CellSet:
+        """Make the occupied cells unknown that padded shapes fill; returns those.
 
         Args:
             shapes: The robot, base frame.
             padding: In place of that of the shapes, m.
         """
-        n = reset_cells(
-            shapes.kinds, shapes.halves + padding, shapes.seen_from(np.eye(4)),
-            self.lattice.resolution, self._key_min, self.log_odds, self.states, self._changed,
-        )  # fmt: skip
-        return self._changed[:n].copy()
+        changed, blocks = self.blocks.cell_set(), self.blocks
+        where = (shapes.kinds, shapes.halves + padding, shapes.seen_from(np.eye(4)), self.lattice.resolution)
+        blocks.repeat(
+            lambda: cell_kernels.forget_shapes(
+                *where, blocks.key_min, blocks.shape, blocks.rows, blocks.palette, changed.words
+            )
+        )
+        return changed
 
     def oldest_s(self, t_ns: int) -> float:
         """Return the seconds since the occupied cell was observed that has waited longest; 0 without occupied cells."""
-        seen = self.seen[self.states == OCCUPIED]
-        if not seen.size or self._epoch_ns is None:
+        counts, oldest = self._tally()
+        if counts[OCCUPIED] == 0 or self._epoch_ns is None:
             return 0.0
-        return max(0.0, (t_ns - self._epoch_ns) * 1e-9 - float(seen.min()) * 1e-3)
+        return max(0.0, (t_ns - self._epoch_ns) * 1e-9 - oldest * 1e-3)
 
     def counts(self) -> dict[str, int]:
         """Return how many cells are occupied, free and unknown."""
-        number = np.bincount(self.states.reshape(-1), minlength=3)
+        number = self._tally()[0]
         return {"occupied": int(number[OCCUPIED]), "free": int(number[FREE]), "unknown": int(number[UNKNOWN])}
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the map takes, bytes."""
+        marks = (self._through, self._hits, self._ended, self._table, self._ends)
+        return self.blocks.nbytes + sum(array.nbytes for array in (*self._seen, *marks))
 
     def reset(self) -> None:
         """Forget everything."""
-        self.log_odds[...] = np.nan
-        self.states[...] = UNKNOWN
-        self.seen[...] = 0
+        self.blocks.clear()
+        self._never_seen()
 
     def clear_box(self, lower: ArrayLike, upper: ArrayLike, state: int = FREE) -> int:
         """Make the cells that a box touches free, or unknown.
@@ -170,9 +177,8 @@ class OccupancyGrid:
                 Code.INVALID_ARGUMENT, f"box {a.tolist()} .. {b.tolist()}: expected finite corners, the lower one first"
             )
         box = self.lattice.range_of(a, b)
-        self.log_odds[box] = self.config.clamp_min if state == FREE else np.nan
-        self.states[box] = FREE if state == FREE else UNKNOWN
-        return int(self.states[box].size)
+        self.blocks.fill(box, self.config.clamp_min if state == FREE else np.nan)
+        return math.prod(s.stop - s.start for s in box)
 
     def load(self, leaves: Leaves) -> int:
         """Replace the map; log-odds are cut to the limits of this map.
@@ -183,20 +189,17 @@ class OccupancyGrid:
         Raises:
             OpenArmError: INVALID_ARGUMENT, when the resolutions differ; the map is as it was.
         """
-        values, outside = leaves.on(self.lattice)
-        self.log_odds[...] = np.clip(values, self.config.clamp_min, self.config.clamp_max)
-        known = np.isfinite(self.log_odds)
-        self.states[...] = np.where(known, np.where(self.log_odds >= 0.0, OCCUPIED, FREE), UNKNOWN)
-        self.seen[...] = 0
+        outside = leaves.put(self.blocks, self.config.clamp_min, self.config.clamp_max)
+        self._never_seen()
         return outside
 
     def binary(self) -> Payload:
         """Return the map as OctoMap's binary form."""
-        return self._encoder.binary(self.states)
+        return encode_binary(self.blocks)
 
     def full(self) -> Payload:
         """Return the map as OctoMap's full form."""
-        return self._encoder.full(self.log_odds)
+        return encode_full(self.blocks)
 
     def coarse(self, depth: int) -> tuple[Lattice, Bytes]:
         """States at another depth of the tree: a cell is occupied when any of its parts is, free when any is free.
@@ -207,8 +210,8 @@ class OccupancyGrid:
         Returns:
             The box of coarse cells and their states.
         """
-        states = self.states
-        for level in range(DEPTH - depth):
+        states = self.blocks.halved() if depth < DEPTH else self.blocks.states()
+        for level in range(1, DEPTH - depth):
             finer = self.lattice.coarser(level)
             pads = [(k % 2, (k + n) % 2) for k, n in zip(finer.key_min, finer.shape, strict=True)]
             padded = np.pad(states, pads) if any(map(any, pads)) else states
@@ -219,23 +222,22 @@ class OccupancyGrid:
 
     def states_at(self, points: ArrayLike, depth: int = DEPTH) -> Bytes:
         """Return states (n,) of the cells that contain points (n, 3), m; UNKNOWN outside of the workspace."""
-        lattice, states = self.coarse(depth)
+        lattice, states = (self.lattice, None) if depth == DEPTH else self.coarse(depth)
         index = lattice.indices(np.asarray(points, np.float64).reshape(-1, 3))
         inside = lattice.contains(index)
         out = np.full(index.shape[0], UNKNOWN, np.uint8)
-        out[inside] = states[tuple(index[inside].T)]
+        index = index[inside]
+        out[inside] = self.blocks.states_at(index) if states is None else states[tuple(index.T)]
         return out
 
     def _mark(self, scan: DepthScan | CloudScan) -> tuple[int, int, int]:
         config = self.config
-        self._tick += 1
-        if self._tick > 65535:
-            self._ticks[...] = 0
-            self._tick = 1
+        self._ended[...] = 0
         size = scan.depth.size if isinstance(scan, DepthScan) else scan.points.shape[0]
         if self._ends.shape[0] < size:
             self._ends = np.empty((size, 3), np.int32)
-        kept = (self._marks, self._ticks, self._tick, self._table, self._ends)
+        key_min, axes = self.blocks.key_min, self.blocks.axes
+        kept = (axes, self._hits.reshape(-1), self._ended.reshape(-1), self._table, self._ends)
         if isinstance(scan, DepthScan):
             origin = scan.T_base_camera[:3, 3].astype(np.float32)
             label = np.zeros(scan.depth.shape, np.uint8) if scan.label is None else scan.label
@@ -244,24 +246,47 @@ class OccupancyGrid:
                 config.no_return_block if config.clear_without_return else 0, self._stride(scan.intrinsics),
                 np.float32(config.no_return_range),
                 *scan.rays, np.ascontiguousarray(scan.T_base_camera[:3], dtype=np.float32), label,
-                config.resolution, self._key_min, origin, config.max_range, *kept,
+                config.resolution, key_min, origin, config.max_range, *kept,
             )  # fmt: skip
         else:
             origin, cleared = scan.origin.astype(np.float32), 0
             label = np.zeros(size, np.uint8) if scan.label is None else scan.label
             ends, valid = kernels.cloud_ends(
-                scan.points, label, config.resolution, self._key_min, origin, config.max_range, *kept
+                scan.points, label, config.resolution, key_min, origin, config.max_range, *kept
             )
-        kernels.walk_rays(self._ends, ends, config.resolution, self._key_min, origin, config.max_range, self._marks)
+        through = self._through.reshape(-1)
+        kernels.walk_rays(self._ends, ends, config.resolution, key_min, origin, config.max_range, axes, through)
         return ends, valid, cleared
 
-    def _apply(self, now: int) -> NDArray[np.int32]:
-        config = self.config
-        flat = self._marks.reshape(-1), self.log_odds.reshape(-1), self.states.reshape(-1), self.seen.reshape(-1)
-        numbers = (config.hit_log_odds, config.miss_log_odds, config.clamp_min, config.clamp_max)
-        hit, miss, low, high = (np.float32(v) for v in numbers)
-        n = kernels.apply_marks(*flat, now, hit, miss, low, high, self._changed)
-        return self._changed[:n].copy()
+    def _apply(self, now: int) -> CellSet:
+        config, blocks, changed = self.config, self.blocks, self.blocks.cell_set()
+        deltas = np.array([config.miss_log_odds, config.hit_log_odds], np.float32)
+        limits = np.array([config.clamp_min, config.clamp_max], np.float32)
+        done = 0
+        while done < len(self._hits):
+            done = cell_kernels.apply_marks(
+                self._through, self._hits, done, blocks.rows, blocks.palette, self._seen, now, deltas, limits,
+                changed.words,
+            )  # fmt: skip
+            if done < len(self._hits):
+                blocks.grow()
+                self._more_seen()
+        return changed
+
+    def _tally(self) -> tuple[Ints, int]:
+        """Return cells by state (3,), and when the occupied cell was observed that has waited longest, ms."""
+        counts = np.zeros(3, np.int64)
+        return counts, cell_kernels.tally(self.blocks.rows, self.blocks.palette, self._seen, counts)
+
+    def _more_seen(self) -> None:
+        if self._seen.top[0] == 0:
+            cell_kernels.drop_seen(self.blocks.rows, self.blocks.palette, self._seen)
+            if self._seen.top[0] <= self._seen.pool.shape[0] // 8:  # else this would soon be done again
+                self._seen = more_rows(self._seen)
+
+    def _never_seen(self) -> None:
+        # ms of the newest observation of occupied cells, in rows of 64
+        self._seen = empty_rows(self.lattice.cells // 64, 64, np.int32)
 
     def _stride(self, intrinsics: Intrinsics) -> int:
         """Pixels between rays that clear without a return: no cell within their range is left out between two."""
@@ -272,5 +297,5 @@ class OccupancyGrid:
         """Return the time since the first scan; a clock that was set back begins again."""
         if self._epoch_ns is None or t_ns < self._epoch_ns:
             self._epoch_ns = t_ns
-            self.seen[...] = 0
+            self._never_seen()
         return (t_ns - self._epoch_ns) // 1_000_000

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numba kernels of the map: the cells that rays end in, the exact walk along each ray, log-odds.
+"""Numba kernels of the map: the cells that rays end in, and the exact walk along each ray.
 
 They do what liboctomap does for a cloud whose points are first made unique by cell, with
 the same types in the same order, so that the cells come out identical. Coordinates are in the frame of the map, m;
-keys are those of `octree.lattice`. Marks of a scan: bit 0 a ray went through, bit 1 a ray ended there. The GIL
-is released.
+keys are those of `octree.lattice`. What a scan marks are sets of cells, a bit each, in the order of
+`octree.block_kernels`. The GIL is released.
 """
 
 from __future__ import annotations
@@ -14,11 +14,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from openarm_common.camera.depth_view import DepthImage
+from openarm_common.octree.block_kernels import FREE as FREE
+from openarm_common.octree.block_kernels import OCCUPIED as OCCUPIED
+from openarm_common.octree.block_kernels import UNKNOWN as UNKNOWN
+from openarm_common.octree.block_kernels import Words
 from openarm_common.octree.lattice import KEY_ZERO
-from openarm_common.robot.filter_kernels import Whole, inside
-from openarm_common.types import Array, Bytes, Floats, Ints
+from openarm_common.robot.filter_kernels import Whole
+from openarm_common.types import Bytes, Floats, Ints
 
-Shorts = NDArray[np.uint16]
+Axes = tuple[Ints, ...]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -44,7 +48,7 @@ def image_ends(
     block: int, stride: int, reach: np.float32,
     ray_x: Floats, ray_y: Floats, T: Floats, label: Bytes,
     resolution: float, key_min: Ints, origin: Floats, max_range: float,
-    marks: Bytes, ticks: Shorts, tick: int, table: Ints, ends: NDArray[np.int32],
+    axes: Axes, hits: Words, ended: Words, table: Ints, ends: NDArray[np.int32],
 ) -> tuple[int, int, int]:  # fmt: skip
     """Return cells where the rays of a depth image end, each once; those of surfaces are marked.
 
@@ -61,12 +65,12 @@ def image_ends(
         T: (3, 4) float32, camera in the frame of the map.
         label: (h, w): 0 environment; 1 robot: the ray clears up to it and marks nothing; 2 nothing is known.
         resolution: Edge of a cell, m.
-        key_min: (3,) key of marks[0, 0, 0].
+        key_min: (3,) key of the first cell of the box.
         origin: (3,) the camera.
         max_range: Surfaces further away than this mark nothing, m; negative: none does.
-        marks: (nx, ny, nz), changed.
-        ticks: (nx, ny, nz): which scan last had an end in the cell; changed.
-        tick: Number of this scan, not in `ticks` yet.
+        axes: Of the box, as in `VoxelBlocks`.
+        hits: Cells that a ray ended in, of all scans of an update; changed.
+        ended: Cells of the box that are among `ends`; empty before.
         table: Hash table of the keys outside of the box: a power of two long, all -1 before and after.
         ends: (h * w, 3), filled with keys.
 
@@ -74,7 +78,8 @@ def image_ends(
         How many ends there are, how many pixels had a valid depth, how many rays without return clear.
     """
     h, w = depth.shape
-    nx, ny, nz = marks.shape
+    at_x, at_y, at_z = axes
+    nx, ny, nz = at_x.size, at_y.size, at_z.size
     factor = 1.0 / resolution
     used = np.empty(table.size // 2, np.int32)
     outside, m, valid, cleared = 0, 0, 0, 0
@@ -110,15 +115,17 @@ def image_ends(
             last_x, last_y, last_z, last_hit = x, y, q, hit
             # the same as in `cloud_ends`: a function of all these arrays, inlined or not, takes 1.7 times as long
             if 0 <= x < nx and 0 <= y < ny and 0 <= q < nz:
-                if hit and not marks[x, y, q] & HIT_BIT:
+                at = at_x[x] + at_y[y] + at_z[q]
+                word, bit = np.uint64(at) >> np.uint64(6), np.uint64(1) << np.uint64(at & 63)
+                if hit and not hits[word] & bit:
                     near_enough = True
                     if max_range >= 0.0:
                         near_enough = cell_distance(x, y, q, key_min, resolution, origin) <= max_range
                     if near_enough:
-                        marks[x, y, q] |= HIT_BIT
-                if ticks[x, y, q] == tick:
+                        hits[word] |= bit
+                if ended[word] & bit:
                     continue
-                ticks[x, y, q] = tick
+                ended[word] |= bit
             else:
                 slot = _free_slot(x, y, q, table)
                 if slot < 0 or outside >= used.size:
@@ -157,14 +164,15 @@ def _find_empty(
 def cloud_ends(
     points: Floats, label: Bytes,
     resolution: float, key_min: Ints, origin: Floats, max_range: float,
-    marks: Bytes, ticks: Shorts, tick: int, table: Ints, ends: NDArray[np.int32],
+    axes: Axes, hits: Words, ended: Words, table: Ints, ends: NDArray[np.int32],
 ) -> tuple[int, int]:  # fmt: skip
     """Do as `image_ends` for points (n, 3) float32 in the frame of the map; `label` is (n,), the rest the same.
 
     Returns:
         How many ends there are, and how many points were finite.
     """
-    nx, ny, nz = marks.shape
+    at_x, at_y, at_z = axes
+    nx, ny, nz = at_x.size, at_y.size, at_z.size
     factor = 1.0 / resolution
     used = np.empty(table.size // 2, np.int32)
     outside, m, valid = 0, 0, 0
@@ -180,11 +188,13 @@ def cloud_ends(
         y = int(np.floor(factor * py)) + KEY_ZERO - key_min[1]
         z = int(np.floor(factor * pz)) + KEY_ZERO - key_min[2]
         if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+            at = at_x[x] + at_y[y] + at_z[z]
+            word, bit = np.uint64(at) >> np.uint64(6), np.uint64(1) << np.uint64(at & 63)
             if label[i] == 0 and (max_range < 0.0 or cell_distance(x, y, z, key_min, resolution, origin) <= max_range):
-                marks[x, y, z] |= HIT_BIT
-            if ticks[x, y, z] == tick:
+                hits[word] |= bit
+            if ended[word] & bit:
                 continue
-            ticks[x, y, z] = tick
+            ended[word] |= bit
         else:
             slot = _free_slot(x, y, z, table)
             if slot < 0 or outside >= used.size:
@@ -199,57 +209,6 @@ def cloud_ends(
     return m, valid
 
 
-@njit(cache=True, nogil=True)
-def reset_cells(
-    kinds: Ints, halves: Array, T_shape_base: Array,
-    resolution: float, key_min: Ints, log_odds: Floats, states: Bytes, changed: NDArray[np.int32],
-) -> int:  # fmt: skip
-    """Make the occupied cells unknown whose centre lies in a shape.
-
-    Args:
-        kinds: (n,).
-        halves: (n, 3).
-        T_shape_base: (n, 3, 4).
-        resolution: Edge of a cell, m.
-        key_min: (3,) key of states[0, 0, 0].
-        log_odds: (nx, ny, nz), changed.
-        states: (nx, ny, nz), changed.
-        changed: Filled with the flat indices of the cells.
-
-    Returns:
-        How many cells there were.
-    """
-    count = 0
-    _, ny, nz = states.shape
-    for i in range(kinds.size):
-        T, half = T_shape_base[i], halves[i]
-        lo, hi = np.empty(3, np.int64), np.empty(3, np.int64)
-        for k in range(3):
-            centre = -(T[0, k] * T[0, 3] + T[1, k] * T[1, 3] + T[2, k] * T[2, 3])
-            reach = abs(T[0, k]) * half[0] + abs(T[1, k]) * half[1] + abs(T[2, k]) * half[2]
-            lo[k] = max(int(np.floor((centre - reach) / resolution)) + KEY_ZERO - key_min[k], 0)
-            hi[k] = min(int(np.floor((centre + reach) / resolution)) + KEY_ZERO - key_min[k] + 1, states.shape[k])
-        for a in range(lo[0], hi[0]):
-            x = (a + key_min[0] - KEY_ZERO + 0.5) * resolution
-            for b in range(lo[1], hi[1]):
-                y = (b + key_min[1] - KEY_ZERO + 0.5) * resolution
-                for c in range(lo[2], hi[2]):
-                    if states[a, b, c] != OCCUPIED:
-                        continue
-                    z = (c + key_min[2] - KEY_ZERO + 0.5) * resolution
-                    px = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-                    py = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-                    pz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-                    if inside(kinds[i], px, py, pz, half[0], half[1], half[2]):
-                        states[a, b, c] = UNKNOWN
-                        log_odds[a, b, c] = np.float32(np.nan)
-                        changed[count] = (a * ny + b) * nz + c
-                        count += 1
-    return count
-
-
-FREE_BIT, HIT_BIT = 1, 2
-UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 _HUGE = 1.7976931348623157e308
 
 
@@ -298,7 +257,7 @@ def _first_step(
 @njit(cache=True, nogil=True)
 def walk_rays(
     ends: NDArray[np.int32], count: int, resolution: float, key_min: Ints, origin: Floats, max_range: float,
-    marks: Bytes,
+    axes: Axes, through: Words,
 ) -> int:  # fmt: skip
     """Mark the cells that rays pass through, from the origin to before the centre of each end cell.
 
@@ -309,16 +268,17 @@ def walk_rays(
         ends: (n, 3) cell indices relative to the box.
         count: How many of them count.
         resolution: Edge of a cell, m.
-        key_min: (3,) key of marks[0, 0, 0].
+        key_min: (3,) key of the first cell of the box.
         origin: (3,) where the rays begin, m.
         max_range: Rays end here at the latest, m; negative: no limit.
-        marks: (nx, ny, nz) C-contiguous, changed.
+        axes: Of the box, as in `VoxelBlocks`.
+        through: Cells that a ray went through; changed.
 
     Returns:
         How many steps were made.
     """
-    nx, ny, nz = marks.shape
-    flat = marks.ravel()
+    at_x, at_y, at_z = axes
+    nx, ny, nz = at_x.size, at_y.size, at_z.size
     factor = 1.0 / resolution
     o0, o1, o2 = origin[0], origin[1], origin[2]
     begin_x = int(np.floor(factor * np.float64(o0))) + KEY_ZERO - key_min[0]
@@ -385,87 +345,42 @@ def walk_rays(
         if done:
             continue
         # the box is convex: once the ray is out again it stays out
-        step_x, step_y = sx * ny * nz, sy * nz
         out_x = nx if sx > 0 else -1
         out_y = ny if sy > 0 else -1
         out_z = nz if sz > 0 else -1
-        at = (gx * ny + gy) * nz + gz
-        flat[at] |= FREE_BIT
+        x, y, z = at_x[gx], at_y[gy], at_z[gz]
+        at = np.uint64(x + y + z)
+        through[at >> np.uint64(6)] |= np.uint64(1) << (at & np.uint64(63))
         while True:
             if tx < ty:
                 if tx < tz:
                     gx += sx
                     tx += ax
-                    at += step_x
                     if gx == out_x:
                         break
+                    x = at_x[np.uint64(gx)]
                 else:
                     gz += sz
                     tz += az
-                    at += sz
                     if gz == out_z:
                         break
+                    z = at_z[np.uint64(gz)]
             elif ty < tz:
                 gy += sy
                 ty += ay
-                at += step_y
                 if gy == out_y:
                     break
+                y = at_y[np.uint64(gy)]
             else:
                 gz += sz
                 tz += az
-                at += sz
                 if gz == out_z:
                     break
+                z = at_z[np.uint64(gz)]
             left -= 1
             steps += 1
             if (left == 0 and gx == qx and gy == qy and gz == qz) or min(min(tx, ty), tz) > length:
                 break
-            flat[at] |= FREE_BIT
+            at = np.uint64(x + y + z)
+            through[at >> np.uint64(6)] |= np.uint64(1) << (at & np.uint64(63))
     return steps
-
-
-@njit(cache=True, nogil=True)
-def apply_marks(
-    marks: Bytes, log_odds: Floats, states: Bytes, seen: NDArray[np.int32], now: int,
-    hit: np.float32, miss: np.float32, low: np.float32, high: np.float32, changed: NDArray[np.int32],
-) -> int:  # fmt: skip
-    """Turn marks into log-odds, and clear the marks.
-
-    Args:
-        marks: (n,) flat; a cell that a ray ended in counts as hit, whatever went through it.
-        log_odds: (n,), NaN where unknown.
-        states: (n,) UNKNOWN, FREE, OCCUPIED.
-        seen: (n,) when each cell was last observed.
-        now: Written to `seen`.
-        hit: Added for a hit.
-        miss: Added for a miss.
-        low: Lower limit.
-        high: Upper limit.
-        changed: (n,), filled with the indices of the cells whose state changed.
-
-    Returns:
-        How many states changed.
-    """
-    count = 0
-    words = marks.view(np.uint64)
-    for i in range(words.size):
-        if words[i] == 0:
-            continue
-        for j in range(8 * i, 8 * i + 8):
-            mark = marks[j]
-            if mark == 0:
-                continue
-            value = log_odds[j]
-            if np.isnan(value):
-                value = np.float32(0.0)
-            value = min(value + hit, high) if mark & HIT_BIT else max(value + miss, low)
-            state = OCCUPIED if value >= np.float32(0.0) else FREE
-            if state != states[j]:
-                states[j] = state
-                changed[count] = j
-                count += 1
-            log_odds[j] = value
-            seen[j] = now
-        words[i] = 0
-    return count

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from openarm_common.camera.flying_pixels import FlyingConfig, label_flying
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.octree.blocks import CellSet
 from openarm_common.octree.codec import Payload, encode_states, read_file, write_file
 from openarm_common.octree.lattice import DEPTH, Lattice
 from openarm_common.robot.description import RobotDescription
@@ -89,7 +90,7 @@ class Report:
 
     Attributes:
         snapshot: The map afterwards.
-        changed: Flat indices of the cells whose state changed.
+        changed: Cells whose state changed.
         removed: Pixels or points that each link (or held box) took, by source.
         flying: Pixels that were left out because they float between surfaces, by source.
         reset: Cells that the robot filled.
@@ -98,7 +99,7 @@ class Report:
     """
 
     snapshot: Snapshot
-    changed: NDArray[np.int32]
+    changed: CellSet
     removed: Mapping[str, Mapping[str, int]] = field(default_factory=dict[str, Mapping[str, int]])
     flying: Mapping[str, int] = field(default_factory=dict[str, int])
     reset: int = 0
@@ -181,17 +182,20 @@ class Mapper:
         with self._lock:
             outdated = edition is not None and edition != self._edition
             update = self._grid.integrate([] if outdated else scans, newest.t_ns)
-            changes = [update.changed, self._grid.decay(newest.t_ns)]
+            changed, reset = update.changed, 0
+            changed |= self._grid.decay(newest.t_ns)
             if shapes is not None:
-                changes.append(self._grid.forget(shapes, self._reset_padding))
+                gone = self._grid.forget(shapes, self._reset_padding)
+                changed |= gone
+                reset = gone.size
             if distances is not None:
-                self._transform.compute(self._grid.states, distances)
+                self._transform.compute(self._grid.blocks, distances)
             return Report(
                 snapshot=self._snapshot(wanted),
-                changed=np.unique(np.concatenate(changes)),
+                changed=changed,
                 removed=removed,
                 flying=flying,
-                reset=int(changes[-1].size) if shapes is not None else 0,
+                reset=reset,
                 ends=update.ends,
                 outdated=outdated,
             )
@@ -212,7 +216,7 @@ class Mapper:
     def compute_distances(self, out: Floats) -> None:
         """Fill (nx, ny, nz) with the distance field of the map as it is."""
         with self._lock:
-            self._transform.compute(self._grid.states, out)
+            self._transform.compute(self._grid.blocks, out)
 
     def counts(self, t_ns: int) -> dict[str, float]:
         """Return cells by state, and the longest time since an occupied cell was observed, s."""
@@ -304,7 +308,7 @@ class Mapper:
             lattice=grid.lattice,
             binary=grid.binary(),
             full=grid.full() if "full" in wanted else None,
-            states=grid.states.copy() if "states" in wanted else None,
+            states=grid.blocks.states() if "states" in wanted else None,
         )
 
 

@@ -61,9 +61,10 @@ def link_poses(description: RobotDescription, q: Mapping[str, float]) -> Floats:
 
 def occupied_cells(leaves: Leaves) -> Floats:
     """Centre and edge (n, 4) of the occupied leaves of a map."""
-    cells = leaves.cells[leaves.log_odds > 0.0]
+    cells, log_odds = leaves.arrays()
+    cells = cells[log_odds > 0.0]
     edge = leaves.resolution * (1 << cells[:, 0])
-    lower = (cells[:, 1:4] << cells[:, :1]) - _KEY_ZERO
+    lower = (cells[:, 1:] << cells[:, :1]) - _KEY_ZERO
     centre = lower * leaves.resolution + edge[:, None] / 2.0
     return np.column_stack([centre, edge]).astype(np.float32)
 

@@ -9,6 +9,7 @@ equal bytes. Cells are in the frame of the map, see `openarm_common.octree.latti
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -18,6 +19,8 @@ from numpy.typing import NDArray
 
 from openarm_common.errors import Code, OpenArmError
 from openarm_common.octree import codec_kernels as kernels
+from openarm_common.octree.block_kernels import EDGE, LEVEL, UNKNOWN
+from openarm_common.octree.blocks import VoxelBlocks
 from openarm_common.octree.lattice import DEPTH, Lattice
 from openarm_common.resources import write_whole
 from openarm_common.types import Bytes, Floats, Ints
@@ -31,6 +34,8 @@ CLAMP_MIN, CLAMP_MAX = -2.0, 3.5
 #: A file that is longer is refused before it is read.
 MAX_FILE_BYTES = 256 * 2**20
 
+#: Leaves that are read at a time.
+_PART = 1 << 14
 _FIRST_LINE = {".bt": "# Octomap OcTree binary file", ".ot": "# Octomap OcTree file"}
 _NOTE = "# (feel free to add / change comments, but leave the first line as it is!)\n#"
 
@@ -44,108 +49,106 @@ class Payload:
     binary: bool
 
 
-class OctreeEncoder:
-    """Writes a dense box as an octree; keeps its buffers.
+def encode_binary(blocks: VoxelBlocks) -> Payload:
+    """Write cells as occupied, free and unknown; no bytes at all for a map without a known cell."""
+    levels, states = _Levels(blocks), blocks.palette.states
+    inner = kernels.block_states(
+        blocks.rows, states, blocks.shape, levels.of(levels.states, LEVEL), levels.shift[LEVEL]
+    )
+    for level in range(LEVEL, DEPTH):
+        below, above = (levels.of(levels.states, n) for n in (level, level + 1))
+        kernels.merge_states(below, above, levels.shift[level + 1])
+        inner += int(np.count_nonzero(above == kernels.INNER))
+    if levels.states[-1] == UNKNOWN:
+        return Payload(np.empty(0, np.uint8), 0, True)
+    out = np.empty(2 * inner, np.uint8)
+    n, nodes = kernels.write_states(blocks.rows, states, levels.blocks, levels.states, *levels.layout, out)
+    out.resize(n, refcheck=False)  # in place, without a copy next to it
+    return Payload(out, nodes, True)
 
-    Args:
-        lattice: The box; its faces must lie at even keys.
 
-    Raises:
-        OpenArmError: CONFIG_INVALID, when a face lies at an odd key.
-    """
-
-    def __init__(self, lattice: Lattice) -> None:
-        if any(k % 2 or n % 2 for k, n in zip(lattice.key_min, lattice.shape, strict=True)):
-            raise OpenArmError(
-                Code.CONFIG_INVALID,
-                f"box begins at key {lattice.key_min} and has {lattice.shape} cells; an octree needs even numbers",
-            )
-        self._lattice = lattice
-        self._offset = np.zeros(DEPTH + 1, np.int64)
-        self._shape = np.zeros((DEPTH + 1, 3), np.int64)
-        self._origin = np.zeros((DEPTH + 1, 3), np.int64)
-        self._shift = np.zeros((DEPTH + 1, 3), np.int64)  # of the level below in each level
-        first: Ints = np.array(lattice.key_min, np.int64)
-        end: Ints = first + np.array(lattice.shape, np.int64)
-        total = 0
-        for level in range(DEPTH + 1):
-            if level:
-                parent_first, parent_end = first >> 1, end >> 1
-                first, end = parent_first, parent_end
-                if level < DEPTH:  # the root is a single node
-                    first, end = parent_first & ~1, (parent_end + 1) & ~1
-                self._shift[level] = parent_first - first
-            self._origin[level], self._shape[level], self._offset[level] = first, end - first, total
-            total += int(np.prod(end - first))
-        self._states = np.zeros(total, np.uint8)
-        self._levels = [self._view(self._states, level) for level in range(DEPTH + 1)]
-        self._values = np.zeros(0, np.float32)
-        self._out = np.empty(2 * total + 2, np.uint8)
-
-    def binary(self, states: Bytes) -> Payload:
-        """Write a box of states.
-
-        Args:
-            states: (nx, ny, nz): 0 unknown, 1 free, 2 occupied.
-
-        Returns:
-            The payload; no bytes at all for a map without a known cell. The data is a copy.
-        """
-        self._levels[0][...] = states
-        for level in range(DEPTH):
-            kernels.merge_states(self._levels[level], self._levels[level + 1], self._shift[level + 1])
-        if self._levels[DEPTH][0, 0, 0] == 0:
-            return Payload(np.empty(0, np.uint8), 0, True)
-        n, nodes = kernels.write_states(self._states, self._offset, self._shape, self._origin, self._out)
-        return Payload(self._out[:n].copy(), nodes, True)
-
-    def full(self, log_odds: Floats) -> Payload:
-        """Write a box of log-odds (nx, ny, nz), NaN where unknown; as `binary`."""
-        if not self._values.size:
-            self._values = np.zeros(self._states.size, np.float32)
-        values = [self._view(self._values, level) for level in range(DEPTH + 1)]
-        self._levels[0][...], values[0][...] = ~np.isnan(log_odds), log_odds
-        for level in range(DEPTH):
-            above = level + 1
-            kernels.merge_values(
-                self._levels[level], values[level], self._levels[above], values[above], self._shift[above]
-            )
-        if self._levels[DEPTH][0, 0, 0] == 0:
-            return Payload(np.empty(0, np.uint8), 0, False)
-        known = sum(int(np.count_nonzero(level)) for level in self._levels)
-        out = np.empty(5 * known, np.uint8)
-        raw = self._values.astype("<f4", copy=False).view(np.uint8).reshape(-1, 4)
-        n, nodes = kernels.write_values(self._states, raw, self._offset, self._shape, self._origin, out)
-        return Payload(out[:n].copy(), nodes, False)
-
-    def _view(self, flat: NDArray[ScalarT], level: int) -> NDArray[ScalarT]:
-        start = int(self._offset[level])
-        shape = tuple(int(n) for n in self._shape[level])
-        return flat[start : start + int(np.prod(shape))].reshape(shape)
+def encode_full(blocks: VoxelBlocks) -> Payload:
+    """Write cells with their log-odds; as `encode_binary`."""
+    levels = _Levels(blocks)
+    values = np.zeros(levels.states.size, np.float32)
+    known = kernels.block_values(
+        blocks.rows, blocks.palette, blocks.shape,
+        levels.of(levels.states, LEVEL), levels.of(values, LEVEL), levels.shift[LEVEL],
+    )  # fmt: skip
+    for level in range(LEVEL, DEPTH):
+        below, above = ((levels.of(levels.states, n), levels.of(values, n)) for n in (level, level + 1))
+        kernels.merge_values(*below, *above, levels.shift[level + 1])
+    if levels.states[-1] == UNKNOWN:
+        return Payload(np.empty(0, np.uint8), 0, False)
+    out = np.empty(5 * (known + int(np.count_nonzero(levels.states))), np.uint8)
+    n, nodes = kernels.write_values(
+        blocks.rows, blocks.palette, levels.blocks, levels.states, values.view(np.int32), *levels.layout, out
+    )
+    return Payload(out[:n], nodes, False)
 
 
 def encode_states(lattice: Lattice, states: Bytes) -> Payload:
-    """Write any box of states once; `OctreeEncoder` is the faster way for a box that is written again and again."""
-    padded = np.pad(states, [(k % 2, (k + n) % 2) for k, n in zip(lattice.key_min, lattice.shape, strict=True)])
-    x, y, z = (k - k % 2 for k in lattice.key_min)
-    return OctreeEncoder(Lattice(lattice.resolution, (x, y, z), padded.shape)).binary(padded)
+    """Write any box of states (nx, ny, nz): 0 unknown, 1 free, 2 occupied."""
+    pads = [(k % EDGE, -(k + n) % EDGE) for k, n in zip(lattice.key_min, lattice.shape, strict=True)]
+    padded = np.pad(states, pads)
+    x, y, z = (k - k % EDGE for k in lattice.key_min)
+    blocks = VoxelBlocks(Lattice(lattice.resolution, (x, y, z), padded.shape))
+    blocks.set_states(padded, np.array([np.nan, CLAMP_MIN, CLAMP_MAX], np.float32))
+    return encode_binary(blocks)
+
+
+class _Levels:
+    """Where the nodes of a box of blocks are at levels 3 to 16, and their states.
+
+    Attributes:
+        blocks: (2, 3) key of the first block at level 3, and blocks along each axis.
+        shift: (17, 3) index in each level of the parent of the first node of the level below.
+        layout: (17,) where each level begins in an array of all nodes, (17, 3) shape, (17, 3) key of the first node.
+        states: Of all nodes, 0 at first.
+    """
+
+    def __init__(self, blocks: VoxelBlocks) -> None:
+        offset, total = np.zeros(DEPTH + 1, np.int64), 0
+        shape, origin, self.shift = (np.zeros((DEPTH + 1, 3), np.int64) for _ in range(3))
+        first: Ints = blocks.key_min // EDGE
+        end = first + blocks.shape
+        self.blocks: Ints = np.stack([first, blocks.shape])
+        for level in range(LEVEL, DEPTH + 1):
+            # the root is a single node
+            even, even_end = (first & ~1, (end + 1) & ~1) if level < DEPTH else (first, end)
+            self.shift[level], origin[level], shape[level], offset[level] = first - even, even, even_end - even, total
+            total += int(np.prod(shape[level]))
+            first, end = even >> 1, even_end >> 1
+        self.layout = (offset, shape, origin)
+        self.states: Bytes = np.zeros(total, np.uint8)
+
+    def of(self, flat: NDArray[ScalarT], level: int) -> NDArray[ScalarT]:
+        """Return the part of an array of all nodes that is one level."""
+        start, shape = int(self.layout[0][level]), tuple(int(n) for n in self.layout[1][level])
+        return flat[start : start + int(np.prod(shape))].reshape(shape)
 
 
 @dataclass(frozen=True, eq=False)
 class Leaves:
-    """The leaves of a tree.
+    """The leaves of a tree; they are read from its bytes part by part, as there are many times as many bytes of them.
 
     Attributes:
         resolution: Edge of a cell of level 0, m.
-        cells: (n, 5) level, x, y, z key at that level, and a column of no meaning to readers.
-        log_odds: (n,).
+        raw: The tree, sound.
+        binary: Which form it has.
         nodes: Nodes of the tree, inner ones too.
     """
 
     resolution: float
-    cells: Ints
-    log_odds: Floats
+    raw: Bytes
+    binary: bool
     nodes: int
+
+    def arrays(self) -> tuple[NDArray[np.int32], Floats]:
+        """Return (n, 4) level, x, y, z key at that level, and log-odds (n,)."""
+        parts = [(cells.copy(), values.copy()) for cells, values in _Reader(self.raw, self.binary).parts()]
+        cells, values = zip(*parts, strict=True) if parts else ([np.empty((0, 4), np.int32)], [np.empty(0, np.float32)])
+        return np.concatenate(cells), np.concatenate(values)
 
     def on(self, lattice: Lattice) -> tuple[Floats, int]:
         """Return log-odds of a box, NaN where unknown, and how many leaves lie outside of it, wholly or in part.
@@ -153,11 +156,74 @@ class Leaves:
         Raises:
             OpenArmError: INVALID_ARGUMENT, when the resolutions differ.
         """
+        self._require(lattice)
+        out = np.full(lattice.shape, np.nan, np.float32)
+        where = (np.array(lattice.key_min, np.int64), np.array(lattice.shape, np.int64))
+        return out, sum(kernels.paint(*part, *where, out) for part in _Reader(self.raw, self.binary).parts())
+
+    def put(self, blocks: VoxelBlocks, low: float, high: float) -> int:
+        """Replace cells, log-odds cut to two limits; how many leaves lie outside of the box, wholly or in part.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when the resolutions differ; the cells are as they were.
+        """
+        self._require(blocks.lattice)
+        blocks.clear()
+        outside, shape, nothing = 0, np.array(blocks.lattice.shape, np.int64), np.empty((0, 0, 0), np.float32)
+        for cells, values in _Reader(self.raw, self.binary).parts():
+            outside += kernels.paint(cells, values, blocks.key_min, shape, nothing)
+            blocks.paint(cells, np.clip(values, low, high))
+        return outside
+
+    def _require(self, lattice: Lattice) -> None:
         if abs(lattice.resolution - self.resolution) > 1e-6 * self.resolution:
             raise _invalid(f"the map has cells of {self.resolution:g} m, expected {lattice.resolution:g} m")
-        out = np.full(lattice.shape, np.nan, np.float32)
-        outside = kernels.paint(self.cells, self.log_odds, np.array(lattice.key_min, np.int64), out)
-        return out, outside
+
+
+class _Reader:
+    """Reads the leaves of a tree.
+
+    Args:
+        raw: The tree.
+        binary: Which form it has.
+    """
+
+    def __init__(self, raw: Bytes, binary: bool) -> None:
+        self._raw, self._binary = raw, binary
+        self._stack = np.zeros((8 * (DEPTH + 1), 4), np.int64)
+        self._stack[0, 0] = DEPTH
+        self._at = np.array([1, 0, 1], np.int64)
+
+    @property
+    def used(self) -> int:
+        """Bytes that are read."""
+        return int(self._at[1])
+
+    @property
+    def nodes(self) -> int:
+        """Nodes that are read."""
+        return int(self._at[2])
+
+    def parts(self) -> Iterator[tuple[NDArray[np.int32], Floats]]:
+        """Yield (n, 4) level, x, y, z key at that level, and log-odds (n,), in arrays that the next ones replace.
+
+        Raises:
+            OpenArmError: INVALID_ARGUMENT, when the tree ends too early or is deeper than 16 levels.
+        """
+        if self._raw.size == 0:
+            return
+        cells, values = np.empty((_PART, 4), np.int32), np.empty(_PART, np.float32)
+        free, occupied = np.float32(CLAMP_MIN), np.float32(CLAMP_MAX)
+        while self._at[0] > 0:
+            if self._binary:
+                n = kernels.read_states(self._raw, free, occupied, self._stack, self._at, cells, values)
+            else:
+                n = kernels.read_values(self._raw, self._stack, self._at, cells, values.view(np.int32))
+            if n == kernels.TRUNCATED:
+                raise _damaged(f"ends after {self._raw.size} bytes in the middle of the tree")
+            if n == kernels.TOO_DEEP:
+                raise _damaged(f"goes deeper than {DEPTH} levels at byte {self.used}")
+            yield cells[:n], values[:n]
 
 
 def decode(data: Bytes | bytes, resolution: float, *, binary: bool) -> Leaves:
@@ -175,24 +241,13 @@ def decode(data: Bytes | bytes, resolution: float, *, binary: bool) -> Leaves:
     if not 1e-4 <= resolution <= 100.0:
         raise _invalid(f"res is {resolution} m, expected 0.0001 .. 100")
     raw = np.frombuffer(data, np.uint8) if isinstance(data, bytes) else data.view(np.uint8)
-    if raw.size == 0:
-        return Leaves(resolution, np.empty((0, 5), np.int64), np.empty(0, np.float32), 0)
-    leaves = np.empty((4 * raw.size if binary else raw.size // 5, 5), np.int64)
-    count, used, nodes = kernels.read_states(raw, leaves) if binary else kernels.read_values(raw, leaves)
-    if count == kernels.TRUNCATED:
-        raise _damaged(f"ends after {raw.size} bytes in the middle of the tree")
-    if count == kernels.TOO_DEEP:
-        raise _damaged(f"goes deeper than {DEPTH} levels at byte {used}")
-    if used != raw.size:
-        raise _damaged(f"goes on for {raw.size - used} bytes after the tree's end")
-    cells = leaves[:count].copy()
-    if binary:
-        values = np.where(cells[:, 4] == 2, np.float32(CLAMP_MAX), np.float32(CLAMP_MIN))
-    else:
-        values = raw[cells[:, 4, None] + np.arange(4)].copy().view("<f4")[:, 0].astype(np.float32)
-        if not np.isfinite(values).all():
-            raise _damaged("holds log-odds that are not finite")
-    return Leaves(resolution, cells, values, nodes)
+    reader = _Reader(raw, binary)
+    finite = all([np.isfinite(values).all() for _, values in reader.parts()])  # all parts, that the tree is sound
+    if reader.used != raw.size:
+        raise _damaged(f"goes on for {raw.size - reader.used} bytes after the tree's end")
+    if not finite:
+        raise _damaged("holds log-odds that are not finite")
+    return Leaves(resolution, raw, binary, reader.nodes if raw.size else 0)
 
 
 def write_file(path: Path, payload: Payload, resolution: float) -> None:

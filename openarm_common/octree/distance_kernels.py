@@ -15,13 +15,12 @@ from openarm_common.types import Bytes, Floats
 
 
 @njit(cache=True, nogil=True)
-def along_z(states: Bytes, lowest: int, highest: int, cap: np.float32, out: Floats) -> None:
-    """Compute squared distances along z to the nearest cell with lowest <= state <= highest, cut at `cap`.
+def along_z(states: Bytes, obstacle: int, cap: np.float32, out: Floats) -> None:
+    """Compute squared distances along z to the nearest obstacle, cut at `cap`.
 
     Args:
         states: (nx, ny, nz).
-        lowest: Least state of an obstacle.
-        highest: Largest state of an obstacle.
+        obstacle: State of an obstacle.
         cap: Squared reach, cells.
         out: (nx, ny, nz), filled.
     """
@@ -32,13 +31,13 @@ def along_z(states: Bytes, lowest: int, highest: int, cap: np.float32, out: Floa
             line = out[i, j]
             last = -100000
             for k in range(nz):
-                if lowest <= row[k] <= highest:
+                if row[k] == obstacle:
                     last = k
                 d = np.float32(k - last)
                 line[k] = min(d * d, cap)
             last = 100000
             for k in range(nz - 1, -1, -1):
-                if lowest <= row[k] <= highest:
+                if row[k] == obstacle:
                     last = k
                 d = np.float32(last - k)
                 line[k] = min(line[k], d * d)
@@ -77,16 +76,16 @@ def along_y(squares: Floats, cap: np.float32, reach: int, scratch: Floats) -> No
 
 
 @njit(cache=True, nogil=True)
-def along_x(squares: Floats, cap: np.float32, reach: int, edge: np.float32, scratch: Floats, out: Floats) -> None:
-    """Run the third pass, and convert to metres.
+def along_x(squares: Floats, cap: np.float32, reach: int, edge: np.float32, scratch: Floats, ring: Floats) -> None:
+    """Run the third pass in place, and convert to metres.
 
     Args:
-        squares: (nx, ny, nz) of the pass before.
+        squares: (nx, ny, nz) of the pass before; distances afterwards, m.
         cap: Squared reach, cells.
         reach: Cells.
         edge: Edge of a cell, m.
         scratch: (nz,).
-        out: (nx, ny, nz) distances, m.
+        ring: (reach, ny, nz): squares of the last planes that hold distances already.
     """
     nx, ny, nz = squares.shape
     near = np.empty((nx, ny), np.bool_)
@@ -105,10 +104,11 @@ def along_x(squares: Floats, cap: np.float32, reach: int, edge: np.float32, scra
                 if other == i or not near[other, j]:
                     continue
                 d = np.float32((other - i) * (other - i))
-                source = squares[other, j]
+                source = squares[other, j] if other > i else ring[other % reach, j]
                 for k in range(nz):
                     candidate = source[k] + d
                     line[k] = candidate if candidate < line[k] else line[k]
-            target = out[i, j]
+            target, kept = squares[i, j], ring[i % reach, j]
             for k in range(nz):
+                kept[k] = target[k]
                 target[k] = np.sqrt(line[k]) * edge

@@ -22,7 +22,7 @@ from openarm_common.types import Array, Ints, Mask
 DEPTH = 16
 #: Key of the cell that begins at 0 m.
 KEY_ZERO = 1 << (DEPTH - 1)
-#: More cells than this are refused: 1 GB of log-odds.
+#: More cells than this are refused: 1 GB for a distance of each.
 MAX_CELLS = 1 << 28
 
 Triple = tuple[int, int, int]

@@ -14,6 +14,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from openarm_common.octree.blocks import CellSet
 from openarm_common.octree.codec import TREE_ID, Payload
 from openarm_common.octree.lattice import Lattice
 from openarm_common.ros.convert import cloud_from_fields, cloud_from_points, header
@@ -51,22 +52,21 @@ def centres_msg(lattice: Lattice, states: NDArray[np.uint8], frame: str, t_ns: i
     return cloud_from_points(points, frame, t_ns)
 
 
-def changes_msg(
-    lattice: Lattice, states: NDArray[np.uint8], changed: NDArray[np.int32], frame: str, t_ns: int
-) -> PointCloud2:
+def changes_msg(lattice: Lattice, states: NDArray[np.uint8], changed: CellSet, frame: str, t_ns: int) -> PointCloud2:
     """Return cells whose state changed, with a field `state`: 0 unknown, 1 free, 2 occupied.
 
     Args:
         lattice: Which cells.
         states: (nx, ny, nz).
-        changed: Flat indices.
+        changed: The cells.
         frame: Base frame.
         t_ns: Stamp.
     """
-    index = np.stack(np.unravel_index(changed, lattice.shape), axis=-1)
-    rows = np.empty((changed.size, 4), np.float32)
+    flat = changed.indices()
+    index = np.stack(np.unravel_index(flat, lattice.shape), axis=-1)
+    rows = np.empty((flat.size, 4), np.float32)
     rows[:, :3] = lattice.centres(index)
-    rows[:, 3] = states.reshape(-1)[changed]
+    rows[:, 3] = states.reshape(-1)[flat]
     return cloud_from_fields(("x", "y", "z", "state"), rows, frame, t_ns)
 
 

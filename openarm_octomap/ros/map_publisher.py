@@ -5,14 +5,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from nav_msgs.msg import OccupancyGrid
-from numpy.typing import NDArray
 from octomap_msgs.msg import Octomap
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
+from openarm_common.octree.blocks import CellSet
 from openarm_common.ros.node import QOS_LATCHED
 from openarm_octomap.mapper import Snapshot
 from openarm_octomap.ros import convert
@@ -44,13 +43,13 @@ class MapPublisher:
         wanted = {"states"} if listening or self._changes.get_subscription_count() else set[str]()
         return wanted | ({"full"} if self._full_wanted else set())
 
-    def publish(self, snapshot: Snapshot, t_ns: int, changed: NDArray[np.int32] | None = None) -> None:
+    def publish(self, snapshot: Snapshot, t_ns: int, changed: CellSet | None = None) -> None:
         """Publish a snapshot; without `changed` it is a new map, which all topics show at once.
 
         Args:
             snapshot: The map.
             t_ns: Stamp.
-            changed: Flat indices of the cells whose state changed.
+            changed: Cells whose state changed.
         """
         resolution = snapshot.lattice.resolution
         self._binary.publish(convert.octomap_msg(snapshot.binary, resolution, self._frame, t_ns))

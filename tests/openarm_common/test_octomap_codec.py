@@ -11,11 +11,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openarm_common.errors import OpenArmError
-from openarm_common.octree.codec import OctreeEncoder, decode, read_file, write_file
+from openarm_common.octree.blocks import VoxelBlocks
+from openarm_common.octree.codec import Payload, decode, encode_full, encode_states, read_file, write_file
 from openarm_common.octree.lattice import Lattice
 
 LATTICE = Lattice.from_bounds(0.02, (-0.16, -0.16, -0.08), (0.16, 0.16, 0.24), align=8)
-ENCODER = OctreeEncoder(LATTICE)
+
+
+def full(log_odds: np.ndarray) -> Payload:
+    """The full form of a box of log-odds."""
+    blocks = VoxelBlocks(LATTICE)
+    index = np.argwhere(~np.isnan(log_odds))
+    cells = np.column_stack([np.zeros(len(index)), index + LATTICE.key_min]).astype(np.int32)
+    blocks.paint(cells, log_odds[tuple(index.T)])
+    return encode_full(blocks)
 
 
 def states_of(seed: int) -> np.ndarray:
@@ -33,18 +42,18 @@ def test_one_voxel_is_thirty_two_bytes() -> None:
     """Sixteen inner nodes of two bytes; the voxel at (0, 0, 0) is child 7 of the root and child 0 from there on."""
     states = np.zeros(LATTICE.shape, np.uint8)
     states[8, 8, 8] = 2
-    payload = ENCODER.binary(states)
+    payload = encode_states(LATTICE, states)
     assert payload.nodes == 17
     assert payload.data.tobytes() == b"\x00\xc0" + b"\x03\x00" * 14 + b"\x02\x00"
     states[8, 8, 8] = 1
-    assert ENCODER.binary(states).data.tobytes()[-2:] == b"\x01\x00"
+    assert encode_states(LATTICE, states).data.tobytes()[-2:] == b"\x01\x00"
 
 
 def test_an_empty_map_has_no_bytes() -> None:
     """Readers remove the map then."""
     empty = np.zeros(LATTICE.shape, np.uint8)
-    assert ENCODER.binary(empty).data.size == 0
-    assert ENCODER.full(np.full(LATTICE.shape, np.nan, np.float32)).data.size == 0
+    assert encode_states(LATTICE, empty).data.size == 0
+    assert full(np.full(LATTICE.shape, np.nan, np.float32)).data.size == 0
     values, outside = decode(b"", 0.02, binary=True).on(LATTICE)
     assert outside == 0
     assert np.isnan(values).all()
@@ -55,7 +64,7 @@ def test_an_empty_map_has_no_bytes() -> None:
 @pytest.mark.requirement("A-57")
 def test_binary_round_trip(seed: int) -> None:
     states = states_of(seed)
-    leaves = decode(ENCODER.binary(states).data, 0.02, binary=True)
+    leaves = decode(encode_states(LATTICE, states).data, 0.02, binary=True)
     values, outside = leaves.on(LATTICE)
     assert outside == 0
     np.testing.assert_array_equal(np.where(np.isnan(values), 0, np.where(values > 0, 2, 1)), states)
@@ -68,7 +77,7 @@ def test_full_round_trip(seed: int) -> None:
     rng = np.random.default_rng(seed)
     levels = np.array([np.nan, -2.0, -0.405, 0.442, 3.5], np.float32)
     log_odds = levels[(states_of(seed) + rng.integers(0, 3)) % 5]
-    payload = ENCODER.full(log_odds)
+    payload = full(log_odds)
     values, outside = decode(payload.data, 0.02, binary=False).on(LATTICE)
     assert outside == 0
     np.testing.assert_array_equal(values, log_odds)
@@ -76,7 +85,7 @@ def test_full_round_trip(seed: int) -> None:
 
 def test_what_lies_outside_of_a_box_is_counted() -> None:
     states = np.ones(LATTICE.shape, np.uint8)
-    leaves = decode(ENCODER.binary(states).data, 0.02, binary=True)
+    leaves = decode(encode_states(LATTICE, states).data, 0.02, binary=True)
     half = Lattice(0.02, LATTICE.key_min, (8, 16, 16))
     values, outside = leaves.on(half)
     assert outside > 0
@@ -93,7 +102,7 @@ def test_random_bytes_are_read_or_refused_never_worse(data: bytes, binary: bool)
     except OpenArmError as error:
         assert "octree is damaged" in error.message  # noqa: PT017
     else:
-        assert np.isfinite(leaves.log_odds).all()
+        assert np.isfinite(leaves.arrays()[1]).all()
 
 
 @settings(max_examples=60)
@@ -101,7 +110,7 @@ def test_random_bytes_are_read_or_refused_never_worse(data: bytes, binary: bool)
 def test_a_damaged_file_is_refused_or_reads_as_some_tree(tmp_path_factory, data) -> None:
     """Cut, lengthened or with bytes changed; a change that leaves a well-formed tree can't be seen."""
     path = tmp_path_factory.mktemp("damage") / "map.ot"
-    write_file(path, ENCODER.full(np.where(states_of(3) == 2, np.float32(1.0), np.float32(np.nan))), 0.02)
+    write_file(path, full(np.where(states_of(3) == 2, np.float32(1.0), np.float32(np.nan))), 0.02)
     content = bytearray(path.read_bytes())
     kind = data.draw(st.sampled_from(["cut", "longer", "changed"]))
     if kind == "cut":
@@ -150,7 +159,7 @@ def test_files_that_are_none_are_refused_with_the_reason(content: bytes, text: s
 def test_missing_files_and_wrong_suffixes_are_named(tmp_path: Path) -> None:
     with pytest.raises(OpenArmError, match="can't be read"):
         read_file(tmp_path / "none.bt")
-    payload = ENCODER.binary(states_of(1))
+    payload = encode_states(LATTICE, states_of(1))
     with pytest.raises(OpenArmError, match=r"needs the suffix \.bt"):
         write_file(tmp_path / "map.ot", payload, 0.02)
     with pytest.raises(OpenArmError, match="can't be written"):
@@ -158,6 +167,7 @@ def test_missing_files_and_wrong_suffixes_are_named(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_boxes_at_odd_keys_are_refused() -> None:
-    with pytest.raises(OpenArmError, match="even"):
-        OctreeEncoder(Lattice(0.02, (1, 0, 0), (2, 2, 2)))
+def test_a_box_of_blocks_begins_and_ends_between_blocks() -> None:
+    for key, n in ((4, 8), (8, 12)):
+        with pytest.raises(OpenArmError, match="multiples of 8"):
+            VoxelBlocks(Lattice(0.02, (key, 0, 0), (n, 8, 8)))

@@ -7,10 +7,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
+from openarm_common.octree.blocks import VoxelBlocks
 from openarm_common.octree.lattice import Lattice
 from openarm_octomap.distance import DistanceTransform
 
-LATTICE = Lattice.from_bounds(0.02, (0, 0, 0), (0.8, 0.6, 0.48))
+LATTICE = Lattice.from_bounds(0.02, (0, 0, 0), (0.8, 0.64, 0.48))
+
+
+def blocks_of(states: np.ndarray) -> VoxelBlocks:
+    blocks = VoxelBlocks(LATTICE)
+    blocks.set_states(states, np.array([np.nan, -1.0, 1.0], np.float32))
+    return blocks
 
 
 @pytest.mark.parametrize("density", [0.0, 1e-5, 1e-4, 1e-3, 0.1, 1.0])
@@ -20,7 +27,7 @@ def test_distances_equal_scipy_cut_at_the_reach(density: float, reach: float) ->
     states = rng.integers(0, 2, LATTICE.shape).astype(np.uint8)
     states[rng.random(LATTICE.shape) < density] = 2
     out = np.empty(LATTICE.shape, np.float32)
-    DistanceTransform(LATTICE, reach).compute(states, out)
+    DistanceTransform(LATTICE, reach).compute(blocks_of(states), out)
     truth = np.full(LATTICE.shape, reach)
     if (states == 2).any():
         truth = np.minimum(distance_transform_edt(states != 2) * 0.02, reach)
@@ -31,7 +38,7 @@ def test_unknown_cells_count_as_asked() -> None:
     states = np.ones(LATTICE.shape, np.uint8)
     states[5, 5, 5] = 0
     out = np.empty(LATTICE.shape, np.float32)
-    DistanceTransform(LATTICE, 0.4, "occupied").compute(states, out)
+    DistanceTransform(LATTICE, 0.4, "occupied").compute(blocks_of(states), out)
     assert out[5, 5, 7] == pytest.approx(0.04)
-    DistanceTransform(LATTICE, 0.4, "free").compute(states, out)
+    DistanceTransform(LATTICE, 0.4, "free").compute(blocks_of(states), out)
     np.testing.assert_allclose(out, 0.4, rtol=1e-6)

@@ -71,7 +71,7 @@ def test_cells_equal_liboctomap_after_ten_frames_with_clearing(accumulated, refe
     assert outside == 0
     states = np.where(np.isnan(theirs), UNKNOWN, np.where(theirs > 0, OCCUPIED, FREE))
     assert np.count_nonzero(states == OCCUPIED) > 4000
-    np.testing.assert_array_equal(accumulated.states, states)
+    np.testing.assert_array_equal(accumulated.blocks.states(), states)
 
 
 @pytest.mark.requirement("A-57")
@@ -98,14 +98,14 @@ def test_a_smaller_workspace_holds_the_same_cells_also_with_the_camera_outside(a
     first = np.array(small.lattice.key_min) - accumulated.lattice.key_min
     cut = tuple(slice(a, a + n) for a, n in zip(first, small.lattice.shape, strict=True))
     assert small.counts()["occupied"] > 200
-    np.testing.assert_array_equal(small.log_odds, accumulated.log_odds[cut])
+    np.testing.assert_array_equal(small.blocks.log_odds(), accumulated.blocks.log_odds()[cut])
 
 
 def test_a_cloud_gives_the_same_map_as_its_image(accumulated, reference) -> None:
     grid = OccupancyGrid(liboctomap())
     for i, (depth, T) in enumerate(reference.frames()):
         grid.integrate([CloudScan(reference.points(depth, T), T[:3, 3])], i)
-    np.testing.assert_array_equal(grid.log_odds, accumulated.log_odds)
+    np.testing.assert_array_equal(grid.blocks.log_odds(), accumulated.blocks.log_odds())
 
 
 @settings(max_examples=40)
@@ -117,14 +117,14 @@ def test_every_ray_is_free_up_to_its_end(seed: int, limited: bool) -> None:
     T = se3.make(se3.exp_so3(rng.normal(size=3)), rng.uniform(-1.0, 1.0, 3))
     image = scan(rng.integers(0, 2000, (48, 64)).astype(np.uint16), T)
     grid.integrate([image], 0)
-    assert not grid._marks.any()
+    assert not np.any([grid._through, grid._hits])
     ends = image.points().astype(np.float64)[::50]
     cells = grid.lattice.indices(ends)
     inside = grid.lattice.contains(cells)
     centres, origin = grid.lattice.centres(cells), T[:3, 3].astype(np.float32).astype(np.float64)
     distance = np.linalg.norm(centres - origin, axis=1)
     hit = inside & ((distance <= 0.88) if limited else True)
-    assert (grid.states[tuple(cells[hit].T)] == OCCUPIED).all()
+    assert (grid.blocks.states()[tuple(cells[hit].T)] == OCCUPIED).all()
     for centre, far in zip(centres, distance, strict=True):
         u = np.linspace(0.0, 1.0, 50)[:-2, None] * (min(1.0, 0.85 / far) if limited else 1.0)
         way = origin + u * (centre - origin)
@@ -132,7 +132,7 @@ def test_every_ray_is_free_up_to_its_end(seed: int, limited: bool) -> None:
         frac = np.abs(way / 0.02 - np.round(way / 0.02)).min(axis=1)
         at = grid.lattice.indices(way[frac > 0.02])
         at = at[grid.lattice.contains(at)]
-        assert (grid.states[tuple(at.T)] != UNKNOWN).all()
+        assert (grid.blocks.states()[tuple(at.T)] != UNKNOWN).all()
 
 
 @pytest.mark.requirement("A-55", "A-56")
@@ -206,9 +206,9 @@ def test_robot_pixels_clear_up_to_the_robot_and_mark_nothing() -> None:
     assert grid.states_at([(0.0, 0.0, 0.31), (0.0, 0.0, 0.21), (0.0, 0.0, 0.11)]).tolist() == [FREE, UNKNOWN, UNKNOWN]
     # where nothing is known of a view, it neither marks nor clears
     label[...] = 2
-    before = grid.log_odds.copy()
+    before = grid.blocks.log_odds()
     grid.integrate([scan(floor(), label=label), scan(np.zeros((48, 64), np.uint16), label=label)], 1)
-    np.testing.assert_array_equal(grid.log_odds, before)
+    np.testing.assert_array_equal(grid.blocks.log_odds(), before)
 
 
 @pytest.mark.requirement("P-06")
@@ -232,7 +232,7 @@ def test_coarse_queries_keep_what_is_occupied() -> None:
     """A cell of 4, 8, 16 cm is occupied when a part of it is; centres lie on OctoMap's lattice of that edge."""
     grid = OccupancyGrid(GridConfig(**SMALL))
     grid.integrate([scan(floor(box=(slice(20, 28), slice(28, 36), 890)))], 0)
-    fine = grid.lattice.centres(np.argwhere(grid.states == OCCUPIED))
+    fine = grid.lattice.centres(np.argwhere(grid.blocks.states() == OCCUPIED))
     for depth in (16, 15, 14, 13):
         lattice, states = grid.coarse(depth)
         assert lattice.resolution == pytest.approx(0.02 * 2 ** (16 - depth))
@@ -280,14 +280,14 @@ def test_load_replaces_the_map_and_another_resolution_is_refused(accumulated, re
     grid = OccupancyGrid(liboctomap())
     write_file(tmp_path / "map.ot", accumulated.full(), 0.02)
     assert grid.load(read_file(tmp_path / "map.ot")) == 0
-    np.testing.assert_array_equal(grid.log_odds, accumulated.log_odds)
-    np.testing.assert_array_equal(grid.states, accumulated.states)
+    np.testing.assert_array_equal(grid.blocks.log_odds(), accumulated.blocks.log_odds())
+    np.testing.assert_array_equal(grid.blocks.states(), accumulated.blocks.states())
     coarse = OccupancyGrid(GridConfig(resolution=0.05, **SMALL))
     coarse.clear_box((0, 0, 0), (0.1, 0.1, 0.1))
-    before = coarse.states.copy()
+    before = coarse.blocks.states()
     with pytest.raises(OpenArmError, match=r"cells of 0\.02 m, expected 0\.05 m"):
         coarse.load(read_file(reference.data / "reference.bt"))
-    np.testing.assert_array_equal(coarse.states, before)
+    np.testing.assert_array_equal(coarse.blocks.states(), before)
 
 
 @pytest.mark.parametrize(
@@ -319,10 +319,10 @@ def test_no_image_harms_the_map(data) -> None:
     p = [data.draw(st.sampled_from([0.0, 0.3, -5.0, 900.0])) for _ in range(3)]
     grid = GRID
     grid.integrate([scan(depth, se3.make(None, p), intrinsics=Intrinsics(w, h, f, f, 0.0, 0.0))], 0)
-    known = np.isfinite(grid.log_odds)
-    assert np.abs(grid.log_odds[known]).max(initial=0.0) <= 2.0
-    np.testing.assert_array_equal(grid.states == UNKNOWN, ~known)
-    assert not grid._marks.any()
+    known = np.isfinite(grid.blocks.log_odds())
+    assert np.abs(grid.blocks.log_odds()[known]).max(initial=0.0) <= 2.0
+    np.testing.assert_array_equal(grid.blocks.states() == UNKNOWN, ~known)
+    assert not np.any([grid._through, grid._hits])
     assert (grid._table == -1).all()
 
 
