@@ -18,6 +18,18 @@ from openarm_common.errors import Code, OpenArmError
 if TYPE_CHECKING:
     from openarm_bringup.ros.peer import Peer
 
+
+def _known_arms(_: object, value: str | list[str] | None) -> None:
+    from openarm_common.robot.folder import known_arm
+
+    for arm in [value] if isinstance(value, str) else value or ():
+        known_arm(arm)
+
+
+#: An arm of the robot, or auto.
+Arm = Annotated[str, Parameter(validator=_known_arms)]
+Arms = Annotated[list[str] | None, Parameter(validator=_known_arms)]
+
 Domain = Annotated[
     int | None,
     Parameter(help="ROS_DOMAIN_ID of the graph; found automatically when one graph runs on this machine."),

@@ -7,7 +7,7 @@ from typing import Literal
 
 from cyclopts import App
 
-from openarm_bringup.commands.connect import Domain, join_graph, requires_node
+from openarm_bringup.commands.connect import Arm, Domain, join_graph, requires_node
 from openarm_bringup.outcome import Outcome
 
 grasp = App(name="grasp", help="The states of a grasp; release of a hand.")
@@ -28,7 +28,7 @@ def graph(*, form: Literal["text", "mermaid"] = "text") -> Outcome:
 
 
 @grasp.command
-def release(*, arm: str = "", domain: Domain = None) -> Outcome:
+def release(*, arm: Arm = "", domain: Domain = None) -> Outcome:
     """Open a hand where it is: what it holds falls from there. `openarm pick --phase place` puts it down instead.
 
     Args:

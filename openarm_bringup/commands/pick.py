@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from openarm_bringup.commands.connect import Domain, join_graph, requires_node
+from openarm_bringup.commands.connect import Arms, Domain, join_graph, requires_node
 from openarm_bringup.outcome import Outcome, as_text, console
 from openarm_common.errors import Code, OpenArmError
 
@@ -29,7 +29,7 @@ def pick(
     label: str = "",
     second: str = "",
     *,
-    arm: list[str] | None = None,
+    arm: Arms = None,
     at: list[tuple[float, float]] | None = None,
     place: list[tuple[float, float, float]] | None = None,
     yaw: list[float] | None = None,

@@ -15,15 +15,16 @@ from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from aiohttp import WSCloseCode, WSMsgType, web
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from openarm_bringup.view.gate import one_answer
 from openarm_bringup.view.guard import Guard
 from openarm_common.config import Config, describe_faults
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.folder import known_arm
 
 if TYPE_CHECKING:
     from openarm_bringup.view.ros.page import GraphView
@@ -54,7 +55,7 @@ class Order(Config):
     """A grasp that a page asks for."""
 
     label: str = Field(default="", max_length=64, description="what to pick; empty = the best detection")
-    arm: str = "auto"
+    arm: Annotated[str, AfterValidator(known_arm)] = "auto"
     dry_run: bool = False
     confirm: bool = False
 

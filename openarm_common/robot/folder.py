@@ -82,6 +82,18 @@ def robot_names() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in (models_dir() / "robots").glob("*/robot.yaml")))
 
 
+def known_arm(arm: str) -> str:
+    """Return the name of an arm of this process's robot, or "auto" or "", which leave the choice to the suite.
+
+    Raises:
+        ValueError: Listing the arms.
+    """
+    arms = load_folder(robot_name())[1].arms
+    if arm not in ("auto", "", *arms):
+        raise ValueError(f"arm {arm[:80]!r} does not exist; valid: auto, {', '.join(arms)}")
+    return arm
+
+
 def load_folder(name: str) -> tuple[Path, RobotFolder]:
     """Read `robot.yaml` of a robot; returns its folder, too.
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from openarm_bringup.commands.connect import Sets
+from openarm_bringup.commands.connect import Arm, Sets
 from openarm_evaluation.campaign.options import Seeds
 
 
@@ -33,7 +33,7 @@ class DemoOptions:
 
     seeds: Seeds = ()
     label: str | None = None
-    arm: str = "auto"
+    arm: Arm = "auto"
     place: tuple[float, float, float] | None = None
     scene: str | None = None
     graph: str = "sim"

@@ -112,11 +112,12 @@ class OccupancyMap:
         occupied = np.zeros(shape, np.uint8)
         occupied[tuple(self.indices.T)] = 1
         cap, cells = np.float32((_REACH / edge) ** 2), int(np.ceil(_REACH / edge))
-        squares, out = np.empty(shape, np.float32), np.empty(shape, np.float32)
-        kernels.along_z(occupied, 1, 1, cap, squares)
-        kernels.along_y(squares, cap, cells, np.empty(shape[1:], np.float32))
-        kernels.along_x(squares, cap, cells, np.float32(edge), np.empty(shape[2], np.float32), out)
-        return DistanceMap(out, self.lattice.lower, edge, _REACH)
+        plane, ring = np.empty(shape[1:], np.float32), np.empty((cells, *shape[1:]), np.float32)
+        squares = np.empty(shape, np.float32)
+        kernels.along_z(occupied, 1, cap, squares)
+        kernels.along_y(squares, cap, cells, plane)
+        kernels.along_x(squares, cap, cells, np.float32(edge), plane[0], ring)
+        return DistanceMap(squares, self.lattice.lower, edge, _REACH)
 
 
 @dataclass(frozen=True, eq=False)

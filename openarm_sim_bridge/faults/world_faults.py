@@ -42,7 +42,7 @@ class WorldFaults:
         self._description = description
         by_joint = {joint: name for name, arm in description.arms.items() for joint in arm.controlled}
         fingers = {arm.finger_joint for arm in description.arms.values()}
-        self._arms = tuple(by_joint[joint] for joint in joint_names)
+        self._arms = tuple(by_joint.get(joint, "") for joint in joint_names)
         self._fingers = tuple(i for i, joint in enumerate(joint_names) if joint in fingers)
         self._faults: dict[str, Fault] = {}
         self._model: mujoco.MjModel | None = None
