@@ -273,8 +273,15 @@ class WaitingPlanner:
         raise OpenArmError(Code.CANCELLED, "planning was stopped")
 
 
+def waiting_planner(bench) -> WaitingPlanner:
+    """Let the right arm ask one for every path."""
+    arm = bench.node.service.arms["right"]
+    arm._planner, arm.direct = WaitingPlanner(), False
+    return arm._planner
+
+
 def test_a_search_ends_by_cancel(bench) -> None:
-    planner = bench.node.service.arms["right"]._planner = WaitingPlanner()
+    planner = waiting_planner(bench)
     for client, goal in ((bench.move_client, bench.named()), (bench.plan_client, approach_goal(bench))):
         planner.searching.clear()
         handle, future = bench.start(client, goal)
@@ -286,7 +293,7 @@ def test_a_search_ends_by_cancel(bench) -> None:
 
 
 def test_a_search_ends_with_the_node(bench) -> None:
-    planner = bench.node.service.arms["right"]._planner = WaitingPlanner()
+    planner = waiting_planner(bench)
     bench.start(bench.move_client, bench.named())
     bench.ros.spin_until(planner.searching.is_set, 5.0, "the search")
     begin = time.monotonic()
