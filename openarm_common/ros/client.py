@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -30,6 +31,8 @@ _CHECK_S = 0.25
 _GONE = 20
 #: Longest wait for the end of a goal that was cancelled, s: a robot ramps down, and a plan may have to be dropped.
 _HALT_S = 5.0
+#: A cancel is sent again after this, s: a server that has not discovered this client yet misses the request.
+_AGAIN_S = 0.5
 _UP = "is the graph up, with the same ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE?"
 
 
@@ -213,7 +216,7 @@ class BackgroundNode(ContextNode):
             answer = self._wait(ended, timeout, name, there, stop, cancel, trouble, meanwhile, died)
         except BaseException as error:
             # Whatever keeps the caller from waiting (a deadline, Ctrl-C): the robot would continue unattended.
-            halted = self._cancel(sent).wait(_HALT_S if there() and not died() else 0.1)
+            halted = self._halted(sent, _HALT_S if there() and not died() else 0.1)
             if not halted and isinstance(error, KeyboardInterrupt):
                 text = f"{name} was cancelled by Ctrl-C and has not ended within {_HALT_S:g} s"
                 raise OpenArmError(Code.TIMEOUT, f"{text}; the emergency stop is `openarm stop`") from error
@@ -222,9 +225,9 @@ class BackgroundNode(ContextNode):
             raise OpenArmError(Code.NOT_READY, f"{name} no longer knows the goal: its node was restarted")
         return answer.result
 
-    def _cancel(self, sent: Future) -> threading.Event:
-        """Cancel a goal, also one that is still being accepted; the returned event is set when it has ended."""
-        ended = threading.Event()
+    def _halted(self, sent: Future, limit: float) -> bool:
+        """Cancel a goal, also one that is still being accepted; return whether it has ended within `limit`, s."""
+        ended, end = threading.Event(), time.monotonic() + limit
 
         async def cancel() -> None:
             handle: Any = await sent
@@ -233,8 +236,11 @@ class BackgroundNode(ContextNode):
                 await handle.get_result_async()
             ended.set()
 
-        self._executor.create_task(cancel)
-        return ended
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.create_task(cancel)
+            if ended.wait(min(left, _AGAIN_S)):
+                return True
+        return False
 
     def servers(self, service: str) -> list[str]:
         """Return the nodes that offer a service, as far as they are discovered: their fully qualified names."""
@@ -298,7 +304,7 @@ class BackgroundNode(ContextNode):
     ) -> Any:
         done = _event(future)
         deadline = time.monotonic() + timeout
-        missed, stopped = 0, False
+        missed, asked = 0, -math.inf
         while not done.wait(_CHECK_S):
             meanwhile()
             if not self._thread.is_alive():
@@ -312,10 +318,12 @@ class BackgroundNode(ContextNode):
                 raise trouble[0]
             if time.monotonic() > deadline:
                 raise OpenArmError(Code.TIMEOUT, f"no answer of {name} within {timeout:g} s")
-            if stop is not None and stop.is_set() and not stopped:
-                stopped = True
-                deadline = min(deadline, time.monotonic() + self._timeout)
+            now = time.monotonic()
+            if stop is not None and stop.is_set() and now - asked >= _AGAIN_S:
+                if asked < 0.0:
+                    deadline = min(deadline, now + self._timeout)
                 cancel()
+                asked = now
         answer = future.result()
         if isinstance(answer, _Unsent):
             reason = str(answer.error).partition("\n")[0] or type(answer.error).__name__

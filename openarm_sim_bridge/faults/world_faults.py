@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_sim_bridge.faults.faults import (
@@ -63,8 +64,10 @@ class WorldFaults:
             OpenArmError: INVALID_ARGUMENT for an object or an arm that is not there; SCENE_INVALID where the object
                 would be pushed into something.
         """
-        if isinstance(fault.parameters, OfSide) and fault.parameters.side != "both":
-            self._description.arm(fault.parameters.side)
+        arms = self._description.arm_names
+        if isinstance(fault.parameters, OfSide) and fault.parameters.side not in ("both", *arms):
+            text = f"no side {fault.parameters.side[:80]!r}; sides: {', '.join(arms)}, both"
+            raise OpenArmError(Code.INVALID_ARGUMENT, text)
         if isinstance(fault.parameters, ObjectNudged):
             nudge(world, fault.parameters, fault.seed)
             return

@@ -51,9 +51,12 @@ def test_two_objects_are_grasped_at_once_and_the_arms_keep_apart() -> None:
     assert row["as_expected"], row["message"]
     assert row["arm_clearance_mm"] >= 1e3 * LEAST_CLEARANCE
     assert {g["arm"] for g in row["grasps"]} == {"left", "right"}
-    closed = {step.arm: step.t_ns for step in trials.steps if step.state == "CLOSE_GRIPPER"}
-    placed = {step.arm: step.t_ns for step in trials.steps if step.state == "PLACE"}
-    assert max(closed.values()) < min(placed.values())  # both hands closed before either had placed
+    arms, steps = ("left", "right"), trials.steps
+    closed, placed = (
+        [next(step.t_ns for step in steps if (step.arm, step.state) == (arm, state)) for arm in arms]
+        for state in ("CLOSE_GRIPPER", "PLACE")
+    )
+    assert max(closed) < min(placed)  # both hands closed before either had placed; one may have to close again
 
 
 def test_the_judge_of_the_gap_measures_what_mujoco_measures_pair_by_pair() -> None:

@@ -41,6 +41,7 @@ def in_box(trajectory: Trajectory, waypoints: np.ndarray) -> bool:
     return bool(np.all(q >= waypoints.min(axis=0) - 1e-9) and np.all(q <= waypoints.max(axis=0) + 1e-9))
 
 
+@pytest.mark.requirement("R-31")
 @pytest.mark.parametrize("sides", [("right",), ("left", "right")])
 @given(data=st.data(), scale=st.sampled_from([0.1, 0.5, 1.0]), how=st.sampled_from(["blended", "stops", "quintic"]))
 @settings(max_examples=25)

@@ -56,7 +56,7 @@ def assert_reached(arm: ArmKinematics, q: Array, pose: Array, *, position_only: 
     assert arm.margin(q) >= 0.0
 
 
-@pytest.mark.requirement("A-66", "B-07")
+@pytest.mark.requirement("A-66", "B-07", "R-31")
 @pytest.mark.parametrize("name", ROBOTS)
 @settings(max_examples=100)
 @given(drawn=places)
