@@ -38,11 +38,11 @@ from benchmarks.motion_problems import (
     shelf_problems,
     table_boxes,
     table_problems,
+    timed,
 )
 from benchmarks.report import Row, write_report
 from openarm_common.camera.cameras import load_cameras
 from openarm_common.camera.housings import with_housings
-from openarm_common.errors import Code, OpenArmError
 from openarm_common.robot.description import RobotDescription
 from openarm_common.types import Array
 from openarm_motion.collision.fast import FastScene
@@ -52,7 +52,7 @@ from openarm_motion.config import MotionConfig
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.dual_arm import DualArm
 from openarm_motion.planning.ompl_planner import OmplPlanner
-from openarm_motion.planning.planner import Planner, PlanQuery
+from openarm_motion.planning.planner import PlanQuery
 from openarm_motion.planning.rrt import FastPlanner
 
 #: A problem counts as feasible when some planner finds a path within this time, s.
@@ -88,15 +88,15 @@ def plan_rows(
         fast = query.fast()  # a scene is made once and serves all plans in it
         packing.append(time.perf_counter() - begin)
         update.append(time.perf_counter() - first)
-        path, seconds = _timed(ours, query)
+        path, seconds = timed(ours, query)
         free = path is not None and all(query.edge_free(a, b) for a, b in itertools.pairwise(path))
         odd += path is not None and not free
         times.append(seconds)
         solved += free
-        long, seconds = _timed(peer, replace(query, time_limit=_LONG))
+        long, seconds = timed(peer, replace(query, time_limit=_LONG))
         coal.append(seconds)
         feasible += free or long is not None
-        callbacks.append(_timed(peer, _by_callbacks(query, fast))[1])
+        callbacks.append(timed(peer, _by_callbacks(query, fast))[1])
     n, goal = len(problems), 100.0 if name == "table" else 99.0
     median, p95 = _p(times, 50), _p(times, 95)
     return [
@@ -221,18 +221,6 @@ def main() -> None:
     }
     rows = [row for name, part in parts.items() if name.startswith(args.only) for row in part()]
     write_report(rows, args.json)
-
-
-def _timed(planner: Planner, query: PlanQuery) -> tuple[Array | None, float]:
-    """Way points, None without a plan, and seconds."""
-    begin = time.perf_counter()
-    try:
-        path = planner.plan(query).waypoints
-    except OpenArmError as error:
-        if error.code != Code.NO_PLAN:
-            raise
-        return None, time.perf_counter() - begin
-    return path, time.perf_counter() - begin
 
 
 def _each(work: Callable[[tuple[Array, Array]], object], items: Sequence[tuple[Array, Array]]) -> float:

@@ -70,7 +70,7 @@ class IkArm:
 
 
 def ik_rows(arms: Mapping[str, Arm], count: int, peer_count: int) -> list[Row]:
-    """Rows of the arms together, each beside one peer, then of each arm, kind of pose, and kind of answer."""
+    """Rows of the arms together, each compared with one peer, then of each arm, kind of pose, and kind of answer."""
     ours = {name: IkArm(arm.description, arm.inverse) for name, arm in arms.items()}
     targets = {name: arm.targets(count, at_limits=False) for name, arm in ours.items()}
     solved, times = _measure(ours, targets, _one, count)
@@ -92,7 +92,7 @@ def ik_rows(arms: Mapping[str, Arm], count: int, peer_count: int) -> list[Row]:
 
 
 def _rows_of(metric: str, arm: IkArm, poses: Array, peer_count: int) -> list[Row]:
-    """One configuration near the middle of the limits, beside pinocchio; then all that planning is given as goals."""
+    """One configuration near the middle of the limits, compared with pinocchio; then all goals of a plan."""
     at, label = {"": poses}, "pinocchio in Python, 20 restarts"
     solved, times = _measure({"": arm}, at, _one, len(poses))
     peer_solved, peer_times = _measure({"": arm}, at, PinocchioIk, peer_count)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -11,11 +12,13 @@ import numpy as np
 
 from benchmarks.motion_map import rendered
 from openarm_common import se3
+from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.collision.occupancy import NOTHING, Environment
 from openarm_motion.collision.solids import Box, box_from
 from openarm_motion.planning.arm import Arm
 from openarm_motion.planning.dual_arm import DualArm
+from openarm_motion.planning.planner import Planner, PlanQuery
 
 #: Whether configurations collide that are free of everything else is asked of this.
 Collides = Callable[[Array], bool]
@@ -165,3 +168,15 @@ def _free(arm: Arm, pose: Array, rng: np.random.Generator, collides: Collides, w
             if len(found) == want:
                 break
     return found
+
+
+def timed(planner: Planner, query: PlanQuery) -> tuple[Array | None, float]:
+    """Plan: way points, None without a plan, and seconds."""
+    begin = time.perf_counter()
+    try:
+        path = planner.plan(query).waypoints
+    except OpenArmError as error:
+        if error.code != Code.NO_PLAN:
+            raise
+        return None, time.perf_counter() - begin
+    return path, time.perf_counter() - begin

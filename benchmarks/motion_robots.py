@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,14 +26,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
+from benchmarks.motion_problems import timed
 from benchmarks.report import Row, write_report
 from benchmarks.robot_models import ABSENT, ROBOTS, TrueMeshes, example_robots, load_arm, states_of
 from benchmarks.robot_problems import FAMILIES, RobotProblem, problems
-from openarm_common.errors import Code, OpenArmError
 from openarm_common.types import Array
 from openarm_motion.planning.arm import Arm, StartState
 from openarm_motion.planning.ompl_planner import OmplPlanner
-from openarm_motion.planning.planner import Planner, PlanQuery
+from openarm_motion.planning.planner import PlanQuery
 from openarm_motion.planning.rrt import FastPlanner
 
 #: Seeds of problems that steps of the search were chosen on, and of those that figures are reported of.
@@ -91,8 +90,8 @@ def family_tally(robot: str, family: str, arm: Arm, judge: TrueMeshes, drawn: Se
             raise RuntimeError("the query has no fast layer")
         query.fast()  # a scene is made once and serves all plans in it
         hits = judge.around(problem.obstacles)
-        path, seconds = _timed(FastPlanner(), query)
-        other, peer_seconds = _timed(OmplPlanner(), replace(query, edge_free=scene.edge_free, fast=None))
+        path, seconds = timed(FastPlanner(), query)
+        other, peer_seconds = timed(OmplPlanner(), replace(query, edge_free=scene.edge_free, fast=None))
         tally.ours.append(seconds)
         tally.peer.append(peer_seconds)
         touched, peer_touched = (_touches(way, hits) for way in (path, other))
@@ -101,7 +100,7 @@ def family_tally(robot: str, family: str, arm: Arm, judge: TrueMeshes, drawn: Se
         tally.solved += path is not None and not touched
         tally.peer_solved += other is not None and not peer_touched
         solvable = path is not None or other is not None
-        tally.feasible += solvable or _timed(OmplPlanner(), _on_triangles(query, hits))[0] is not None
+        tally.feasible += solvable or timed(OmplPlanner(), _on_triangles(query, hits))[0] is not None
     return tally
 
 
@@ -117,18 +116,6 @@ def _on_triangles(query: PlanQuery, hits: Callable[[Array], bool]) -> PlanQuery:
         return not any(hits(q) for q in states_of(np.stack([a, b]), 0.05))
 
     return replace(query, fast=None, goals=goals, collides=hits, edge_free=edge_free, time_limit=_LONG)
-
-
-def _timed(planner: Planner, query: PlanQuery) -> tuple[Array | None, float]:
-    """Way points, None without a plan, and seconds."""
-    begin = time.perf_counter()
-    try:
-        path = planner.plan(query).waypoints
-    except OpenArmError as error:
-        if error.code != Code.NO_PLAN:
-            raise
-        return None, time.perf_counter() - begin
-    return path, time.perf_counter() - begin
 
 
 def _percentiles(seconds: Sequence[float]) -> tuple[float, float]:

@@ -32,30 +32,23 @@ class JointReadout:
 
 
 def joint_names(description: RobotDescription) -> tuple[str, ...]:
-    """Return the controlled joints: of each side those of the arm, then the driving finger joint."""
-    return tuple(
-        name
-        for side in description.arm_names
-        for name in (*description.arm_joints(side), description.finger_joint(side))
-    )
+    """Return the controlled joints: of each arm its own, then the driving finger joint."""
+    return tuple(name for arm in description.arms.values() for name in arm.controlled)
 
 
 def arm_groups(description: RobotDescription) -> dict[str, JointGroup]:
-    """Return the joint group of each arm, by side."""
-    return {side: _group(description, description.arm_joints(side)) for side in description.arm_names}
+    """Return the joint group of each arm, by name."""
+    return {name: _group(description, arm.joints) for name, arm in description.arms.items()}
 
 
 def gripper_groups(description: RobotDescription) -> dict[str, JointGroup]:
-    """Return the joint group (the driving finger joint) of each gripper, by side."""
-    return {side: _group(description, (description.finger_joint(side),)) for side in description.arm_names}
+    """Return the joint group (the driving finger joint) of each gripper, by arm."""
+    return {name: _group(description, (arm.finger_joint,)) for name, arm in description.arms.items()}
 
 
 def arm_loads(description: RobotDescription) -> dict[str, ArmLoad]:
-    """Return what motions of each arm take, by side."""
-    return {
-        side: ArmLoad(description, description.arm_joints(side), description.tcp_link(side))
-        for side in description.arm_names
-    }
+    """Return what motions of each arm take, by name."""
+    return {name: ArmLoad(description, arm.joints, arm.tcp) for name, arm in description.arms.items()}
 
 
 def carriers(

@@ -178,10 +178,9 @@ class CalibrationNode(BaseNode[CalibrationConfig]):
 
     def _head(self, optics: Intrinsics) -> SessionHead:
         seed = self.config.seed if self.camera.mount_error else None
-        carrier = self.config.carrier or self.description.arm(self.description.arm_names[-1]).flange
         return head_of(
             self.camera.name, self.camera.parent, self.description, optics,
-            read_board(self.config.board, "parameter board"), carrier, mount_seed=seed, created=now(),
+            read_board(self.config.board, "parameter board"), self.config.carrier, mount_seed=seed, created=now(),
         )  # fmt: skip
 
     def _check_optics(self, optics: Intrinsics) -> None:

@@ -265,7 +265,7 @@ class SampleSet:
 def head_of(
     camera: str, parent: str, description: RobotDescription, optics: Intrinsics, board: Board, carrier: str, **more: Any
 ) -> SessionHead:
-    """Describe a session: a camera on a link that moves is in the hand; for another one the arm carries the board.
+    """Describe a session: a camera on a link that moves is in the hand; for another one an arm carries the board.
 
     Args:
         camera: Name of the camera.
@@ -273,10 +273,13 @@ def head_of(
         description: The robot.
         optics: Intrinsics.
         board: To detect.
-        carrier: Link that holds the board of a camera that does not move.
+        carrier: Link that holds the board of a camera that does not move; "": the flange of the robot's last arm.
         more: Other fields.
     """
     moves = any(joint.type != "fixed" for joint in description.chain(parent))
+    if not carrier:
+        *_, last = RobotDescription.load().arms.values()  # that of a bag names no arms
+        carrier = last.flange
     return SessionHead(
         camera=camera, setup="in_hand" if moves else "to_hand", parent=parent, carrier=parent if moves else carrier,
         intrinsics=astuple(optics), board=board.model_dump(), **more,

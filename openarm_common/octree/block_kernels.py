@@ -32,7 +32,7 @@ class Rows(NamedTuple):
     Attributes:
         table: (owners,) row of each; below zero it has none: -1 - code of all of its cells.
         pool: (rows, cells): 512 cells of a block.
-        spare: (rows,) stack of the rows in nobody's use.
+        spare: (rows,) stack of the rows that are free.
         top: (1,) how many those are.
     """
 

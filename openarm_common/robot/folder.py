@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Self
 
@@ -82,15 +82,19 @@ def robot_names() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in (models_dir() / "robots").glob("*/robot.yaml")))
 
 
+def arm_fault(arm: str, arms: Collection[str]) -> str:
+    """Return what is wrong with the arm of a request; nothing with one of `arms`, "auto" and "" (the suite chooses)."""
+    return "" if arm in ("auto", "", *arms) else f"arm {arm[:80]!r} does not exist; valid: auto, {', '.join(arms)}"
+
+
 def known_arm(arm: str) -> str:
-    """Return the name of an arm of this process's robot, or "auto" or "", which leave the choice to the suite.
+    """Return an arm of a request to this process's robot.
 
     Raises:
         ValueError: Listing the arms.
     """
-    arms = load_folder(robot_name())[1].arms
-    if arm not in ("auto", "", *arms):
-        raise ValueError(f"arm {arm[:80]!r} does not exist; valid: auto, {', '.join(arms)}")
+    if text := arm_fault(arm, load_folder(robot_name())[1].arms):
+        raise ValueError(text)
     return arm
 
 

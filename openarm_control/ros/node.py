@@ -54,11 +54,6 @@ class ArmControl(ControlNode[ArmControlConfig]):
         self.create_timer(self.REPORT_PERIOD_S, self._report, clock=self.steady_clock)
         self._loop.start()
 
-    @property
-    def priority(self) -> int:
-        """See `ControlNode.priority`."""
-        return self.config.thread_priority
-
     async def hold(self) -> None:
         """End all motions; the arms hold where they are."""
         await self.awaitable(self._loop.call(lambda: self._controller.abort("the node arm_control ends")))
@@ -88,7 +83,7 @@ class ArmControl(ControlNode[ArmControlConfig]):
 
 def make() -> ArmControl:
     """Make the node for a process of its own."""
-    return timely(ArmControl)
+    return timely(ArmControl, lambda node: node.config.thread_priority)
 
 
 def main() -> None:

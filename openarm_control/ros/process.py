@@ -22,15 +22,10 @@ class ControlNode(BaseNode[ConfigT]):
 
     scheduling = ""
 
-    @property
-    def priority(self) -> int:
-        """Of the process under SCHED_FIFO; 0: ordinary."""
-        raise NotImplementedError
-
-    def use_real_time_priority(self) -> None:
-        """Request real-time scheduling of this process."""
-        if self.priority:
-            self.scheduling = use_fifo(self.priority)
+    def use_real_time_priority(self, priority: int) -> None:
+        """Request real-time scheduling of this process; 0: stay with the ordinary one."""
+        if priority:
+            self.scheduling = use_fifo(priority)
             self.get_logger().info(f"scheduled as {self.scheduling}")
 
     def on_crash(self, error: Exception) -> None:
@@ -42,11 +37,16 @@ class ControlNode(BaseNode[ConfigT]):
 NodeT = TypeVar("NodeT", bound=ControlNode[Any])
 
 
-def timely(make: Callable[[], NodeT]) -> NodeT:
-    """Make a node in a process of its own, in which nothing holds its control thread up for long."""
+def timely(make: Callable[[], NodeT], priority: Callable[[NodeT], int]) -> NodeT:
+    """Make a node in a process of its own, in which nothing holds its control thread up for long.
+
+    Args:
+        make: Makes it.
+        priority: Of its process under SCHED_FIFO.
+    """
     sys.setswitchinterval(0.0005)  # the thread must not wait 5 ms, the default, for another one
     node = make()
-    node.use_real_time_priority()
+    node.use_real_time_priority(priority(node))
     gc.collect()
     gc.freeze()  # what is there now stays; later collections are short
     return node

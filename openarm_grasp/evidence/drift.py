@@ -4,8 +4,8 @@
 A closing hand centres the object between its fingers, wherever the camera thought it was. So along the opening axis
 the hand knows where it puts the object down, and what the camera sees there next to it is the camera's own error in
 that direction. Across that axis the object keeps the error it was grasped with, and nothing is learned. Each placed
-object measures one direction; turned hands measure the others. What is wrong with a camera is the same for both arms;
-where their residuals differ, the joint zeros of an arm are wrong. Base frame, m.
+object measures one direction; turned hands measure the others. A camera that was shifted is off by the same for every
+arm; where residuals differ by arm, it was turned, or the joint zeros of an arm are wrong. Base frame, m.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Drift:
         bias: (2,) mean residual, base frame, m: where the camera sees objects, less where they are.
         grasps: How many.
         alarm: The bias is large and sure.
-        arms: Bias of each arm, m, where they differ surely: joint zeros are wrong.
+        arms: Bias of each arm, m, where they surely differ.
     """
 
     camera: str
@@ -51,8 +51,8 @@ class Drift:
         if self.arms:
             each = ", ".join(f"{arm} by {_millimetres(bias)}" for arm, bias in self.arms.items())
             return (
-                f"by camera {self.camera!r} the arms place objects differently ({each}) over {self.grasps} grasps:"
-                " joint zeros are wrong; calibrate the zeros of the motors, then the camera"
+                f"camera {self.camera!r} is off differently for each arm ({each}) over {self.grasps} grasps: it has"
+                " turned, or the joint zeros of an arm are wrong; calibrate it again: the verdict names wrong zeros"
             )
         text = f"camera {self.camera!r} is off by {_millimetres(self.bias)} over {self.grasps} grasps"
         cause = "its mount has moved, or its calibration or the joint zeros of the arm are wrong; calibrate it again"

@@ -6,19 +6,20 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 from openarm_common.errors import Code, OpenArmError
+from openarm_common.robot.folder import arm_fault
 
 #: By (x, y) of the first joint of each arm, base frame, m.
 Shoulders = Mapping[str, Sequence[float]]
 
 
 def check_arm(arm: str, arms: Collection[str]) -> None:
-    """Refuse an arm that the robot does not have; "auto" and "" leave the choice to the suite.
+    """Refuse an arm that the robot does not have; see `arm_fault`.
 
     Raises:
         OpenArmError: INVALID_ARGUMENT, listing the arms.
     """
-    if arm not in ("auto", "", *arms):
-        raise OpenArmError(Code.INVALID_ARGUMENT, f"arm {arm!r} does not exist; valid: auto, {', '.join(arms)}")
+    if text := arm_fault(arm, arms):
+        raise OpenArmError(Code.INVALID_ARGUMENT, text)
 
 
 def arm_order(arm: str, y: float, overlap_half_width: float, shoulders: Shoulders) -> tuple[str, ...]:

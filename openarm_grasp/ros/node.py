@@ -238,7 +238,7 @@ class GraspNode(BaseNode[GraspConfig]):
             for other in self._newest.values():
                 if other.request != status.request and other.state is not State.IDLE:
                     self._status_topic.publish(
-                        messages.status_msg(replace(other, previous=other.state), message.header.frame_id, t_ns)
+                        messages.status_msg(replace(other, previous=other.state), self.description.base, t_ns)
                     )
         change = f"{message.previous_state} -> {message.state} at {t_ns * 1e-9:.2f} s, attempt {status.attempt}"
         about = f"{status.label} " if status.label else ""

@@ -106,11 +106,6 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         self._simulation.start()
         self.get_logger().info(f"scene {scene.name!r} with {len(scene.objects)} objects; simulation is running")
 
-    @property
-    def priority(self) -> int:
-        """See `ControlNode.priority`; a simulation as fast as it can would take a core from everything else."""
-        return self.config.thread_priority if 0.0 < self.config.speed <= 1.0 else 0
-
     def close(self) -> None:
         """Stop physics and drawing, then the node."""
         self._simulation.stop()
@@ -194,12 +189,17 @@ class MujocoBridge(ControlNode[BridgeConfig]):
         )
 
 
+def _priority(node: MujocoBridge) -> int:
+    """Of the process; a simulation as fast as it can would take a core from everything else."""
+    return node.config.thread_priority if 0.0 < node.config.speed <= 1.0 else 0
+
+
 def make() -> MujocoBridge:
     """Make the node for a process of its own."""
     if PROFILE in os.environ:
         os.environ[LARGE_PROFILE] = os.environ[PROFILE]
         os.environ[PROFILE] = str(config_dir() / "fastdds_small.xml")
-    node = timely(MujocoBridge)
+    node = timely(MujocoBridge, _priority)
     mujoco.set_mju_user_warning(lambda text: node.get_logger().warning(f"MuJoCo: {text}"))  # not into a file
     return node
 

@@ -107,8 +107,8 @@ class Hardware:
         """Return what commands and states of joints go through; fingers are exact but for their latency."""
         steps = dict.fromkeys(joint_names, (0.0, 0.0, 0.0))
         if self.quantized:
-            for side in description.arm_names:
-                for i, name in enumerate(description.arm_joints(side)):
+            for arm in description.arms.values():
+                for i, name in enumerate(arm.joints):
                     steps[name] = (
                         2.0 * MOTOR_RANGE / (2.0**16 - 1.0),
                         2.0 * float(_VELOCITY_RANGE[i]) / (2.0**12 - 1.0),
@@ -116,9 +116,7 @@ class Hardware:
                     )
         position, velocity, effort = np.array([steps[name] for name in joint_names]).T
         arm_latency = {
-            name: self.latency_s[description.arm_joints(side)[0]]
-            for side in description.arm_names
-            for name in description.arm(side).controlled
+            name: self.latency_s[arm.joints[0]] for arm in description.arms.values() for name in arm.controlled
         }
         return Encoders(
             zero=np.array([self.zero.get(name, 0.0) for name in joint_names]),
@@ -136,7 +134,8 @@ def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
         config: What is possible.
         description: The robot.
     """
-    joints = tuple(name for side in description.arm_names for name in description.arm_joints(side))
+    arms = description.arms
+    joints = tuple(name for arm in arms.values() for name in arm.joints)
     rng = np.random.default_rng([config.dynamics_seed, 901])
     zeros = np.random.default_rng([config.zero_seed, 902])
 
@@ -149,13 +148,13 @@ def drawn(config: HardwareConfig, description: RobotDescription) -> Hardware:
     n = len(joints)
     stiffness, damping, gearbox = (either(config.gain_error, n) for _ in range(3))
     friction = rng.uniform(*config.friction, n)
-    latency = np.repeat(rng.uniform(*config.latency, len(description.arm_names)), n // len(description.arm_names))
-    links = [link for side in description.arm_names for link in description.links_of(side)]
+    latency = np.repeat(rng.uniform(*config.latency, len(arms)), n // len(arms))
+    links = [link for name in arms for link in description.links_of(name)]
     mass = dict(zip(links, either(config.mass_error, len(links)).tolist(), strict=True))
     return Hardware(
-        stiffness=named(np.tile(config.stiffness, len(description.arm_names)) * stiffness),
-        damping=named(np.tile(config.damping, len(description.arm_names)) * damping),
-        armature=named(np.tile(config.armature, len(description.arm_names))),
+        stiffness=named(np.tile(config.stiffness, len(arms)) * stiffness),
+        damping=named(np.tile(config.damping, len(arms)) * damping),
+        armature=named(np.tile(config.armature, len(arms))),
         gearbox=named(gearbox),
         friction=named(friction) if config.friction[1] > 0.0 else {},
         zero=named(np.radians(config.zero_rms) * zeros.standard_normal(n)),

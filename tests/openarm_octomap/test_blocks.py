@@ -143,7 +143,7 @@ def test_what_is_alike_takes_no_memory_again() -> None:
 
 @pytest.mark.parametrize(("number", "width"), [(200, 1), (4000, 2), (70_000, 4)])
 def test_any_number_of_different_log_odds_is_exact(number: int, width: int) -> None:
-    """The palette grows while cells are painted; 0 and -0 are told apart. Log-odds that no cell has are dropped."""
+    """The palette grows while cells are painted; 0 and -0 stay different. Log-odds that no cell has are dropped."""
     rng = np.random.default_rng(number)
     blocks = VoxelBlocks(Lattice(0.02, (8, 16, 24), (48, 48, 40)))
     index = rng.permutation(np.argwhere(np.ones(blocks.lattice.shape, bool)))[: number + 5]

@@ -58,13 +58,13 @@ def samples_of(
         small = _small(bag, camera)
     optics = next(iter(small.optics.values()))
     configured = load_cameras()
-    ours = RobotDescription.load()
-    base = ours.base if ours.base in small.robot.links else small.robot.root
+    ours = RobotDescription.load().base
+    base = ours if ours in small.robot.links else small.robot.root
     parent = _parent(small, camera, base, configured)
     simulated = camera not in configured or configured[camera].mount_error
     seed = mount_seed if mount_seed is not None else _seed(bag)
     head = head_of(
-        camera, parent, small.robot, optics, board, carrier or ours.arm(ours.arm_names[-1]).flange,
+        camera, parent, small.robot, optics, board, carrier,
         base=base, mount_seed=seed if simulated else None,
     )  # fmt: skip
     samples = SampleSet(head, small.robot)
