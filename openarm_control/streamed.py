@@ -30,6 +30,8 @@ _FINGER_S = 0.05
 #: After a pause of the process commands go on where they were, faster by this share until they are in time; after a
 #: longer one than `_LOST_NS` they do not come back to it.
 _CATCH_UP_NS, _LOST_NS = PERIOD_NS // 5, 1_000_000_000
+#: For so long the robot is waited for to say what targets its servos have, once there are joint states.
+_TARGETS_NS = 100_000_000
 #: Joints are taken to go on as they moved since the stamp of their state for so long at most, s.
 _FORESEEN_S = 0.05
 
@@ -45,8 +47,8 @@ class Driver(Protocol):
         """Return the newest joint state that has come since the last call, at the time of its stamp."""
         ...
 
-    def targets(self) -> Array | None:
-        """Return the targets (n,) that the servos have, as far as the robot says; NaN or None where it does not."""
+    def targets(self, since_ns: int) -> Array:
+        """Return the targets (n,) that the servos have, by what the robot said since a stamp; NaN where it did not."""
         ...
 
     def send(self, targets: Array) -> None:
@@ -84,6 +86,8 @@ class StreamedRobot(ControlLoop):
         self._state: JointReadout | None = None
         self._received_ns = 0
         self._ticked_ns = 0
+        #: Stamp of the joint state and wall time from which on the targets of the servos are waited for.
+        self._waits_since: tuple[int, int] | None = None
         self._fingers = np.array(
             [controller.joint_names.index(gripper.group.names[0]) for gripper in controller.grippers.values()]
         )
@@ -117,6 +121,8 @@ class StreamedRobot(ControlLoop):
         if wall_ns - self._received_ns > self._stale_ns:
             self._lose(f"no joint state for {(wall_ns - self._received_ns) * 1e-9:.2f} s; is the driver alive?")
             return
+        if self.fault and not self._begins(self._state, wall_ns):
+            return
         now_ns = self._driver.now_ns()
         self._ticked_ns = t_ns = self._next_stamp(now_ns)
         state = replace(self._state, t_ns=t_ns, position=self._position_at(now_ns))
@@ -140,31 +146,39 @@ class StreamedRobot(ControlLoop):
         return self._state.position + age_s * self._state.velocity
 
     def _note(self, fresh: JointReadout) -> None:
-        """Take a joint state; begin where the robot is when it is the first one, or says that it was put elsewhere."""
+        """Take a joint state; give up when it says that the robot was put elsewhere."""
         before, self._state = self._state, self._with_finger_velocity(fresh)
         if before is not None and not self.fault:
             moved = np.abs(fresh.position - before.position)
             excess = moved - self._jump - self._speed * max(0.0, (fresh.t_ns - before.t_ns) * 1e-9)
             j = int(np.argmax(excess))
-            if excess[j] <= 0.0:
-                return
-            self._lose(f"{self.controller.joint_names[j]} jumped by {moved[j]:.3f} from one joint state to the next")
-        self._begin()
+            if excess[j] > 0.0:
+                self._lose(
+                    f"{self.controller.joint_names[j]} jumped by {moved[j]:.3f} from one joint state to the next"
+                )
 
-    def _begin(self) -> None:
-        """Hold where the robot is, from the targets that its servos have."""
-        assert self._state is not None
-        self.fault = ""
-        self.controller.reset(self._state)
-        targets = self._driver.targets()
-        if targets is not None:
-            self._robot.begin(targets)
+    def _begins(self, state: JointReadout, wall_ns: int) -> bool:
+        """Hold where the robot is, from the targets that its servos have; False while these are waited for.
+
+        What they had before the joints were where they are now says nothing: taken for the present targets, it would
+        be a blow.
+        """
+        if self._waits_since is None:
+            self._waits_since = (state.t_ns, wall_ns)
+        since_ns, began_ns = self._waits_since
+        targets = self._driver.targets(since_ns)
+        if np.isnan(targets).any() and wall_ns - began_ns < _TARGETS_NS:
+            return False
+        self._waits_since, self.fault = None, ""
+        self.controller.reset(state)
+        self._robot.begin(targets)
+        return True
 
     def _lose(self, why: str) -> None:
         """Command nothing more; goals are given up."""
         if not self.fault:
             self.controller.abort(why)
-        self.fault = why
+        self.fault, self._waits_since = why, None
 
     def _with_finger_velocity(self, fresh: JointReadout) -> JointReadout:
         """Fill in the velocity of the fingers, of which such drivers say nothing."""

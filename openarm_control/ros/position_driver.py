@@ -59,6 +59,9 @@ class PositionDriver:
                 state = f"{name.rpartition('/')[0]}/controller_state"
                 source = Source(JointTrajectoryControllerState, state, reliable(1))
                 self._references.append((at, Polled(self._listener, source)))
+        #: Targets as the driver's controllers said them, and their stamps.
+        self._said: Array = np.full(len(self._names), np.nan)
+        self._said_ns = np.zeros(len(self._names), np.int64)
         self._ticks = 0
         self._sent: Array = np.full(len(self._names), np.nan)
         self.refused = ""
@@ -86,15 +89,15 @@ class PositionDriver:
         self._passed_on.publish(message)
         return readout
 
-    def targets(self) -> Array | None:
+    def targets(self, since_ns: int) -> Array:
         """See `Driver.targets`: what the driver's controllers say that they command."""
-        found = np.full(len(self._names), np.nan)
         for at, polled in self._references:
             message: JointTrajectoryControllerState | None = polled.newest()
             if message is not None and len(message.reference.positions) == len(at):
                 by_name = dict(zip(message.joint_names, message.reference.positions, strict=False))
-                found[at] = [by_name.get(self._names[i], np.nan) for i in at]
-        return found
+                self._said[at] = [by_name.get(self._names[i], np.nan) for i in at]
+                self._said_ns[at] = stamp_to_ns(message.header.stamp)
+        return np.where(self._said_ns >= since_ns, self._said, np.nan)
 
     def send(self, targets: Array) -> None:
         """See `Driver.send`; targets that are as before are repeated now and then, for a driver that was restarted."""

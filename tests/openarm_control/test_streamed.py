@@ -32,6 +32,7 @@ class Robot:
         self.at: Array = START.copy()
         self.commands: list[Array] = []
         self.known: Array | None = None
+        self.known_ns = 2 * 10**18
         self.stop_at = 0.0
         self.silent = False
 
@@ -41,8 +42,9 @@ class Robot:
     def take(self) -> JointReadout | None:
         return None if self.silent else JointReadout(self.t_ns, self.at.copy(), np.zeros(2), np.zeros(2))
 
-    def targets(self) -> Array | None:
-        return self.known
+    def targets(self, since_ns: int) -> Array:
+        known = self.at if self.known is None else self.known
+        return known if self.known_ns >= since_ns else np.full(2, np.nan)
 
     def send(self, targets: Array) -> None:
         self.commands.append(targets.copy())
@@ -114,6 +116,32 @@ def test_it_begins_with_the_targets_that_the_servos_have(bench: Bench) -> None:
     np.testing.assert_allclose(bench.robot.commands[0], targets, atol=1e-6)
     bench.ticks(300)
     np.testing.assert_allclose(bench.robot.commands[-1], START + np.array([0.0, -0.01]), atol=1e-3)
+
+
+def test_an_arm_that_is_put_elsewhere_waits_for_the_targets_that_its_servos_have_there(bench: Bench) -> None:
+    """Those of the place that it was taken from would throw it back."""
+    bench.ticks(2)
+    bench.robot.known, bench.robot.known_ns = START, bench.robot.t_ns
+    bench.robot.at = np.array([-0.7, 0.02])
+    sent = len(bench.robot.commands)
+    bench.ticks(5)
+    assert len(bench.robot.commands) == sent
+    with pytest.raises(OpenArmError, match="j1 jumped by"):
+        bench.loop.check_able()
+    bench.robot.known, bench.robot.known_ns = np.array([-0.65, 0.02]), bench.robot.t_ns
+    bench.ticks(200)
+    begun = np.array([command[0] for command in bench.robot.commands[sent:]])
+    assert begun[0] == pytest.approx(-0.65, abs=1e-6)
+    assert begun[-1] == pytest.approx(-0.7, abs=1e-3)
+    bench.loop.check_able()
+
+
+def test_a_robot_that_says_nothing_of_its_targets_is_waited_for_a_tenth_of_a_second(bench: Bench) -> None:
+    bench.robot.known_ns = 0
+    bench.ticks(10)
+    assert bench.robot.commands == []
+    bench.ticks(1)
+    np.testing.assert_allclose(bench.robot.commands[0], START)
 
 
 def test_every_tick_of_a_motion_is_a_command(bench: Bench) -> None:
